@@ -40,7 +40,7 @@ class EnvSpaces(NamedTuple):
         """
         observation = env.observation_space
         action = action_spec(env.action_space)
-        if action_masks == "info" and action.kind not in ("discrete", "multidiscrete"):
+        if action_masks == "info" and not action.choices:
             raise UsageError(
                 f"action_masks info: expected an action space Discrete or MultiDiscrete, got {env.action_space}"
             )

@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from millrace.own_policy import OwnPolicy
     from millrace.playing import evaluate, record
     from millrace.policies import CNN, MLP, Piece, PolicyParameters, Recurrent
+    from millrace.protocol.envs.tuple_of_agents import TupleOfAgents
     from millrace.protocol.envs.which_copy import EnvCopy
     from millrace.rollout_service import RolloutBatch, RolloutService
     from millrace.runs import Metrics, Run, train
@@ -78,6 +79,7 @@ __all__ = [
     "RunError",
     "Stalled",
     "Summary",
+    "TupleOfAgents",
     "UsageError",
     "UserFacingError",
     "WorkerLost",
@@ -112,6 +114,7 @@ _IMPORTED_WHEN_USED = {
     "RolloutService": "millrace.rollout_service",
     "Run": "millrace.runs",
     "Summary": "millrace.learner.run_folder.results",
+    "TupleOfAgents": "millrace.protocol.envs.tuple_of_agents",
     "env_copy": "millrace.workers.copy_slots",
     "evaluate": "millrace.playing",
     "load": "millrace.loaded_policy",

@@ -17,11 +17,12 @@ import numpy.typing as npt
 
 from millrace.arguments import checked
 from millrace.learner.run_folder.run_folder import RunFolder
+from millrace.protocol.action_parts import make_nest
 from millrace.protocol.arrays import Array, Bools, Floats
-from millrace.protocol.envs.env_actions import action_converter_of
+from millrace.protocol.envs.env_actions import action_leaves_of
 from millrace.protocol.errors import UsageError, check_at_least
 from millrace.protocol.policy.distributions import distribution
-from millrace.protocol.policy.masks import MASK, choices, forbid, masked_distribution, no_choice
+from millrace.protocol.policy.masks import MASK, forbid, masked_distribution, no_choice
 from millrace.protocol.policy.policy import make_policy
 from millrace.protocol.policy.recurrent import zero_state
 from millrace.protocol.random_streams import Purpose, generator
@@ -37,7 +38,8 @@ class LoadedPolicy:
 
     It takes one observation of the environment's space, or n of them stacked along a first axis, and returns one action or
     n. Actions are the environment's: of the dtype and shape of its action space, counted from its `start` and within its
-    bounds. Observations are as the environment returns them; the policy normalizes them itself if it was trained so.
+    bounds; those of a Dict or Tuple space are a dict or tuple. Observations are as the environment returns them; the policy
+    normalizes them itself if it was trained so.
 
     A policy with a recurrent core remembers what it saw in each env copy: call `reset(n)` before the first observations, and
     say with `first` which copies begin a new episode.
@@ -70,7 +72,8 @@ class LoadedPolicy:
         self._distribution = distribution(card.policy)
         self._masked_distribution = masked_distribution(card.policy)
         self._is_masked = card.masked
-        self._to_env_action = action_converter_of(card.policy)
+        self._to_env_action = action_leaves_of(card.policy)
+        self._nest = make_nest([part.path for part in card.policy.action.parts] or [()])
         self._generator = None if deterministic else generator(seed, Purpose.PLAYED_ACTIONS)
         self._state: Floats | None = None  # [1, n, S] of a recurrent policy, once it was reset
 
@@ -97,7 +100,8 @@ class LoadedPolicy:
     def __call__(
         self, observation: Observation, *, first: npt.ArrayLike | None = None, mask: npt.ArrayLike | None = None
     ) -> Any:
-        """The action for one observation, as `env.step` takes it; for a batch of n observations, actions [n, *action].
+        """The action for one observation, as `env.step` takes it; for a batch of n observations, actions [n, *action], or a
+        dict or tuple of arrays [n, *part].
 
         Arguments:
             observation: One of the environment's observation space, or n of them: arrays [n, *leaf]. A Dict or Tuple
@@ -132,8 +136,8 @@ class LoadedPolicy:
                 chosen = chance.mode(params)[0]
             else:
                 chosen = chance.sample(params, chance.noise(self._generator, (1, n)))[0]
-            action = np.asarray(self._to_env_action(chosen)).astype(self.spec.action.dtype, copy=False)
-        return action[0] if is_one else action
+            parts = self._to_env_action(chosen)
+        return self._nest([part[0] for part in parts] if is_one else parts)
 
     def __repr__(self) -> str:
         how = "most probable actions" if self._generator is None else "sampled actions"
@@ -157,7 +161,7 @@ class LoadedPolicy:
     def _checked_mask(self, mask: npt.ArrayLike, n: int) -> Bools:
         """A mask as an array [1, n, choices]. Raises `UsageError`."""
         action = self.spec.action
-        size = choices(self.spec.action)
+        size = action.choices
         try:
             given = np.asarray(mask)
         except (ValueError, TypeError):  # rows of different lengths

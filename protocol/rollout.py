@@ -113,7 +113,7 @@ def rollout_bytes(run: RunSpec) -> int:
     leaves = [(T + 1, leaf.shape, leaf.dtype) for leaf in run.policy.seen]
     steps = [*leaves, (T, run.policy.action.shape, run.policy.action.stored_dtype), (1, (run.policy.state_size,), "float32")]
     if run.masked:
-        steps.append((T + 1, (sum(run.policy.action.sizes),), "bool"))
+        steps.append((T + 1, (run.policy.action.choices,), "bool"))
     steps += [(T, extra.shape, extra.dtype) for extra in run.extras]
     fixed = T * N * (2 * np.dtype(np.float32).itemsize + 3)  # log_prob, reward; terminated, truncated, valid
     fixed += (T + 1) * run.copies if run.seats else 0  # resets
@@ -133,7 +133,7 @@ def memory_bytes(run: RunSpec) -> int:
     if not run.seats:
         return of_copies + of_state
     action = run.policy.action
-    chosen = 32 * (sum(action.sizes) + math.prod(action.shape) + 1)  # action, numbers of the distribution, noise
+    chosen = 32 * (action.choices + math.prod(action.shape) + 1)  # action, numbers of the distribution, noise
     extras = sum(math.prod(extra.shape) * np.dtype(extra.dtype).itemsize for extra in run.extras)
     return of_copies + 2 * of_state + run.columns * (1 + chosen + extras)
 

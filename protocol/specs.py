@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Literal
 
 import msgspec
@@ -59,26 +60,65 @@ class Leaf(msgspec.Struct, frozen=True):
         return self.shape[2] <= self.shape[0]
 
 
-class ActionSpec(msgspec.Struct, frozen=True):
-    """The action space of the policy."""
+class ActionPart(msgspec.Struct, frozen=True):
+    """One space inside a Dict or Tuple of actions."""
 
+    path: tuple[str | int, ...]
+    """where it stands: the key in each Dict, and the number in each Tuple, from the outermost"""
     kind: Literal["discrete", "multidiscrete", "multibinary", "box"]
     shape: Shape
     dtype: str
-    """dtype that the environment takes; a Box action is stored as float32, unclipped or in [-1, 1] (`PolicySpec.head`)"""
+    """dtype that the environment takes"""
+
+
+class ActionSpec(msgspec.Struct, frozen=True):
+    """The action space of the policy."""
+
+    kind: Literal["discrete", "multidiscrete", "multibinary", "box", "mixed"]
+    """the gymnasium space it comes from; `mixed`: a Dict or Tuple of the others"""
+    shape: Shape
+    dtype: str
+    """dtype that the environment takes; a Box action is stored as float32, unclipped or in [-1, 1] (`PolicySpec.head`). A
+    mixed action is stored as a row [D] float32: the choices of all Discrete and MultiDiscrete parts, then the bits of all
+    MultiBinary parts, then the numbers of all Box parts, each in the order of `parts`
+    """
     sizes: tuple[int, ...] = ()
-    """how many choices each entry has (discrete, multidiscrete)"""
+    """how many choices each entry has (discrete, multidiscrete, mixed); at most 2²⁴ in a mixed action, so that float32 is
+    exact
+    """
     start: tuple[int, ...] = ()
-    """the smallest value of each entry (discrete, multidiscrete): stored actions count from 0"""
+    """the smallest value of each entry (discrete, multidiscrete, mixed): stored actions count from 0"""
     low: tuple[float, ...] = ()
-    """lower bounds (box), flattened; -inf where unbounded"""
+    """lower bounds (box, mixed), flattened; -inf where unbounded"""
     high: tuple[float, ...] = ()
-    """upper bounds (box), flattened"""
+    """upper bounds (box, mixed), flattened"""
+    parts: tuple[ActionPart, ...] = ()
+    """those of a mixed action, in the order of the space"""
 
     @property
     def stored_dtype(self) -> str:
         """Dtype of `Rollout.action`."""
-        return "float32" if self.kind == "box" else "int64"
+        return "float32" if self.kind in ("box", "mixed") else "int64"
+
+    @property
+    def in_words(self) -> str:
+        """As errors name it."""
+        return "a Dict or Tuple" if self.kind == "mixed" else f"{self.kind}{list(self.shape)}"
+
+    @property
+    def choices(self) -> int:
+        """How many choices all its entries have together: the number of their logits, and the length of a mask."""
+        return sum(self.sizes)
+
+    @property
+    def bits(self) -> int:
+        """How many bits it has (multibinary, mixed)."""
+        return math.prod(self.shape) - len(self.sizes) - self.numbers
+
+    @property
+    def numbers(self) -> int:
+        """How many numbers it has (box, mixed): each has a standard deviation."""
+        return len(self.low)
 
 
 class NamedShape(msgspec.Struct, frozen=True, array_like=True):

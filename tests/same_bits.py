@@ -55,6 +55,7 @@ RUNS: dict[str, tuple[str, ...]] = {
     "lstm": (f"train toy:Recall-v0 --algo ppo --core lstm --core-size 16 {ON_POLICY}",),
     "images": (f"train toy:Spaces-v0 {IMAGES} --algo ppo {ON_POLICY}",),
     "masks": (f"train Taxi-v4 --algo ppo --action-masks info {ON_POLICY}",),
+    "mixed": (f"train toy:Spaces-v0 --env-kwargs action mixed --algo ppo --record {RECORDED} {ON_POLICY}",),
     "shared": (f"train CartPole-v1 --algo ppo --shared-net {ON_POLICY}",),
     "per": (f"train CartPole-v1 --algo dqn --priority-alpha 0.6 --n-step 3 --normalize-observations {REPLAY}",),
     "prior": (f"train CartPole-v1 --algo dqn --prior {RECORDED} --prior-steps 20 {REPLAY}",),

@@ -92,6 +92,7 @@ FEATURES = {
     "self-play": (
         "test_self_play.py::test_weights_pool_and_ratings_do_not_depend_on_the_number_of_workers[RandomGame-settings0]"
     ),
+    "mixed actions": "test_mixed_actions.py::test_they_are_if_a_worker_dies_and_its_lanes_are_brought_back",
     "masks": "test_masked_runs.py::test_a_run_trains_evaluates_and_plays_with_masks[InInfo-workers]",
     "prior": "test_prior_data.py::test_prior_data_changes_what_is_learned_and_the_number_of_workers_does_not",
     "record": "test_local_run.py::test_training_episodes_are_recorded_whole",

@@ -358,15 +358,16 @@ def learns_the_identity_environment(subject: Subject) -> Iterator[str]:
     generator = np.random.default_rng(4)
     env_steps = 0
     rewards = list[float]()
-    box = subject.policy.action.kind == "box"
+    action = subject.policy.action
+    best = 1 if action.choices else 0
     goal = math.nan
     while env_steps < LEARNING_STEPS:
         acting = ToyActor(subject.policy, *_weights(algorithm))
         batch, reward = identity_batch(acting, subject.steps, generator)
         rewards.append(reward)
         if len(rewards) == MEASURED_BATCHES:
-            first = float(np.mean(rewards)) if box else 1 / CHOICES
-            goal = first + LEARNED * ((0 if box else 1) - first)
+            first = float(np.mean(rewards)) if action.numbers else 1 / CHOICES
+            goal = first + LEARNED * (best - first)
         if float(np.mean(rewards[-MEASURED_BATCHES:])) >= goal:
             return
         algorithm.update(batch, _no_pulse)

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
+from millrace.protocol.action_parts import mixed
 from millrace.protocol.arrays import Array, Bools, Floats
 from millrace.protocol.policy.distributions import distribution
 from millrace.protocol.policy.policy import make_policy
@@ -19,10 +20,9 @@ from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
 
 CHOICES = 4
 OBSERVATION = (Leaf("", "box", (CHOICES,), "float32"),)
-ACTIONS = (
-    ActionSpec("discrete", (), "int64", (CHOICES,), (0,)),
-    ActionSpec("box", (2,), "float32", low=(-1.0,) * 2, high=(1.0,) * 2),
-)
+CHOICE = ActionSpec("discrete", (), "int64", (CHOICES,), (0,))
+NUMBERS = ActionSpec("box", (2,), "float32", low=(-1.0,) * 2, high=(1.0,) * 2)
+ACTIONS = (CHOICE, NUMBERS, mixed([((0,), CHOICE), ((1,), NUMBERS)]))
 """The action spaces that an algorithm is tried with; the first that it can use is taken"""
 LANES = 2
 COPIES = 4
@@ -54,7 +54,8 @@ def noise_batch(acting: ToyActor, steps: int, generator: np.random.Generator, fr
 def identity_batch(acting: ToyActor, steps: int, generator: np.random.Generator) -> tuple[Batch, float]:
     """The identity environment: the right action is what is observed. Also returns the mean reward.
 
-    Each episode has one step. Discrete actions: reward 1 for the right choice. Box: minus the squared distance.
+    Each episode has one step. A choice gets 1 if it is the right one, numbers get minus their squared distance; both are
+    added up for a Dict or Tuple.
     """
     columns = LANES * COPIES
     choice = generator.integers(0, CHOICES, (steps + 1, columns))
@@ -65,10 +66,13 @@ def identity_batch(acting: ToyActor, steps: int, generator: np.random.Generator)
     batch = _batch(
         acting, generator, obs, _OtherColumns(np.zeros((steps, columns), np.float32), valid.copy(), none, valid), False
     )
-    if acting.spec.action.kind == "box":
-        reward = -np.square(batch.action - obs[:-1, :, :2]).sum(-1)
-    else:
-        reward = (batch.action == choice[:-1]).astype(np.float32)
+    action = acting.spec.action
+    stored = batch.action.reshape(steps, columns, -1)
+    reward = np.zeros((steps, columns), np.float32)
+    if action.choices:
+        reward += stored[..., 0] == choice[:-1]
+    if action.numbers:
+        reward -= np.square(stored[..., -action.numbers :] - obs[:-1, :, : action.numbers]).sum(-1)
     rewarded = np.where(valid, reward, np.float32(GARBAGE_REWARD))
     return msgspec.structs.replace(batch, reward=rewarded), float(reward[valid].mean())
 

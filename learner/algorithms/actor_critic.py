@@ -75,7 +75,7 @@ class ActorCritic(GradientDescent):
         super().__init__(config, policy, total_steps=total_steps)
         self.net = actor_critic_network(policy, device, seed)
         self.seed = seed
-        if policy.action.kind == "box":
+        if policy.action.numbers:
             self.net.parameters["actor.log_std"].detach().fill_(config.log_std_init)
         self.generator = torch.Generator().manual_seed(torch_seed(seed, Purpose.SHUFFLES))
         self.tensors = {"parameters": self.net.flat}

@@ -50,8 +50,7 @@ class DQN(OffPolicy):
         """Action values for any supported observation. Raises `UsageError` unless the action space is Discrete."""
         if action.kind != "discrete":
             name = cls.__name__.lower()
-            got = f"{action.kind}{list(action.shape)}"
-            raise UsageError(f"{name}: expected an action space Discrete(n), got {got}; take --algo ppo for it")
+            raise UsageError(f"{name}: expected an action space Discrete(n), got {action.in_words}; take --algo ppo for it")
         return replace(OffPolicy.policy_spec(config, observation, action), head="q", dueling=config.dueling)
 
     def __init__(

@@ -12,6 +12,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from time import monotonic
+from typing import Any
 
 from millrace.launch.crew import Crew
 from millrace.launch.vector import VectorEnvPool, open_vector_env_pool
@@ -27,7 +28,6 @@ from millrace.learner.torch_setup import torch_device
 from millrace.learner.vector_env.env import GymnasiumStep, ZmqVectorEnv
 from millrace.learner.vector_env.settings import VectorEnvSettings
 from millrace.protocol.alive import StartFailed, WorkerActivity, WorkerExit
-from millrace.protocol.arrays import Array
 from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.envs.description import DescribedEnv
 from millrace.protocol.messages import Status
@@ -196,7 +196,7 @@ class _ActingProcesses(WorkerProcesses):
         return failures
 
 
-def _step_lanes(env: ZmqVectorEnv, lanes: Sequence[int], actions: Array) -> GymnasiumStep:
+def _step_lanes(env: ZmqVectorEnv, lanes: Sequence[int], actions: Any) -> GymnasiumStep:
     """Step the copies of these lanes only. Actions and results have a row for every copy, which other copies ignore."""
     env.step_async(actions, lanes)
     return env.step_wait()

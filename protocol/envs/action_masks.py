@@ -7,14 +7,15 @@ by the spaces alone.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium
 from gymnasium import spaces
 
-from millrace.protocol.envs.spaces import action_spec, observation_leaves
+from millrace.protocol.envs.spaces import action_spec, observation_leaves, with_last
 from millrace.protocol.errors import UsageError
-from millrace.protocol.policy.masks import MASK, choices
+from millrace.protocol.policy.masks import MASK
 from millrace.protocol.specs import Leaf
 
 
@@ -24,7 +25,7 @@ def has_mask(observation: gymnasium.Space[Any], action: gymnasium.Space[Any]) ->
         return False
     try:
         leaves = observation_leaves(observation.spaces[MASK])
-        wanted = choices(action_spec(action))
+        wanted = action_spec(action).choices
     except UsageError:
         return False
     return 0 < wanted == sum(math.prod(leaf.shape) for leaf in leaves) and all(map(_has_bits, leaves))
@@ -46,3 +47,10 @@ def without_mask(observation: gymnasium.Space[Any], action: gymnasium.Space[Any]
         return observation
     assert isinstance(observation, spaces.Dict)
     return spaces.Dict([(key, space) for key, space in observation.spaces.items() if key != MASK])
+
+
+def seen_space(
+    observation: gymnasium.Space[Any], action: gymnasium.Space[Any], *, masked: bool, critic_keys: Sequence[str]
+) -> gymnasium.Space[Any]:
+    """The observation space as rows have it: without the mask of a masked run, and with the critic's keys at its end."""
+    return with_last(without_mask(observation, action) if masked else observation, critic_keys)

@@ -1,22 +1,25 @@
 """Turns actions as the policy chooses them and rollouts store them into the environment's, and back. Pure.
 
 Rule: what is stored is what was chosen; what the environment gets is shifted by `start`, or scaled, and clipped to the Box.
+A mixed action is stored as a row; the environment gets its Dict or Tuple (`millrace.protocol.action_parts`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from millrace.protocol.action_parts import make_nest, parts_of
 from millrace.protocol.arrays import Array
 from millrace.protocol.specs import ActionSpec, PolicySpec
 
 
 def action_converter_of(policy: PolicySpec) -> Callable[[Array], Array]:
-    """A function from the stored actions [N, *action] of this policy to actions of the environment.
+    """A function from the stored actions [..., *action] of this policy to actions of the environment.
 
-    Actions in [-1, 1] are scaled to the bounds of the Box, in float64, and then converted as all others.
+    Those of a Dict or Tuple are an array [...] of objects. Actions in [-1, 1] are scaled to the bounds of the Box, in
+    float64, and then converted as all others.
     """
     convert = make_action_converter(policy.action)
     spec = policy.action
@@ -28,12 +31,53 @@ def action_converter_of(policy: PolicySpec) -> Callable[[Array], Array]:
     return lambda action: convert(middle + half * action.astype(np.float64))
 
 
+def action_leaves_of(policy: PolicySpec) -> Callable[[Array], tuple[Array, ...]]:
+    """A function from the stored actions [..., *action] of this policy to arrays [..., *part] of the environment's numbers.
+
+    They are those of the parts of a Dict or Tuple, in the order of the space, or the one array of another space.
+    """
+    if policy.action.parts:
+        return _make_leaves(policy.action)
+    convert = action_converter_of(policy)
+    return lambda action: (convert(action),)
+
+
+def _make_leaves(spec: ActionSpec) -> Callable[[Array], tuple[Array, ...]]:
+    """The same for a mixed action."""
+    parts = parts_of(spec)
+    converters = [make_action_converter(part.spec) for part in parts]
+
+    def leaves(action: Array) -> tuple[Array, ...]:
+        stored = [action[..., part.columns].reshape(*action.shape[:-1], *part.spec.shape) for part in parts]
+        return tuple(convert(array) for convert, array in zip(converters, stored, strict=True))
+
+    return leaves
+
+
+def _make_structures(spec: ActionSpec) -> Callable[[Array], Array]:
+    """A function from stored actions [..., D] to an array [...] of objects, each the Dict or Tuple of one."""
+    leaves = _make_leaves(spec)
+    nest = make_nest([part.path for part in spec.parts])
+
+    def structures(action: Array) -> Array:
+        found = np.empty(action.shape[:-1], object)
+        each = found.reshape(-1)
+        columns = [leaf.reshape(-1, *leaf.shape[action.ndim - 1 :]) for leaf in leaves(action)]
+        for i, values in enumerate(zip(*columns, strict=True)):
+            each[i] = nest(values)
+        return found
+
+    return structures
+
+
 def make_action_converter(spec: ActionSpec) -> Callable[[Array], Array]:
-    """A function from stored actions [N, *action] to actions of the environment: shifted by `start`, or clipped (Box).
+    """A function from stored actions [..., *action] to actions of the environment: shifted by `start`, or clipped (Box).
 
     A Box action is clipped in the dtype of the space, in which the bounds are exact: the float32 next to a float64 bound may
     lie outside of it.
     """
+    if spec.parts:
+        return _make_structures(spec)
     dtype = np.dtype(spec.dtype)
     if spec.kind == "box":
         low, high = (np.reshape(np.asarray(bound, dtype), spec.shape) for bound in (spec.low, spec.high))
@@ -44,11 +88,36 @@ def make_action_converter(spec: ActionSpec) -> Callable[[Array], Array]:
     return lambda action: (action + start).astype(dtype, copy=False)
 
 
-def stored_actions_of(policy: PolicySpec) -> Callable[[Array], Array]:
-    """The inverse of `action_converter_of`: a function from actions of the environment to stored actions.
+def stored_actions_of(policy: PolicySpec) -> Callable[[Sequence[Array]], Array]:
+    """The inverse of `action_leaves_of`: a function from the environment's arrays [..., *part] to stored actions.
 
     An action outside of a Box that is scaled becomes one at its bounds.
     """
+    spec = policy.action
+    if spec.parts:
+        return _make_rows(spec)
+    to_stored = _stored(policy)
+    return lambda leaves: to_stored(leaves[0])
+
+
+def _make_rows(spec: ActionSpec) -> Callable[[Sequence[Array]], Array]:
+    """The same for a mixed action."""
+    parts = parts_of(spec)
+    converters = [_stored(PolicySpec((), part.spec)) for part in parts]
+
+    def rows(leaves: Sequence[Array]) -> Array:
+        first = leaves[0]
+        lead = first.shape[: first.ndim - len(parts[0].spec.shape)]
+        found = np.empty((*lead, *spec.shape), spec.stored_dtype)
+        for part, convert, leaf in zip(parts, converters, leaves, strict=True):
+            found[..., part.columns] = convert(leaf).reshape(*lead, -1)
+        return found
+
+    return rows
+
+
+def _stored(policy: PolicySpec) -> Callable[[Array], Array]:
+    """A function from the environment's arrays [..., *action] of a space that is not mixed to stored actions."""
     spec = policy.action
     if spec.kind != "box":
         start = np.reshape(np.asarray(spec.start or 0), spec.shape if spec.start else ())

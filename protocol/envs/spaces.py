@@ -14,12 +14,14 @@ import msgspec
 import numpy as np
 from gymnasium import spaces
 
+from millrace.protocol.action_parts import mixed
 from millrace.protocol.arrays import Array
 from millrace.protocol.errors import UsageError
 from millrace.protocol.specs import ActionSpec, Leaf
 
 OBSERVATIONS = "Box, Discrete, MultiBinary, MultiDiscrete, and Dict and Tuple of these"
-ACTIONS = "Discrete, MultiDiscrete, MultiBinary and Box"
+ACTIONS = "Discrete, MultiDiscrete, MultiBinary and Box (of floats), and Dict and Tuple of these"
+MOST_CHOICES = 2**24  # of a part of a mixed action: float32 tells no more whole numbers apart
 STORED_KINDS = "biuf"  # bool, integers, floats: the dtypes that a message can carry
 
 
@@ -50,6 +52,18 @@ def make_unflatten(space: gymnasium.Space[Any]) -> Callable[[Sequence[Any]], Any
                 return next(leaves)
 
     return lambda leaves: nest(space, iter(leaves))
+
+
+def make_batched(space: gymnasium.Space[Any]) -> Callable[[Array], Any]:
+    """A function from the actions of N copies, as `action_converter_of` gives them, to what a vector environment takes.
+
+    Those of a Dict or Tuple become a Dict or Tuple of arrays [N, *part].
+    """
+    if not isinstance(space, spaces.Dict | spaces.Tuple):
+        return lambda actions: actions
+    flatten = make_flatten(space)
+    unflatten = make_unflatten(space)
+    return lambda actions: unflatten([np.stack(leaf) for leaf in zip(*map(flatten, actions), strict=True)])
 
 
 def _walk(space: gymnasium.Space[Any], path: tuple[str | int, ...]) -> Iterator[tuple[tuple[str | int, ...], Any]]:
@@ -93,8 +107,33 @@ def with_last(space: gymnasium.Space[Any], keys: Sequence[str]) -> gymnasium.Spa
 
 def action_spec(space: gymnasium.Space[Any]) -> ActionSpec:
     """Describe the action. Raises `UsageError` for a space that is not supported."""
+    if not isinstance(space, spaces.Dict | spaces.Tuple):
+        return _single_action(space, "")
+    if _has_nothing(space):
+        raise UsageError(f"action space {space}: expected at least one space in each Dict and Tuple, got one of none")
+    found = mixed([(path, _single_action(inner, "/".join(map(str, path)))) for path, inner in _walk(space, ())])
+    if max(found.sizes, default=0) > MOST_CHOICES:
+        raise UsageError(f"action space {space}: expected at most {MOST_CHOICES:,} choices, got {max(found.sizes):,}")
+    return found
+
+
+def _has_nothing(space: gymnasium.Space[Any]) -> bool:
+    """Whether it is, or holds, a Dict or Tuple without a space."""
+    match space:
+        case spaces.Dict(spaces=inside):
+            return not inside or any(map(_has_nothing, inside.values()))
+        case spaces.Tuple(spaces=inside):
+            return not inside or any(map(_has_nothing, inside))
+        case _:
+            return False
+
+
+def _single_action(space: gymnasium.Space[Any], path: str) -> ActionSpec:
+    """The action of a space that is no Dict and no Tuple. `path`: where it stands, if inside one."""
+    where = f" at {path}" if path else ""
     if space.shape is not None and 0 in space.shape:
-        raise UsageError(f"action space {space}: expected at least one number to choose, got shape {list(space.shape)}")
+        expected = f"expected at least one number to choose, got shape {list(space.shape)}"
+        raise UsageError(f"action space {space}{where}: {expected}")
     match space:
         case spaces.Discrete():
             return ActionSpec("discrete", (), "int64", (int(space.n),), (int(space.start),))
@@ -106,19 +145,7 @@ def action_spec(space: gymnasium.Space[Any]) -> ActionSpec:
             low, high = (tuple(float(x) for x in bound.ravel()) for bound in (space.low, space.high))
             return ActionSpec("box", space.shape, space.dtype.name, low=low, high=high)
         case _:
-            raise UsageError(
-                f"action space {space} is not supported; supported are {ACTIONS} (of floats){_about_tuples(space)}"
-            )
-
-
-def _about_tuples(space: gymnasium.Space[Any]) -> str:
-    """What to do about a Tuple of actions, as the end of a line; empty for other spaces."""
-    if not isinstance(space, spaces.Tuple):
-        return ""
-    return (
-        "; if its parts are the actions of several agents, see 'A Tuple of actions' in docs/how-to/several_agents.md; "
-        "if they are of one agent, 'Tuple actions' in docs/how-to/third_party_environments.md"
-    )
+            raise UsageError(f"action space {space}{where} is not supported; supported are {ACTIONS}")
 
 
 def _ints(array: Array) -> tuple[int, ...]:

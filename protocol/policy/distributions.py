@@ -6,6 +6,10 @@ and a comparison. The log-probabilities of a whole rollout are computed in one c
     Categorical   P = Σ sizes   logits; action = argmax(logits + Gumbel noise)               (Gumbel-max trick)
     Bernoulli     P = K         logits; action = logits + logistic noise > 0
     Gaussian      P = 2 D       mean, log standard deviation; action = mean + exp(log_std) · normal noise, not clipped
+    Product       their sum     independent factors: params, noise and actions of one stand behind those of the other
+
+A mixed action has at most three factors, because a stored row has the choices of all its parts, then all bits, then all
+numbers (`millrace.protocol.action_parts`).
 
 Those of DQN, SAC and TD3, which explore by numbers that the learner sends, stand in `exploration.py`.
 
@@ -16,7 +20,8 @@ them.
 from __future__ import annotations
 
 import math
-from typing import Protocol
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -29,6 +34,7 @@ class Distribution(Protocol):
     """Params are [..., P] float32, noise [..., noise_size] float32, actions [..., *action]."""
 
     params_size: int
+    """P"""
 
     def noise(self, generator: np.random.Generator, shape: tuple[int, ...]) -> Floats:
         """Noise [*shape, noise_size] for `sample`."""
@@ -51,7 +57,7 @@ class Categorical:
     """A categorical distribution (Discrete), or several independent ones (MultiDiscrete)."""
 
     def __init__(self, sizes: tuple[int, ...], shape: tuple[int, ...]) -> None:
-        self.params_size = sum(sizes)
+        self.params_size = self.noise_size = sum(sizes)
         self._shape = shape
         ends = np.cumsum(sizes).tolist()
         self._parts = [slice(end - size, end) for end, size in zip(ends, sizes, strict=True)]
@@ -74,7 +80,7 @@ class Categorical:
 
     def log_prob(self, params: Floats, action: Array, noise: Floats | None = None) -> Floats:
         """Log π(action) [...]: summed over the entries of a MultiDiscrete."""
-        flat = action.reshape(*params.shape[:-1], len(self._parts))
+        flat = action.reshape(*params.shape[:-1], len(self._parts)).astype(np.int64, copy=False)
         total = np.zeros(params.shape[:-1], np.float32)
         for i, part in enumerate(self._parts):
             logits = params[..., part]
@@ -88,7 +94,7 @@ class Bernoulli:
     """Independent bits (MultiBinary)."""
 
     def __init__(self, shape: tuple[int, ...]) -> None:
-        self.params_size = math.prod(shape)
+        self.params_size = self.noise_size = math.prod(shape)
         self._shape = shape
 
     def noise(self, generator: np.random.Generator, shape: tuple[int, ...]) -> Floats:
@@ -115,7 +121,7 @@ class Gaussian:
     """A diagonal normal distribution (Box). Actions are stored as sampled; only the action converter clips them."""
 
     def __init__(self, shape: tuple[int, ...]) -> None:
-        self._size = math.prod(shape)
+        self._size = self.noise_size = math.prod(shape)
         self.params_size = 2 * self._size
         self._shape = shape
 
@@ -140,6 +146,57 @@ class Gaussian:
         return np.asarray((np.float32(-0.5) * z * z - log_std - np.float32(LOG_SQRT_2PI)).sum(-1))
 
 
+class Factor(NamedTuple):
+    """A factor of a product, and its part of the last axis of params, noise and actions."""
+
+    distribution: Categorical | Bernoulli | Gaussian
+    params: slice
+    noise: slice
+    action: slice
+
+
+class Product:
+    """Independent distributions, whose actions [k] each are one row [D] float32 together (Dict, Tuple)."""
+
+    def __init__(self, factors: Sequence[tuple[Categorical | Bernoulli | Gaussian, int]]) -> None:
+        """`factors`: each with k, the size of its actions."""
+        self._factors: list[Factor] = []
+        self.params_size = noise_size = size = 0
+        for factor, count in factors:
+            params = slice(self.params_size, self.params_size + factor.params_size)
+            noise = slice(noise_size, noise_size + factor.noise_size)
+            action = slice(size, size + count)
+            self._factors.append(Factor(factor, params, noise, action))
+            self.params_size = params.stop
+            noise_size = noise.stop
+            size = action.stop
+
+    def noise(self, generator: np.random.Generator, shape: tuple[int, ...]) -> Floats:
+        """The noise [*shape, …] of each factor."""
+        return np.concatenate([factor.distribution.noise(generator, shape) for factor in self._factors], -1)
+
+    def sample(self, params: Floats, noise: Floats) -> Array:
+        """A sample of each factor, float32."""
+        return self._row(
+            each.distribution.sample(params[..., each.params], noise[..., each.noise]) for each in self._factors
+        )
+
+    def mode(self, params: Floats) -> Array:
+        """The most probable action of each factor."""
+        return self._row(each.distribution.mode(params[..., each.params]) for each in self._factors)
+
+    def log_prob(self, params: Floats, action: Array, noise: Floats | None = None) -> Floats:
+        """Log π(action) [...], the sum over the factors."""
+        total = np.zeros(params.shape[:-1], np.float32)
+        for each in self._factors:
+            total += each.distribution.log_prob(params[..., each.params], action[..., each.action])
+        return total
+
+    @staticmethod
+    def _row(actions: Iterable[Array]) -> Array:
+        return np.concatenate([action.astype(np.float32, copy=False) for action in actions], -1)
+
+
 def distribution(spec: PolicySpec) -> Distribution:
     """The action distribution of this policy."""
     action = spec.action
@@ -156,3 +213,11 @@ def distribution(spec: PolicySpec) -> Distribution:
             return Bernoulli(action.shape)
         case "box":
             return Gaussian(action.shape)
+        case "mixed":
+            entries = len(action.sizes)
+            factors = (
+                (Categorical(action.sizes, (entries,)), entries),
+                (Bernoulli((action.bits,)), action.bits),
+                (Gaussian((action.numbers,)), action.numbers),
+            )
+            return Product([(factor, size) for factor, size in factors if size])

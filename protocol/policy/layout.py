@@ -14,7 +14,6 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 
 from millrace.protocol.arrays import Array
-from millrace.protocol.policy.distributions import distribution
 from millrace.protocol.policy.features import critic_size, feature_size
 from millrace.protocol.policy.recurrent import core_shapes
 from millrace.protocol.specs import Leaf, PolicySpec
@@ -97,10 +96,9 @@ def parameter_layout(spec: PolicySpec) -> tuple[tuple[Field, ...], tuple[Field, 
             for field in (*hidden, *_linear(f"{name}.out", last, 1, 1.0))
         ]
         return tuple(acting), tuple(critics)
-    outputs = size if action.kind == "box" else distribution(spec).params_size
-    acting += _linear("actor.out", last, outputs, 0.01)
-    if action.kind == "box":
-        acting.append(Field("actor.log_std", (outputs,), 0))
+    acting += _linear("actor.out", last, action.choices + action.bits + action.numbers, 0.01)
+    if action.numbers:
+        acting.append(Field("actor.log_std", (action.numbers,), 0))
     critic, last = ([], last) if spec.shared_net else _hidden("critic", width + critic_size(spec), spec.net)
     return tuple(acting), (*critic, *_linear("critic.out", last, 1, 1.0))
 

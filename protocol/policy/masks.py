@@ -1,9 +1,10 @@
-"""Action masks: which choices of a Discrete or MultiDiscrete action are allowed. Pure numpy.
+"""Action masks: which choices of an action are allowed: of a Discrete, a MultiDiscrete, or such parts of others. Pure numpy.
 
 Rule: a choice that is not allowed gets the logit, or the value, FORBIDDEN. This is a finite number, so nothing becomes NaN;
 and its probability exp(FORBIDDEN − max) is exactly 0, so it adds nothing to an entropy, and its gradient is exactly 0.
 
-A mask is [..., choices] bool. The choices of the entries of a MultiDiscrete action stand one after another.
+A mask is [..., choices] bool. The choices of the entries of an action stand one after another. Their logits come before all
+other parameters, and a stored row of a mixed action begins with what was chosen.
 """
 
 from __future__ import annotations
@@ -20,15 +21,10 @@ FORBIDDEN = -1e30
 _TINY = np.float32(1e-30)
 
 
-def choices(action: ActionSpec) -> int:
-    """The length of a mask; 0 if the space cannot have one."""
-    return sum(action.sizes) if action.kind in ("discrete", "multidiscrete") else 0
-
-
 def stored_leaves(run: RunSpec) -> tuple[Leaf, ...]:
     """The arrays of an observation as workers store them: in a masked run the mask is one more, the last."""
     leaves = run.policy.seen
-    return (*leaves, Leaf(MASK, "multibinary", (choices(run.policy.action),), "bool")) if run.masked else leaves
+    return (*leaves, Leaf(MASK, "multibinary", (run.policy.action.choices,), "bool")) if run.masked else leaves
 
 
 def forbid(params: Floats, mask: Bools) -> Floats:
@@ -79,4 +75,5 @@ def not_allowed(stored: Array, mask: Bools, action: ActionSpec) -> Bools:
     """[...] True where a stored action [..., *action] has a choice that the mask [..., choices] forbids."""
     lead = mask.shape[:-1]
     starts = np.cumsum((0, *action.sizes[:-1]))
-    return np.asarray(~np.take_along_axis(mask, stored.reshape(*lead, len(starts)) + starts, -1).all(-1))
+    chosen = stored.reshape(*lead, -1)[..., : len(starts)].astype(np.int64, copy=False)
+    return np.asarray(~np.take_along_axis(mask, chosen + starts, -1).all(-1))

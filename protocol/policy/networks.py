@@ -330,9 +330,8 @@ class ActorCriticNetwork(FlatNetwork):
 
     def _params(self, h: Tensor) -> Tensor:
         out = self.mlp(h, self._actor)
-        if self.spec.action.kind != "box":
-            return out
-        return torch.cat([out, self.parameters["actor.log_std"].expand_as(out)], -1)
+        log_std = self.parameters.get("actor.log_std")
+        return out if log_std is None else torch.cat([out, log_std.expand(len(out), -1)], -1)
 
     def _common(self, x: Tensor, images: Sequence[Tensor], recurrent: RecurrentInput | None) -> Tensor:
         h = self.encode(x[:, : self._acting_features], images)
@@ -384,7 +383,8 @@ class ActorCriticNetwork(FlatNetwork):
         """
         params, value = self.forward(x, images, recurrent)
         if mask is not None:
-            params = params.masked_fill(~mask, FORBIDDEN)
+            others = params.shape[-1] - mask.shape[-1]  # those of bits and numbers, which come behind the choices
+            params = params.masked_fill(F.pad(~mask, (0, others)), FORBIDDEN)
         return *log_prob_and_entropy(self.spec.action, params, action), value
 
     def act(self, x: Tensor, images: Sequence[Tensor], state: Tensor) -> tuple[Tensor, Tensor]:

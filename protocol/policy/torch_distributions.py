@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -17,21 +19,35 @@ SQUASHED_BOUND = 0.999
 
 def log_prob_and_entropy(spec: ActionSpec, params: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
     """Log π(action) [B] and the entropy of π [B], for params [B, P] and actions [B, *action]; see `distributions`."""
-    match spec.kind:
-        case "discrete":
-            return _categorical(params, action)
-        case "multidiscrete":
-            parts = zip(params.split_with_sizes(spec.sizes, -1), action.reshape(len(params), -1).unbind(-1), strict=True)
-            log_probs, entropies = zip(*(_categorical(logits, choice) for logits, choice in parts), strict=True)
-            return torch.stack(log_probs).sum(0), torch.stack(entropies).sum(0)
-        case "multibinary":
-            bits = action.reshape(params.shape).to(params.dtype)
-            softplus = F.softplus(params)
-            return (bits * params - softplus).sum(-1), (softplus - params * torch.sigmoid(params)).sum(-1)
-        case "box":
-            mean, log_std = params.chunk(2, -1)
-            z = (action.reshape(mean.shape) - mean) * torch.exp(-log_std)
-            return (-0.5 * z * z - log_std - LOG_SQRT_2PI).sum(-1), (log_std + (0.5 + LOG_SQRT_2PI)).sum(-1)
+    factors = _factors(spec)
+    rows = action.reshape(len(params), -1)
+    if len(factors) == 1:
+        return factors[0].of(params, rows)
+    parts = params.split_with_sizes([factor.params for factor in factors], -1)
+    actions = rows.split_with_sizes([factor.actions for factor in factors], -1)
+    log_probs, entropies = zip(
+        *(factor.of(*each) for factor, *each in zip(factors, parts, actions, strict=True)), strict=True
+    )
+    return torch.stack(log_probs).sum(0), torch.stack(entropies).sum(0)
+
+
+class _TorchFactor(NamedTuple):
+    """One of the independent distributions of an action."""
+
+    of: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
+    """its log-probability and entropy"""
+    params: int
+    actions: int
+    """how many columns it has of the params [B, P], and of the actions [B, D]"""
+
+
+def _factors(spec: ActionSpec) -> list[_TorchFactor]:
+    factors = [_TorchFactor(_categorical, size, 1) for size in spec.sizes]
+    if spec.bits:
+        factors.append(_TorchFactor(_bernoulli, spec.bits, spec.bits))
+    if spec.numbers:
+        factors.append(_TorchFactor(_gaussian, 2 * spec.numbers, spec.numbers))
+    return factors
 
 
 def policy_log_prob(policy: PolicySpec, params: Tensor, action: Tensor) -> Tensor:
@@ -62,5 +78,19 @@ def squashed_sample(params: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _categorical(logits: Tensor, choice: Tensor) -> tuple[Tensor, Tensor]:
+    """Of logits [B, n], and the choice [B, 1] among them."""
     log_probs = F.log_softmax(logits, -1)
-    return log_probs.gather(-1, choice[:, None])[:, 0], -(log_probs.exp() * log_probs).sum(-1)
+    return log_probs.gather(-1, choice.long())[:, 0], -(log_probs.exp() * log_probs).sum(-1)
+
+
+def _bernoulli(logits: Tensor, bits: Tensor) -> tuple[Tensor, Tensor]:
+    """Of logits [B, k], and as many bits."""
+    softplus = F.softplus(logits)
+    return (bits.to(logits.dtype) * logits - softplus).sum(-1), (softplus - logits * torch.sigmoid(logits)).sum(-1)
+
+
+def _gaussian(params: Tensor, numbers: Tensor) -> tuple[Tensor, Tensor]:
+    """Of means and log standard deviations [B, 2 k], and numbers [B, k]."""
+    mean, log_std = params.chunk(2, -1)
+    z = (numbers - mean) * torch.exp(-log_std)
+    return (-0.5 * z * z - log_std - LOG_SQRT_2PI).sum(-1), (log_std + (0.5 + LOG_SQRT_2PI)).sum(-1)

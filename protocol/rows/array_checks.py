@@ -59,10 +59,16 @@ def wrong_values(array: Array, space: Leaf | ActionSpec | None = None, axes: Axe
         return f"expected finite values, got {_first(array, ~finite, axes, first)}"
     if space is None or space.kind == "box" or array.dtype.kind == "b":
         return ""
-    sizes = np.reshape(space.sizes, space.shape) if space.sizes else np.full(space.shape, 2)  # of MultiBinary
+    if space.kind == "mixed":
+        sizes = np.array((*space.sizes, *[2] * space.bits), np.int64)
+        array = array[..., : len(sizes)]  # numbers follow
+    else:
+        sizes = np.reshape(space.sizes, space.shape) if space.sizes else np.full(space.shape, 2)  # of MultiBinary
     start = np.reshape(space.start, space.shape) if space.start and isinstance(space, Leaf) else np.zeros_like(sizes)
     counts = array - start
     wrong = (counts < 0) | (counts >= sizes)
+    if array.dtype.kind == "f":
+        wrong |= counts != np.trunc(counts)
     if not np.count_nonzero(wrong):
         return ""
     low, count = (np.broadcast_to(of_entry, array.shape)[wrong][0] for of_entry in (start, sizes))

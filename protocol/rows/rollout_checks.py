@@ -45,7 +45,7 @@ def validate(rollout: Rollout, run: RunSpec, most_steps: int = LARGEST) -> None:
     if (rollout.mask is not None) != run.masked:
         raise BadRollout(f"mask: expected {'one' if run.masked else 'none'}")
     if rollout.mask is not None:
-        expected.append(Expected("mask", rollout.mask, (T + 1, N, sum(action.sizes)), "bool"))
+        expected.append(Expected("mask", rollout.mask, (T + 1, N, action.choices), "bool"))
     if (rollout.resets is not None) != bool(run.seats):
         raise BadRollout(f"resets: expected {'some' if run.seats else 'none'}")
     if rollout.resets is not None:

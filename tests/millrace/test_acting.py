@@ -20,7 +20,7 @@ from millrace.learner.run_folder.run_folder import RunFolder
 from millrace.protocol.arrays import Array
 from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.envs.env_actions import make_action_converter
-from millrace.protocol.envs.spaces import make_unflatten
+from millrace.protocol.envs.spaces import make_flatten, make_unflatten
 from millrace.protocol.messages import EpisodeRows
 from millrace.protocol.specs import RunSpec
 from tests.support.in_process.collectors import TOY, random_weights, run_of
@@ -75,6 +75,7 @@ POLICIES: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
     "tuple": (f"{TOY}Spaces-v0", {"observation": "tuple", "action": "multibinary"}, {}),
     "nested": (f"{TOY}Spaces-v0", {"observation": "nested", "action": "offset"}, {}),
     "doubles": (f"{TOY}Spaces-v0", {"observation": "unbounded", "action": "half"}, {}),
+    "mixed": (f"{TOY}Spaces-v0", {"action": "mixed"}, {}),
 }
 
 
@@ -84,7 +85,9 @@ def test_it_acts_as_an_evaluation_does_bit_for_bit(name: str, copies: int, tmp_p
     env, kwargs, settings = POLICIES[name]
     run = run_of(env, kwargs=kwargs, **settings)
     folder = folder_of(run, tmp_path)
-    unflatten = make_unflatten(run.env.make().observation_space)
+    made = run.env.make()
+    unflatten = make_unflatten(made.observation_space)
+    parts = make_flatten(made.action_space)
     episodes = played(folder, copies)
     policy = millrace.load(folder)
     policy.reset(copies)
@@ -94,8 +97,9 @@ def test_it_acts_as_an_evaluation_does_bit_for_bit(name: str, copies: int, tmp_p
         got = policy(batch)
         for n, (_, actions) in enumerate(episodes):
             if t < len(actions):
-                assert got[n].tobytes() == actions[t].tobytes(), (t, n)
-                assert got[n].dtype == actions[t].dtype
+                for ours, theirs in zip(parts(got), parts(actions[t]), strict=True):
+                    assert ours[n].tobytes() == theirs.tobytes(), (t, n)
+                    assert ours[n].dtype == theirs.dtype
                 compared += 1
     assert compared > 2 * copies
 
@@ -116,6 +120,16 @@ def test_one_observation_gives_one_action_that_the_environment_takes(tmp_path: P
     policy = millrace.load(folder)
     assert [policy(obs).tobytes() for obs in leaves[0][:-1]] == [action.tobytes() for action in actions]
     assert run.env.make().action_space.contains(policy(leaves[0][0]))
+
+
+def test_one_action_of_a_dict_is_a_dict_that_the_environment_takes(tmp_path: Path) -> None:
+    run = run_of(f"{TOY}Spaces-v0", kwargs={"action": "mixed"})
+    policy = millrace.load(folder_of(run, tmp_path))
+    env = run.env.make()
+    observation, _ = env.reset(seed=1)
+    for _ in range(4):
+        observation, _, _, ended, _ = env.step(policy(observation))  # it raises for an action outside its space
+    assert ended
 
 
 def test_sampled_actions_are_those_of_a_recording_with_the_same_seed(tmp_path: Path) -> None:

@@ -85,6 +85,7 @@ RECORDS: tuple[type, ...] = (
     specs.NamedShape,
     specs.Leaf,
     specs.ActionSpec,
+    specs.ActionPart,
 )
 EXAMPLES = (
     example(Hello, pid=7, process_nonce=77, software="millrace", attempt=78),

@@ -16,10 +16,10 @@ from gymnasium.vector import VectorWrapper
 from gymnasium.wrappers import OrderEnforcing
 
 from millrace.protocol.arrays import Array, Bools, Doubles
-from millrace.protocol.envs.action_masks import without_mask
+from millrace.protocol.envs.action_masks import seen_space
 from millrace.protocol.envs.description import agents_in_words, agents_of
 from millrace.protocol.envs.seats import SeatedEnv
-from millrace.protocol.envs.spaces import action_spec, make_flatten, observation_leaves, with_last
+from millrace.protocol.envs.spaces import action_spec, make_flatten, observation_leaves
 from millrace.protocol.envs.which_copy import FIRST_COPY, EnvCopy
 from millrace.protocol.errors import UsageError, first_line
 from millrace.protocol.random_streams import Purpose, env_seed
@@ -188,9 +188,9 @@ class LoopedCopies:
         self.note = ""
         self.saves = all(saver(env) is not None for env in self.envs)
         """whether the environment can save its state"""
-        if masked:
-            self.observation_space = without_mask(self.observation_space, self.action_space)
-        self.observation_space = with_last(self.observation_space, critic_keys)
+        self.observation_space = seen_space(
+            self.observation_space, self.action_space, masked=masked, critic_keys=critic_keys
+        )
         self._nested = isinstance(self.observation_space, gymnasium.spaces.Dict | gymnasium.spaces.Tuple)
         self._read = make_flatten(self.observation_space)
         self._observations: list[Any] = [None] * self.count

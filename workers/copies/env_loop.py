@@ -19,6 +19,7 @@ import numpy as np
 
 from millrace.protocol.bounds import one_line
 from millrace.protocol.envs.answers import STEP, reset_answer, wrong_step
+from millrace.protocol.envs.tuple_of_agents import agents_in_tuples
 from millrace.protocol.envs.which_copy import FIRST_COPY, EnvCopy
 from millrace.protocol.errors import UsageError, safe_repr
 from millrace.workers.activity import (
@@ -208,6 +209,8 @@ class EnvLoop:
     def _check_numbers(self, copies: Iterable[int]) -> None:
         """Raise `CopyFailed` for a text as a number, and for no reward: numpy would take them for True, 1 or NaN."""
         for n in copies:
+            if why := self._rewards_of_agents(n):
+                raise CopyFailed(n, f"step {self.steps}", why)
             for name, value in (
                 ("reward", self.reward[n]),
                 ("terminated", self.terminated[n]),
@@ -216,6 +219,19 @@ class EnvLoop:
                 if isinstance(value, str | bytes) or (value is None and name == "reward"):
                     wrong = f"{name}: expected a number, got {one_line(safe_repr(value), 80)}"
                     raise CopyFailed(n, f"step {self.steps}", f"{wrong}; its step must return ({STEP})")
+
+    def _rewards_of_agents(self, n: int) -> str:
+        """What to do if copy `n` rewards each element of its Tuple spaces, as a line; empty if it does not."""
+        reward = self.reward[n]
+        if not isinstance(reward, list | tuple | np.ndarray):
+            return ""
+        count = agents_in_tuples(self.envs[n].observation_space, self.envs[n].action_space)
+        if count < 2 or np.shape(reward) != (count,):
+            return ""
+        return (
+            f"reward: expected a number, got one for each of {count} elements of its Tuple spaces; if these are agents, add "
+            "--wrappers millrace:TupleOfAgents"
+        )
 
     def close(self) -> None:
         """Close every copy. What a copy raises is ignored."""

@@ -18,7 +18,7 @@ from millrace.protocol.bounds import one_line
 from millrace.protocol.envs.action_masks import has_mask
 from millrace.protocol.envs.spaces import action_spec
 from millrace.protocol.errors import safe_repr
-from millrace.protocol.policy.masks import MASK, choices, no_choice
+from millrace.protocol.policy.masks import MASK, no_choice
 from millrace.workers.copies.env_errors import CopyFailed
 
 DTYPES = ("bool", "int8", "uint8", "int64", "int32")
@@ -27,7 +27,7 @@ _NONE: Mapping[str, Any] = {}
 
 def unused_mask(infos: Iterable[Mapping[str, Any]], action: gymnasium.Space[Any]) -> str:
     """A line for whoever trains, if there is a mask in one of these infos of resets, which the run does not use."""
-    if not choices(action_spec(action)) or not any(isinstance(info, Mapping) and MASK in info for info in infos):
+    if not action_spec(action).choices or not any(isinstance(info, Mapping) and MASK in info for info in infos):
         return ""
     return f"the environment's info has an {MASK}, which this run does not use; --action-masks info does"
 
@@ -37,7 +37,7 @@ class MaskReader:
 
     def __init__(self, observation: gymnasium.Space[Any], action: gymnasium.Space[Any]) -> None:
         self._action = action_spec(action)
-        self._choices = choices(self._action)
+        self._choices = self._action.choices
         self._in_observation = has_mask(observation, action)
         self.everything = np.ones(self._choices, bool)
         """the mask that allows every action"""

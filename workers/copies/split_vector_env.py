@@ -16,7 +16,7 @@ from gymnasium.vector import VectorEnv
 
 from millrace.protocol.arrays import Array
 from millrace.protocol.envs.action_masks import without_mask
-from millrace.protocol.envs.spaces import make_flatten
+from millrace.protocol.envs.spaces import make_batched, make_flatten
 from millrace.protocol.errors import EnvironmentFailed, NoWorkers, WorkerLost
 from millrace.protocol.specs import RunSpec
 from millrace.protocol.wire.plain_values import unpack
@@ -38,7 +38,7 @@ class SplitVectorEnv:
         env: VectorEnv[Any, Any, Any],
         lanes: int,
         before_wait: Callable[[Pulse], None] = lambda pulse: None,
-        step_lanes: Callable[[Sequence[int], Array], Any] | None = None,
+        step_lanes: Callable[[Sequence[int], Any], Any] | None = None,
         facts: Sequence[str] = (),
         *,
         masked: bool = False,
@@ -60,6 +60,7 @@ class SplitVectorEnv:
         self._step_lanes = step_lanes
         self._actions: Array | None = None  # [num_envs, *action]
         self._read = make_flatten(self.observation_space)
+        self._batched = make_batched(action)
         self._result: StepResult | None = None
         self._no_workers: NoWorkers | None = None
         self._calls: Any = getattr(env, "calls", None)  # of a `ZmqVectorEnv`
@@ -96,14 +97,14 @@ class SplitVectorEnv:
         if self._lost:
             self._assign_again(pulse)
         if self._step_lanes is None:
-            result = self._wait(lambda: self.env.step(actions), pulse)
+            result = self._wait(lambda: self.env.step(self._batched(actions)), pulse)
         else:
             if self._actions is None:
-                self._actions = np.zeros((self.env.num_envs, *actions.shape[1:]), actions.dtype)
+                self._actions = np.resize(actions, (self.env.num_envs, *actions.shape[1:]))  # any actions of the space
             padded = self._actions
             step_lanes = self._step_lanes
             padded[copies] = actions
-            result = self._wait(lambda: step_lanes(lanes, padded), pulse)
+            result = self._wait(lambda: step_lanes(lanes, self._batched(padded)), pulse)
         observation, reward, terminated, truncated, infos = result
         self._lost |= bool(self._assigned) and "worker_lost" in infos
         facts: Facts = {}

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -35,7 +35,7 @@ class EvaluatedActions:
         """
         params, value = outputs
         if mask is not None:
-            np.copyto(params, np.float32(FORBIDDEN), where=~mask.T)
+            np.copyto(params[: mask.shape[1]], np.float32(FORBIDDEN), where=~mask.T)
         return *self._distribution.forward(params, action.reshape(len(action), -1)), value[0].copy()
 
     def backward(self, by_results: Sequence[Array]) -> Sequence[Array]:
@@ -98,7 +98,8 @@ class _CategoricalKernel:
         self._p = p
         self._entropy = -np.add.reduce(p * log_p, 0)
         rows = params.shape[1]
-        self._chosen = action[:, 0] * rows + np.arange(rows)  # index of log π(a) in [P · B]
+        choice = action[:, 0].astype(np.int64, copy=False)
+        self._chosen = choice * rows + np.arange(rows)  # index of log π(a) in [P · B]
         return log_p.take(self._chosen), self._entropy.copy()
 
     def backward(self, by_log_prob: Array, by_entropy: Array) -> Array:
@@ -111,22 +112,23 @@ class _CategoricalKernel:
         return g
 
 
-class _MultiCategoricalKernel:
-    """A product of independent categorical distributions: log π and H are sums, so each part has its own gradient."""
+class _ProductKernel:
+    """A product of independent distributions: log π and H are sums, so each factor has its own gradient."""
 
-    def __init__(self, sizes: Sequence[int]) -> None:
-        self._ends = np.cumsum(sizes)[:-1]
-        self._parts = [_CategoricalKernel() for _ in sizes]
+    def __init__(self, factors: Sequence[_KernelFactor]) -> None:
+        self._kernels = [factor.kernel for factor in factors]
+        self._ends_of_params = np.cumsum([factor.params for factor in factors])[:-1]
+        self._ends_of_actions = np.cumsum([factor.actions for factor in factors])[:-1]
 
     def forward(self, params: Array, action: Array) -> tuple[Array, Array]:
-        choices = np.split(action, action.shape[1], -1)
-        logits = np.split(params, self._ends)
-        of_parts = [part.forward(*each) for part, *each in zip(self._parts, logits, choices, strict=True)]
-        log_probs, entropies = zip(*of_parts, strict=True)
+        actions = np.split(action, self._ends_of_actions, -1)
+        parts = np.split(params, self._ends_of_params)
+        of_factors = [kernel.forward(*each) for kernel, *each in zip(self._kernels, parts, actions, strict=True)]
+        log_probs, entropies = zip(*of_factors, strict=True)
         return np.sum(log_probs, 0), np.sum(entropies, 0)
 
     def backward(self, by_log_prob: Array, by_entropy: Array) -> Array:
-        return np.concatenate([part.backward(by_log_prob, by_entropy) for part in self._parts])
+        return np.concatenate([kernel.backward(by_log_prob, by_entropy) for kernel in self._kernels])
 
 
 class _BernoulliKernel:
@@ -168,16 +170,22 @@ class _GaussianKernel:
         return by_mean
 
 
+class _KernelFactor(NamedTuple):
+    """One of the independent distributions of an action."""
+
+    kernel: DistributionKernel
+    params: int
+    actions: int
+    """how many rows of parameters [P, B], and of columns of actions [B, k], are its own"""
+
+
 def distribution_kernel(spec: ActionSpec, log_std: Array | None, by_log_std: Array | None) -> DistributionKernel:
-    """That of this action space. `log_std`, `by_log_std`: [k], for Box actions only; the latter is written."""
-    match spec.kind:
-        case "discrete":
-            return _CategoricalKernel()
-        case "multidiscrete":
-            return _MultiCategoricalKernel(spec.sizes)
-        case "multibinary":
-            return _BernoulliKernel()
-        case "box":
-            assert log_std is not None
-            assert by_log_std is not None
-            return _GaussianKernel(log_std, by_log_std)
+    """That of this action space. `log_std`, `by_log_std`: [numbers], where it has some (Box); the latter is written."""
+    factors = [_KernelFactor(_CategoricalKernel(), size, 1) for size in spec.sizes]
+    if spec.bits:
+        factors.append(_KernelFactor(_BernoulliKernel(), spec.bits, spec.bits))
+    if spec.numbers:
+        assert log_std is not None
+        assert by_log_std is not None
+        factors.append(_KernelFactor(_GaussianKernel(log_std, by_log_std), spec.numbers, spec.numbers))
+    return factors[0].kernel if len(factors) == 1 else _ProductKernel(factors)

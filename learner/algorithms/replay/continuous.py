@@ -84,10 +84,8 @@ class Continuous(OffPolicy):
         """
         name = cls.__name__.lower()
         if action.kind != "box":
-            shape = list(action.shape)
-            raise UsageError(
-                f"{name}: expected an action space Box, got {action.kind}{shape}; take --algo ppo or dqn for it"
-            )
+            others = "ppo or dqn" if action.kind == "discrete" else "ppo"
+            raise UsageError(f"{name}: expected an action space Box, got {action.in_words}; take --algo {others} for it")
         largest = min(float(np.finfo(kind).max) for kind in (action.dtype, "float32"))  # it stands for no bound
         for low, high in zip(action.low, action.high, strict=True):
             if max(-low, high) >= largest:

@@ -90,7 +90,7 @@ class PlayedRows:
         if self._order.greedy and (wrong := lost > LOG_PROB_TOLERANCE * np.maximum(1.0, np.abs(best))).any():
             expected = f"the most probable actions under version {version} (greedy is true)"
             raise Broken(Rule.GREEDY, expected, f"others in {int(wrong.sum())} of {wrong.size} rows")
-        by_chance = self._run.policy.action.kind != "box" and best.sum() > BY_CHANCE
+        by_chance = not self._run.policy.action.numbers and best.sum() > BY_CHANCE
         if not self._order.greedy and is_best.all() and not by_chance:
             raise Broken(
                 Rule.GREEDY, "drawn actions (greedy is false)", f"the most probable one in each of {lost.size} rows"

@@ -36,8 +36,8 @@ def clone(algorithm: Algorithm, episodes: Iterable[Batch], pulse: Callable[[], N
     """Make those gradient steps of cloning these episodes (`clone_epochs`) that are not made yet.
 
     `episodes`: each a batch of one column. Calls `pulse`, which may save the state, between gradient steps. Returns the loss
-    over all steps, and how near the most probable actions are: `clone/loss`, and `clone/accuracy` or
-    `clone/mean_absolute_error`.
+    over all steps, and how near the most probable actions are: `clone/loss`, and `clone/accuracy` (choices and bits) or
+    `clone/mean_absolute_error` (numbers), or both.
 
     Raises `UsageError` if the algorithm derives from neither `ActorCritic` nor `Continuous`, and `RunError` if a loss or a
     gradient is not finite, before the step.
@@ -120,16 +120,23 @@ def _measured(algorithm: ActorCritic | Continuous, parts: Sequence[Demonstration
     size = sum(len(rows.at) for rows in parts)
     with torch.no_grad():
         sums = [_sums(algorithm, rows) for rows in parts]
-    loss, error = (float(total) / size for total in np.sum(sums, 0))
-    if algorithm.policy.action.kind == "box":
-        return {"clone/loss": loss, "clone/mean_absolute_error": error}
-    return {"clone/loss": loss, "clone/accuracy": 1 - error}
+    loss, wrong, error = (float(total) / size for total in np.sum(sums, 0))
+    action = algorithm.policy.action
+    metrics = {"clone/loss": loss}
+    if action.choices or action.bits:
+        metrics["clone/accuracy"] = 1 - wrong
+    if action.numbers:
+        metrics["clone/mean_absolute_error"] = error
+    return metrics
 
 
-def _sums(algorithm: ActorCritic | Continuous, rows: Demonstrations) -> tuple[float, float]:
-    """Sums over these steps: of the loss, and of the error of the most probable action. A wrong choice counts as 1."""
+def _sums(algorithm: ActorCritic | Continuous, rows: Demonstrations) -> tuple[float, float, float]:
+    """Sums over these steps, of the loss, and of the most probable action: whether a choice or a bit is wrong; the mean
+    error of its numbers.
+    """
     policy = algorithm.policy
     loss, params = cloning_loss(algorithm, rows)
     error = abs(distribution(policy).mode(params.cpu().numpy()) - rows.action).reshape(len(rows.at), -1)
-    wrong = error.mean(1) if policy.action.kind == "box" else error.any(1)
-    return loss.item() * len(rows.at), float(wrong.sum())
+    numbers = error[:, error.shape[1] - policy.action.numbers :]
+    wrong = error[:, : error.shape[1] - policy.action.numbers].any(1)
+    return loss.item() * len(rows.at), float(wrong.sum()), float(numbers.mean(1).sum()) if numbers.size else 0.0

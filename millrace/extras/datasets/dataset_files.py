@@ -28,7 +28,7 @@ from millrace.protocol.arrays import Array
 from millrace.protocol.bounds import Natural, one_line
 from millrace.protocol.envs.spaces import STORED_KINDS, action_spec, observation_leaves
 from millrace.protocol.errors import UsageError
-from millrace.protocol.specs import ActionSpec, Leaf
+from millrace.protocol.specs import Leaf
 
 METADATA = "metadata.json"
 ARRAYS = "main_data.hdf5"
@@ -42,7 +42,7 @@ class StoredEpisode(NamedTuple):
 
     number: int
     obs: tuple[Array, ...]  # [L+1, *leaf] for each leaf of the observation
-    action: Array  # [L, *action] as the environment took it
+    action: tuple[Array, ...]  # [L, *part] for each part of the action, as the environment took it
     reward: Array  # [L] float32
     terminated: Array  # [L] bool
     truncated: Array  # [L] bool
@@ -76,6 +76,7 @@ class DatasetFiles:
             self._action_space = self._space("action_space", metadata.action_space)
         self.observation = observation_leaves(self._observation_space)
         self.action = action_spec(self._action_space)
+        self._parts = observation_leaves(self._action_space)
         self.rows = metadata.total_steps
         self.episodes = metadata.total_episodes
         """number of steps, and of episodes"""
@@ -96,7 +97,7 @@ class DatasetFiles:
             groups = (file.group(file.root, f"episode_{number}") for number in range(episodes))
             if (rows := sum(_length(file.array(group, "rewards")) for group in groups)) != self.rows:
                 raise UnfitFile(f"expected {self.rows:,} steps, as {METADATA} says, got {rows:,}")
-            leaves: tuple[Leaf | ActionSpec, ...] = (*self.observation, self.action)
+            leaves = (*self.observation, *self._parts)
             size = rows * sum(math.prod(leaf.shape) * np.dtype(leaf.dtype).itemsize for leaf in leaves)
             if size > file.most_bytes:
                 raise UnfitFile(f"expected at most {file.most_bytes:,} bytes in a file of this size, got {size:,}")
@@ -108,10 +109,11 @@ class DatasetFiles:
         if not L:
             raise UnfitFile(f"{group.name}: expected steps, got none")
         stored = zip(_leaves(file, group, "observations", self._observation_space), self.observation, strict=True)
+        actions = zip(_leaves(file, group, "actions", self._action_space), self._parts, strict=True)
         return StoredEpisode(
             number,
             tuple(self._read_leaf(array, L + 1, leaf, space) for (array, space), leaf in stored),
-            _read(file.array(group, "actions"), L, self.action),
+            tuple(_read(array, L, part) for (array, _), part in actions),
             _read(rewards, L, REWARD),
             _read(file.array(group, "terminations"), L, END),
             _read(file.array(group, "truncations"), L, END),
@@ -152,7 +154,7 @@ def _length(rewards: Any) -> int:
 
 
 def _leaves(file: SelfContainedHDF5, parent: Any, name: str, space: gymnasium.Space[Any]) -> Iterator[tuple[Any, Any]]:
-    """The stored arrays of an observation, in the order of its leaves, with their spaces."""
+    """The stored arrays of an observation or an action, in the order of its leaves, with their spaces."""
     match space:
         case spaces.Dict():
             inside = dict(space.spaces)
@@ -166,7 +168,7 @@ def _leaves(file: SelfContainedHDF5, parent: Any, name: str, space: gymnasium.Sp
         yield from _leaves(file, group, key, inner)
 
 
-def _read(stored: Any, rows: int, leaf: Leaf | ActionSpec) -> Array:
+def _read(stored: Any, rows: int, leaf: Leaf) -> Array:
     """The array [rows, *leaf] in the dtype of the leaf, which must hold each of its values."""
     shape = (rows, *leaf.shape)
     dtype = stored.dtype

@@ -24,7 +24,7 @@ class RecordedEpisode:
     """L steps from a reset to the end of the episode. The last of the L+1 observations is the result of the last step."""
 
     obs: tuple[Array, ...]  # [L+1, *leaf] for each leaf of the observation
-    action: Array  # [L, *action] as the environment took it
+    action: tuple[Array, ...]  # [L, *part] for each part of the action, as the environment took it
     reward: Array  # [L] raw
     terminated: Bools  # [L]
     truncated: Bools  # [L]
@@ -46,7 +46,7 @@ class _Fragment(NamedTuple):
     """The rows of an episode that are in one rollout. They are copies, so the rollout's arrays can be freed."""
 
     obs: tuple[Array, ...]  # [k, *leaf] each; [k+1, *leaf] of the fragment with which the episode ends
-    action: Array  # [k, *action]
+    action: tuple[Array, ...]  # [k, *part] each
     reward: Array
     terminated: Bools
     truncated: Bools  # [k] each
@@ -78,8 +78,8 @@ class _LaneState:
 class EpisodeAssembler:
     """Assembles the episodes of many lanes."""
 
-    def __init__(self, to_env_action: Callable[[Array], Array]) -> None:
-        """`to_env_action` converts the actions of a rollout [k, *action] to those that the environment took."""
+    def __init__(self, to_env_action: Callable[[Array], tuple[Array, ...]]) -> None:
+        """`to_env_action` converts the actions of a rollout [k, *action] to arrays [k, *part] that the environment took."""
         self.left_out = 0
         """number of valid rows in episodes that cannot be whole, because a rollout was dropped or the lane moved"""
         self._to_env_action = to_env_action
@@ -147,7 +147,7 @@ class EpisodeAssembler:
     def _fragment(self, rollout: Rollout, n: int, start: int, end: int, last: bool = False) -> _Fragment:
         return _Fragment(
             obs=tuple(leaf[start : end + last, n].copy() for leaf in rollout.obs),
-            action=np.array(self._to_env_action(rollout.action[start:end, n])),
+            action=tuple(np.array(part) for part in self._to_env_action(rollout.action[start:end, n])),
             reward=rollout.reward[start:end, n].copy(),
             terminated=rollout.terminated[start:end, n].copy(),
             truncated=rollout.truncated[start:end, n].copy(),
@@ -158,7 +158,7 @@ def _joined(fragments: list[_Fragment]) -> RecordedEpisode:
     obs, action, reward, terminated, truncated = zip(*fragments, strict=True)
     return RecordedEpisode(
         obs=tuple(np.concatenate(leaf) for leaf in zip(*obs, strict=True)),
-        action=np.concatenate(action),
+        action=tuple(np.concatenate(part) for part in zip(*action, strict=True)),
         reward=np.concatenate(reward),
         terminated=np.concatenate(terminated),
         truncated=np.concatenate(truncated),

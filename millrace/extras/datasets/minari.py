@@ -18,7 +18,7 @@ from gymnasium import spaces
 from millrace.extras.datasets.dataset_files import ARRAYS
 from millrace.extras.datasets.episode_file import append_episodes
 from millrace.extras.datasets.episodes import RecordedEpisode
-from millrace.protocol.arrays import Array
+from millrace.protocol.envs.spaces import make_unflatten
 from millrace.protocol.errors import RunError, UsageError, first_line
 
 CHUNK_BYTES = 64 * 2**20
@@ -46,8 +46,9 @@ class MinariDataset:
             raise UsageError(
                 f"dataset {dataset_id}: expected names of two letters or more and a version, as in cartpole/expert-v0"
             ) from None
-        if slashed := next((key for key in _keys(env.observation_space) if "/" in key), None):
-            raise UsageError(f"dataset {dataset_id}: Minari cannot keep an observation whose key has a slash, {slashed}")
+        for what, space in (("observation", env.observation_space), ("action", env.action_space)):
+            if slashed := next((key for key in _keys(space) if "/" in key), None):
+                raise UsageError(f"dataset {dataset_id}: Minari cannot keep an {what} whose key has a slash, {slashed}")
         root = get_dataset_path()
         self._folder = get_dataset_path(dataset_id)
         if self._folder.exists():
@@ -68,15 +69,15 @@ class MinariDataset:
 
         buffer = EpisodeBuffer(
             seed=episode.seed,
-            observations=nested(self._env.observation_space, iter(episode.obs)),
-            actions=episode.action,
+            observations=make_unflatten(self._env.observation_space)(episode.obs),
+            actions=make_unflatten(self._env.action_space)(episode.action),
             rewards=episode.reward,
             terminations=episode.terminated,
             truncations=episode.truncated,
             infos={},
         )
         self._chunk.append(buffer)
-        self._chunk_bytes += episode.action.nbytes + sum(leaf.nbytes for leaf in episode.obs)
+        self._chunk_bytes += sum(array.nbytes for array in (*episode.action, *episode.obs))
         if self._chunk_bytes > CHUNK_BYTES:
             self._write()
 
@@ -146,17 +147,6 @@ class MinariDataset:
         about = {"dataset_id": self._id, "algorithm_name": "millrace", "description": self._about}
         storage.update_metadata(about | {"minari_version": minari.__version__})
         return storage
-
-
-def nested(space: gymnasium.Space[Any], leaves: Iterator[Array]) -> Any:
-    """Put the arrays of an observation (in the space's own order) back into the Dicts and Tuples of the space."""
-    match space:
-        case spaces.Dict():
-            return {key: nested(inner, leaves) for key, inner in space.spaces.items()}
-        case spaces.Tuple():
-            return tuple(nested(inner, leaves) for inner in space.spaces)
-        case _:
-            return next(leaves)
 
 
 def _spec_can_be_stored(env: gymnasium.Env[Any, Any]) -> bool:

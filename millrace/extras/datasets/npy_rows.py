@@ -32,7 +32,7 @@ class NpyRows:
         """Add a row for each step. The last observation gets no row, because no action followed it."""
         if self._target is None:
             return
-        columns = [*(leaf[:-1] for leaf in episode.obs), episode.action]
+        columns = [*(leaf[:-1] for leaf in episode.obs), *episode.action]
         rows = np.concatenate([np.reshape(column, (episode.length, -1)) for column in columns], axis=1, dtype="<f4")
         with self._as_run_error():
             self._file.write(rows.tobytes())

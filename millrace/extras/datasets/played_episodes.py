@@ -12,7 +12,7 @@ from millrace.extras.datasets.episodes import RecordedEpisode
 from millrace.learner.policy_player import PolicyPlayer
 from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan, PlayedEpisode
 from millrace.protocol.arrays import Array
-from millrace.protocol.envs.env_actions import action_converter_of
+from millrace.protocol.envs.env_actions import action_leaves_of
 from millrace.protocol.messages import EpisodeRows
 from millrace.protocol.random_streams import Purpose, env_seed
 
@@ -46,7 +46,7 @@ class PlayedEpisodes:
         self._player = player
         self._seeds = iter(seeds)
         self._stochastic = stochastic
-        self._to_env_action = action_converter_of(player.policy.spec)
+        self._to_env_action = action_leaves_of(player.policy.spec)
         self._episodes = self._steps = self._bytes = 0  # played so far
 
     def until(self, steps: int) -> Iterator[tuple[RecordedEpisode, bool]]:
@@ -98,7 +98,7 @@ class PlayedEpisodes:
         leaves = [[some.obs[i][bool(n) :] for n, some in enumerate(rows)] for i in range(len(rows[0].obs))]
         return RecordedEpisode(
             obs=tuple(np.concatenate(parts) for parts in leaves),
-            action=np.asarray(self._to_env_action(np.concatenate([some.action for some in rows]))),
+            action=self._to_env_action(np.concatenate([some.action for some in rows])),
             reward=np.concatenate([some.reward for some in rows]),
             terminated=np.concatenate([some.terminated for some in rows]),
             truncated=np.concatenate([some.truncated for some in rows]),
@@ -115,7 +115,7 @@ def _cut(episode: RecordedEpisode, length: int) -> RecordedEpisode:
     truncated[-1] = True
     return RecordedEpisode(
         obs=tuple(leaf[: length + 1] for leaf in episode.obs),
-        action=episode.action[:length],
+        action=tuple(part[:length] for part in episode.action),
         reward=episode.reward[:length],
         terminated=episode.terminated[:length],
         truncated=truncated,

@@ -16,7 +16,7 @@ from millrace.learner.callbacks.callback import Callback
 from millrace.learner.run_folder.progress import Progress
 from millrace.protocol.envs.action_masks import without_mask
 from millrace.protocol.envs.description import DescribedEnv
-from millrace.protocol.envs.env_actions import action_converter_of
+from millrace.protocol.envs.env_actions import action_leaves_of
 from millrace.protocol.errors import RunError
 from millrace.protocol.rollout import Rollout
 from millrace.protocol.specs import RunSpec
@@ -35,7 +35,7 @@ class TrainingRecorder(Callback):
 
         Raises `UsageError`, with a one-line message, if the dataset cannot be made.
         """
-        self._assembler = EpisodeAssembler(action_converter_of(run.policy))
+        self._assembler = EpisodeAssembler(action_leaves_of(run.policy))
         self._id = dataset_id
         self._episodes = 0
         self._dataset = MinariDataset(dataset_id, EnvironmentOfDataset(env, masked=run.masked), about)

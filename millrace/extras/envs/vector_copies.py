@@ -12,9 +12,9 @@ from gymnasium.vector import VectorEnv
 
 from millrace.extras.envs.vectorized import check_resets_next_step
 from millrace.protocol.arrays import Array
-from millrace.protocol.envs.action_masks import without_mask
+from millrace.protocol.envs.action_masks import seen_space
 from millrace.protocol.envs.answers import reset_answer, wrong_step
-from millrace.protocol.envs.spaces import make_flatten, with_last
+from millrace.protocol.envs.spaces import make_batched, make_flatten
 from millrace.protocol.errors import UsageError
 from millrace.protocol.wire.plain_values import unpack
 from millrace.workers.activity import RESETTING, STEPPING, activity
@@ -51,10 +51,11 @@ class VectorCopies:
         self.observation_space = env.single_observation_space
         self.action_space = env.single_action_space
         self._masks = MaskReader(self.observation_space, self.action_space) if masked else None
-        if masked:
-            self.observation_space = without_mask(self.observation_space, self.action_space)
-        self.observation_space = with_last(self.observation_space, critic_keys)
+        self.observation_space = seen_space(
+            self.observation_space, self.action_space, masked=masked, critic_keys=critic_keys
+        )
         self._read = make_flatten(self.observation_space)
+        self._batched = make_batched(self.action_space)
 
     def reset(self, seeds: Sequence[int], pulse: Pulse) -> Leaves:
         """Start episodes in all copies, with a seed for each, or the first seed where the environment takes only one."""
@@ -86,7 +87,7 @@ class VectorCopies:
         """Step all copies at once."""
         self._activity.begin(STEPPING)
         try:
-            answer = self._env.step(actions)
+            answer = self._env.step(self._batched(actions))
         except BaseException as error:
             raise CopyFailed(None, "step") from error
         finally:

@@ -108,7 +108,7 @@ def test_stored_actions_are_converted_to_those_of_the_environment(space: gymnasi
     space.seed(1)
     policy = PolicySpec(observation_leaves(BOX), action_spec(space), head=head)
     actions = np.stack([space.sample() for _ in range(20)])
-    stored = stored_actions_of(policy)(actions)
+    stored = stored_actions_of(policy)([actions])
     assert stored.dtype == np.dtype(policy.action.stored_dtype)
     if head == "squashed":
         assert np.abs(stored).max() <= 1

@@ -31,7 +31,7 @@ from millrace.learner.run_folder.progress import Progress
 from millrace.learner.run_folder.results import RecordedDataset
 from millrace.learner.run_folder.run_folder import RunFolder
 from millrace.protocol.env_spec import EnvSpec
-from millrace.protocol.envs.env_actions import make_action_converter
+from millrace.protocol.envs.env_actions import action_leaves_of, make_action_converter
 from millrace.protocol.envs.spaces import action_spec, make_flatten, observation_leaves
 from millrace.protocol.errors import EnvironmentFailed, RunError, UsageError, UserFacingError
 from millrace.protocol.policy.distributions import distribution
@@ -110,14 +110,14 @@ def check_whole(episode: RecordedEpisode) -> None:
     assert (where[:, :3] == where[0, :3]).all()
     assert where[:, 3].tolist() == step.tolist() == list(range(L + 1))
     assert episode.reward.tolist() == list(range(1, L + 1))
-    assert episode.action.tolist() == [100 + 10 * where[0, 2] + t for t in range(L)]
+    assert episode.action[0].tolist() == [100 + 10 * where[0, 2] + t for t in range(L)]
     ended = episode.terminated | episode.truncated
     assert ended[-1]
     assert not ended[:-1].any()
 
 
-def taken(action: Array) -> Array:
-    return action + 100
+def taken(action: Array) -> tuple[Array, ...]:
+    return (action + 100,)
 
 
 @examples(100)
@@ -136,7 +136,7 @@ def test_the_episodes_of_a_copy_are_its_rows_without_the_resets(stream: list[tup
             for arrays in (
                 [r.obs[0][:-1] for r in rows],
                 [r.valid for r in rows],
-                [taken(r.action) for r in rows],
+                [taken(r.action)[0] for r in rows],
                 [r.reward for r in rows],
                 [r.terminated for r in rows],
                 [r.truncated for r in rows],
@@ -149,7 +149,7 @@ def test_the_episodes_of_a_copy_are_its_rows_without_the_resets(stream: list[tup
             assert sum(e.length for e in mine) == len(kept)
             if mine:
                 assert np.array_equal(np.concatenate([e.obs[0][:-1] for e in mine]), obs[kept, n])
-                assert np.array_equal(np.concatenate([e.action for e in mine]), action[kept, n])
+                assert np.array_equal(np.concatenate([e.action[0] for e in mine]), action[kept, n])
                 assert np.array_equal(np.concatenate([e.reward for e in mine]), reward[kept, n])
                 assert np.array_equal(np.concatenate([e.terminated for e in mine]), terminated[kept, n])
                 assert np.array_equal(np.concatenate([e.truncated for e in mine]), truncated[kept, n])
@@ -201,13 +201,13 @@ def test_an_episode_has_no_hole_where_steps_are_in_no_rollout(
 
 def test_what_is_kept_is_a_copy() -> None:
     ((_, first), (_, second)) = lives([[[0], [0], [0], [1]]], steps=2)
-    assembler = EpisodeAssembler(lambda action: action)
+    assembler = EpisodeAssembler(lambda action: (action,))
     assert assembler.add(first, 0) == []
     for array in (*first.obs, first.action, first.reward):
         array[...] = 77
     (episode,) = assembler.add(second, 0)
     assert episode.obs[1].tolist() == [0, 1, 2, 3, 4]
-    assert episode.action.tolist() == [0, 1, 2, 3]
+    assert episode.action[0].tolist() == [0, 1, 2, 3]
     assert (assembler.waiting, assembler.left_out) == (0, 0)
 
 
@@ -318,7 +318,7 @@ def played(run: Path, seed: int, stochastic: bool, episodes: int) -> list[Record
             rows.append((taken, reward, terminated, truncated))
         actions, rewards, terminations, truncations = (np.array(column) for column in zip(*rows, strict=True))
         leaves = [np.stack(leaf) for leaf in zip(*map(read, obs), strict=True)]
-        found.append(RecordedEpisode(tuple(leaves), actions, rewards, terminations, truncations, reset_seed))
+        found.append(RecordedEpisode(tuple(leaves), (actions,), rewards, terminations, truncations, reset_seed))
     return found
 
 
@@ -349,7 +349,7 @@ def test_minari_reads_back_what_was_played(
             assert len(leaf) == L + 1
             assert leaf.dtype == array.dtype
             assert np.array_equal(leaf, array)
-        assert np.array_equal(got.actions, want.action)
+        assert np.array_equal(got.actions, want.action[0])
         assert got.actions.dtype == np.float32
         assert np.abs(got.actions).max() <= 0.25  # as the environment took them: clipped
     seeds = [metadata["seed"] for metadata in dataset.storage.get_episode_metadata(range(11))]
@@ -384,7 +384,7 @@ def test_images_are_kept_as_they_are(root: Path) -> None:
     images = np.random.default_rng(0).integers(0, 256, (3, 8, 9, 3), np.uint8)
     with dataset_module.MinariDataset("tests/images-v0", env, "two steps") as dataset:
         flags = np.zeros(2, bool)
-        dataset.add(RecordedEpisode((images,), np.zeros((2, 2), np.float32), np.zeros(2), flags, flags))
+        dataset.add(RecordedEpisode((images,), (np.zeros((2, 2), np.float32),), np.zeros(2), flags, flags))
     (episode,) = read("tests/images-v0")
     assert np.array_equal(episode.observations, images)
 
@@ -393,10 +393,10 @@ def test_the_same_seed_plays_the_same_and_drawn_actions_are_not_the_most_probabl
     run = a_run(tmp_path, EnvSpec("CartPole-v1"))
     first, again, drawn = (played(run, 3, stochastic, 2) for stochastic in (False, False, True))
     for a, b in zip(first, again, strict=True):
-        assert np.array_equal(a.action, b.action)
+        assert np.array_equal(a.action[0], b.action[0])
         assert np.array_equal(a.obs[0], b.obs[0])
     assert first[0].seed == drawn[0].seed
-    assert not np.array_equal(first[0].action, drawn[0].action)
+    assert not np.array_equal(first[0].action[0], drawn[0].action[0])
 
 
 def test_the_dataset_does_not_depend_on_the_number_of_workers(tmp_path: Path, root: Path) -> None:
@@ -416,7 +416,9 @@ def test_the_notebooks_array_has_a_row_for_each_step(tmp_path: Path, root: Path)
     t = 0
     for episode in played(run, 2, False, 3):
         for step in range(episode.length):
-            row = np.concatenate([np.ravel(leaf[step]) for leaf in episode.obs] + [episode.action[step]]).astype(np.float32)
+            row = np.concatenate([np.ravel(leaf[step]) for leaf in episode.obs] + [episode.action[0][step]]).astype(
+                np.float32
+            )
             assert np.array_equal(rows[t], row)
             t += 1
     assert t == 12
@@ -547,7 +549,7 @@ def test_nothing_is_left_of_a_training_dataset_that_cannot_be_written(
 def test_an_episode_that_another_worker_goes_on_with_is_recorded_whole() -> None:
     run = run_of("CartPole-v1", T=7, N=3)
     history = LaneHistory.of_nothing(3, most_steps=500)
-    to_env_action = make_action_converter(run.policy.action)
+    to_env_action = action_leaves_of(run.policy)
     moved, whole = EpisodeAssembler(to_env_action), EpisodeAssembler(to_env_action)
     stayed, went = (Collector(run, random_policy(run.policy)) for _ in range(2))
     found: dict[str, list[RecordedEpisode]] = {"moved": [], "whole": []}

@@ -30,7 +30,8 @@ from millrace.algorithms import (
 from millrace.learner.algorithm_check.same_bits import first_difference
 from millrace.learner.algorithms import ALGORITHMS, Algorithm, algorithm_class
 from millrace.protocol.arrays import Floats
-from millrace.protocol.errors import MillraceError, RunError
+from millrace.protocol.errors import MillraceError, RunError, UsageError
+from millrace.protocol.specs import ActionSpec
 from millrace.testing import AlgorithmMistakes, check_algorithm
 from tests.support.variants import variants
 
@@ -290,6 +291,20 @@ class OtherLoss(PPO):
     def loss(self, rows: LossInput) -> tuple[torch.Tensor, Mapping[str, torch.Tensor | float]]:
         ratio = (rows.log_prob_now - rows.log_prob).exp()
         return -(ratio * rows.advantage).mean() + (rows.value - rows.target).square().mean(), {}
+
+
+class OnlyMixed(PPO):
+    """Takes no actions but those of a Dict or Tuple."""
+
+    @staticmethod
+    def policy_spec(config: Any, observation: Any, action: ActionSpec) -> PolicySpec:
+        if not action.parts:
+            raise UsageError(f"only mixed: expected a Dict or Tuple, got {action.in_words}")
+        return PPO.policy_spec(config, observation, action)
+
+
+def test_an_algorithm_of_dicts_and_tuples_alone_is_checked_and_learns() -> None:
+    check_algorithm(OnlyMixed, **SMALL)
 
 
 def test_a_subclass_of_ppo_need_not_log_what_ppo_logs() -> None:

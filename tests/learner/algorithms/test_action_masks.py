@@ -33,10 +33,12 @@ from tests.support.numbers.batches import batch, no_pulse
 
 OBSERVATION = spaces.Box(-np.inf, np.inf, (4,))
 ACTIONS: dict[str, Any] = {"discrete": spaces.Discrete(5), "multidiscrete": spaces.MultiDiscrete([2, 4, 3])}
+MIXED = spaces.Tuple([spaces.Box(-1, 1, (2,)), spaces.Discrete(5), spaces.MultiBinary(2)])
 
 
 def spec_of(action: str, **settings: Any) -> PolicySpec:
-    return PolicySpec(observation_leaves(OBSERVATION), action_spec(ACTIONS[action]), (16, 16), **settings)
+    space = MIXED if action == "mixed" else ACTIONS[action]
+    return PolicySpec(observation_leaves(OBSERVATION), action_spec(space), (16, 16), **settings)
 
 
 def random_masks(generator: np.random.Generator, shape: tuple[int, ...], sizes: tuple[int, ...]) -> Bools:
@@ -144,7 +146,7 @@ def test_a_choice_for_each_entry() -> None:
 
 
 @pytest.mark.parametrize("small", [True, False])
-@pytest.mark.parametrize("action", sorted(ACTIONS))
+@pytest.mark.parametrize("action", [*sorted(ACTIONS), "mixed"])
 def test_a_choice_that_is_always_forbidden_gets_no_gradient(
     action: str, small: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -24,6 +24,7 @@ from tests.support.numbers.batches import (
     DISCRETE,
     GAUSSIAN,
     LANES,
+    MIXED,
     T,
     batch,
     identity_batch,
@@ -202,6 +203,7 @@ LEARNS["ppo"] = {"learning_rate": 0.01, "n_epochs": 5}
     ("spec", "start", "goal"),
     [
         (normal(DISCRETE), 0.5, 0.95),
+        (normal(MIXED), -1.0, 0.4),
         pytest.param(shared(DISCRETE), 0.5, 0.95, marks=pytest.mark.rest),
         pytest.param(normal(GAUSSIAN), -1.5, -0.45, marks=pytest.mark.rest),
     ],

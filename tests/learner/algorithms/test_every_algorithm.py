@@ -16,7 +16,7 @@ from millrace.learner.config.hyperparameters import HYPERPARAMETERS
 from millrace.protocol.errors import RunError
 from millrace.protocol.specs import PolicySpec
 from tests.learner.algorithms.test_action_masks import masked_batch, spec_of
-from tests.support.numbers.batches import DISCRETE, GAUSSIAN, IMAGE, T, batch, no_pulse, normal, recurrent, shared
+from tests.support.numbers.batches import DISCRETE, GAUSSIAN, IMAGE, MIXED, T, batch, no_pulse, normal, recurrent, shared
 from tests.support.variants import variants
 
 ALL: dict[str, Any] = {"normalize_rewards": True, "learning_rate_schedule": "linear"}
@@ -36,6 +36,7 @@ ON_POLICY: dict[str, tuple[PolicySpec, dict[str, Any]]] = {
     "discrete": (normal(DISCRETE), {"optimizer": "adam"}),
     "Gaussian": (normal(GAUSSIAN), {"optimizer": "rmsprop"}),
     "images": (shared(IMAGE), {"optimizer": "adam"}),
+    "mixed": (MIXED, {"optimizer": "adam"}),
 }
 STEPS: dict[str, dict[str, Any]] = {
     "dqn": {"gradient_steps": 3},
@@ -88,7 +89,7 @@ def subject_of(name: str, spec: PolicySpec, settings: dict[str, Any], masks: boo
 
 
 ONE_KIND = (
-    "ppo, discrete",
+    "ppo, mixed",
     "a2c, Gaussian",
     "impala, LSTM",
     "reinforce, masks",

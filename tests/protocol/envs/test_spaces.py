@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +13,21 @@ import pytest
 from gymnasium import spaces
 from gymnasium.vector.utils import batch_space
 
+from millrace.learner.algorithm_check.same_bits import first_difference
+from millrace.protocol.action_parts import parts_of
 from millrace.protocol.arrays import Array
-from millrace.protocol.envs.env_actions import make_action_converter
-from millrace.protocol.envs.spaces import action_spec, make_flatten, observation_leaves
+from millrace.protocol.envs.env_actions import action_leaves_of, make_action_converter, stored_actions_of
+from millrace.protocol.envs.spaces import (
+    action_spec,
+    leaves_with_own_dtype,
+    make_flatten,
+    make_unflatten,
+    observation_leaves,
+)
 from millrace.protocol.errors import BadRollout, UsageError
 from millrace.protocol.rollout import Episode, Rollout
 from millrace.protocol.rows.rollout_checks import validate, wrong_facts
-from millrace.protocol.specs import RunSpec
+from millrace.protocol.specs import ActionSpec, PolicySpec, RunSpec
 from tests.support.envs.toy import ACTIONS, OBSERVATIONS, UNSUPPORTED_ACTIONS, UNSUPPORTED_OBSERVATIONS
 from tests.support.in_process.collectors import TOY, bits, collect, random_collector, run_of, sync_vector_env_over
 
@@ -78,21 +87,78 @@ def test_a_batch_is_read_like_one_observation(observation: str) -> None:
         assert np.shape(several) == (5, *leaf.shape)
 
 
+def stored_actions(spec: ActionSpec, count: int) -> Array:
+    """Random actions [count, *action] as rollouts store them."""
+    if spec.parts:
+        drawn = {part.columns.start: stored_actions(part.spec, count).reshape(count, -1) for part in parts_of(spec)}
+        return np.concatenate([drawn[start] for start in sorted(drawn)], 1).astype(np.float32)
+    generator = np.random.default_rng(0)
+    shape = (count, *spec.shape)
+    if spec.kind == "box":
+        return generator.normal(0, 10, shape).astype(np.float32)
+    return generator.integers(0, np.reshape(spec.sizes, spec.shape) if spec.sizes else 2, shape)
+
+
 @pytest.mark.parametrize("action", DONE)
 def test_whatever_is_sampled_is_written_into_the_space(action: str) -> None:
     space = ACTIONS[action]
-    spec = action_spec(space)
-    generator = np.random.default_rng(0)
-    sizes = np.reshape(spec.sizes, spec.shape) if spec.sizes else 2
-    drawn = (
-        generator.normal(0, 10, (50, *spec.shape)) if spec.kind == "box" else generator.integers(0, sizes, (50, *spec.shape))
-    )
-    stored = drawn.astype(spec.stored_dtype)
+    policy = PolicySpec((), action_spec(space))
+    stored = stored_actions(policy.action, 50)
     before = stored.copy()
-    written = make_action_converter(spec)(stored)
-    assert written.dtype == space.dtype
-    assert all(space.contains(np.asarray(row)) for row in written)
+    leaves = action_leaves_of(policy)(stored)
+    assert [leaf.dtype for leaf in leaves] == [leaf.dtype for leaf in leaves_with_own_dtype(space)]
+    structures = [make_unflatten(space)([np.asarray(leaf[n]) for leaf in leaves]) for n in range(50)]
+    assert all(map(space.contains, structures))  # a Box without dimensions wants an array, and gets a number below
+    written = make_action_converter(policy.action)(stored)
+    flatten = make_flatten(space)
+    for row, structure in zip(written, structures, strict=True):
+        assert first_difference([np.asarray(leaf) for leaf in flatten(row)], list(flatten(structure))) is None
     assert (stored == before).all()
+
+
+@pytest.mark.parametrize("action", DONE)
+def test_actions_of_the_environment_come_back_from_stored_ones(action: str) -> None:
+    policy = PolicySpec((), action_spec(ACTIONS[action]))
+    taken = action_leaves_of(policy)(stored_actions(policy.action, 50))
+    stored = stored_actions_of(policy)(taken)
+    assert stored.dtype == policy.action.stored_dtype
+    assert stored.shape == (50, *policy.action.shape)
+    assert first_difference(action_leaves_of(policy)(stored), taken) is None
+
+
+def test_a_row_has_all_choices_then_all_bits_then_all_numbers() -> None:
+    spec = action_spec(ACTIONS["mixed"])
+    assert (spec.kind, spec.shape, spec.stored_dtype) == ("mixed", (1 + 4 + 1 + 2 + 2 + 1,), "float32")
+    assert (spec.sizes, spec.start, spec.bits) == ((3, 2, 3, 4, 5, 4), (5, 1, 0, 0, -2, 0), 2)
+    assert (spec.low, spec.high) == ((0.0, -0.1, -0.1), (math.inf, 0.1, 0.1))
+    assert [(part.path, part.kind, part.shape, part.dtype) for part in spec.parts] == [
+        (("arm", 0), "discrete", (), "int64"),
+        (("arm", 1), "multidiscrete", (2, 2), "int64"),
+        (("arm", 2, "grip"), "multibinary", (2,), "int8"),
+        (("brake",), "box", (), "float32"),
+        (("gear",), "discrete", (), "int64"),
+        (("speed",), "box", (2,), "float64"),
+    ]
+    (written,) = make_action_converter(spec)(np.array([[2, 1, 2, 3, 4, 3, 0, 1, 7, -5, 0.05]], np.float32))
+    assert list(written) == ["arm", "brake", "gear", "speed"]
+    choice, table, grip = written["arm"]
+    assert (choice, table.tolist(), grip["grip"].tolist()) == (7, [[2, 2], [3, 2]], [0, 1])
+    assert (written["brake"], written["gear"]) == (7, 3)
+    assert written["speed"].tolist() == [-0.1, float(np.float32(0.05))]
+
+
+@pytest.mark.parametrize(
+    "space", [spaces.Tuple([]), spaces.Dict({}), spaces.Tuple([spaces.Discrete(2), spaces.Dict({"a": spaces.Tuple([])})])]
+)
+def test_a_dict_or_tuple_of_no_actions_is_refused(space: Any) -> None:
+    with pytest.raises(UsageError, match=r"^action space .*: expected at least one space in each Dict and Tuple, got one"):
+        action_spec(space)
+
+
+def test_choices_that_float32_cannot_tell_apart_are_refused() -> None:
+    assert action_spec(spaces.Tuple([spaces.Discrete(2**24)])).sizes == (2**24,)
+    with pytest.raises(UsageError, match=r"expected at most 16,777,216 choices, got 16,777,217$"):
+        action_spec(spaces.Tuple([spaces.Discrete(2), spaces.Discrete(2**24 + 1)]))
 
 
 def test_actions_are_shifted_to_where_the_space_starts() -> None:
@@ -135,15 +201,6 @@ def test_an_action_space_that_is_not_supported_is_one_line(name: str) -> None:
     ) as caught:
         spaces_run(action=name)
     assert "\n" not in str(caught.value)
-
-
-def test_a_tuple_of_actions_is_answered_with_the_recipes_that_make_agents_or_one_array_of_it() -> None:
-    pages = {"several_agents.md": "A Tuple of actions", "third_party_environments.md": "Tuple actions"}
-    with pytest.raises(UsageError) as caught:
-        action_spec(spaces.Tuple([spaces.Discrete(5), spaces.Discrete(5)]))
-    for page, heading in pages.items():
-        assert f"'{heading}' in docs/how-to/{page}" in str(caught.value)
-        assert f"\n## {heading}\n" in (ROOT / "docs" / "how-to" / page).read_text()
 
 
 @pytest.mark.parametrize("space", [spaces.Box(-1, 1, (0,)), spaces.Box(-1, 1, (2, 0)), spaces.MultiDiscrete([])])

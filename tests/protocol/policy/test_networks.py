@@ -14,6 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
+from millrace.protocol.action_parts import mixed
 from millrace.protocol.arrays import Array
 from millrace.protocol.policy.distributions import distribution
 from millrace.protocol.policy.features import features
@@ -49,6 +50,11 @@ ACTIONS = {
     "multidiscrete": ActionSpec("multidiscrete", (2, 2), "int64", (2, 3, 4, 2), (0, 0, 0, 0)),
     "multibinary": ActionSpec("multibinary", (3,), "int8"),
     "box": ActionSpec("box", (2, 2), "float32", low=(-1.0,) * 4, high=(1.0,) * 4),
+}
+ACTIONS |= {
+    "choice and numbers": mixed([((0,), ACTIONS["box"]), ((1,), ACTIONS["discrete"])]),
+    "bits twice": mixed([(("a",), ACTIONS["multibinary"]), (("b",), ACTIONS["multibinary"])]),
+    "all kinds": mixed([(("a", number), spec) for number, spec in enumerate(ACTIONS.values())]),
 }
 
 

@@ -116,6 +116,26 @@ class Identity(gymnasium.Env[Floats, Any]):
         return np.equal(np.arange(self._n), self._sign).astype(np.float32)
 
 
+class Steer(Identity):
+    """Shows one of four signs. The action is a Tuple of a number and a choice.
+
+    A right choice gets 1, and the number loses its squared distance from -1 for the first sign to 1 for the last.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(4)
+        self.action_space: Any = spaces.Tuple([spaces.Box(-2, 2, (1,), np.float32), spaces.Discrete(4, start=1)])
+
+    def step(self, action: Any) -> tuple[Floats, float, bool, bool, Info]:
+        """Reward both parts, and show the next sign."""
+        if not self.action_space.contains(action):
+            raise ValueError(f"action: expected one of {self.action_space}, got {action!r}")
+        number, choice = action
+        lost = float(number[0] - (2 * self._sign / 3 - 1)) ** 2
+        shown, reward, terminated, truncated, info = super().step(choice - 1)
+        return shown, reward - lost, terminated, truncated, info
+
+
 class Recall(gymnasium.Env[Floats, Any]):
     """Shows one of `n` signs, one-hot, for one step. The action `delay` steps later gets 1 if it is the number of the sign.
 
@@ -291,11 +311,21 @@ ACTIONS: dict[str, gymnasium.Space[Any]] = {
     "doubles": spaces.Box(-0.1, 0.1, (2,), np.float64),
     "half": spaces.Box(np.array([0, -np.inf]), np.array([np.inf, 0]), dtype=np.float64),
     "unbounded": spaces.Box(-np.inf, np.inf, (2, 2), np.float32),
+    "pair": spaces.Tuple([spaces.Discrete(3), spaces.Box(-0.1, 0.1, (2,), np.float32)]),
+    "mixed": spaces.Dict(
+        {
+            "speed": spaces.Box(-0.1, 0.1, (2,), np.float64),
+            "arm": spaces.Tuple([spaces.Discrete(3, start=5), _TABLE, spaces.Dict({"grip": spaces.MultiBinary(2)})]),
+            "brake": spaces.Box(0, np.inf, (), np.float32),
+            "gear": spaces.Discrete(4),
+        }
+    ),
     "integers": spaces.Box(0, 5, (2,), np.int64),
     "text": spaces.Text(5),
+    "integers inside": spaces.Tuple([spaces.Discrete(2), spaces.Box(0, 5, (2,), np.int64)]),
 }
 UNSUPPORTED_OBSERVATIONS = ("text", "words")
-UNSUPPORTED_ACTIONS = ("integers", "text")
+UNSUPPORTED_ACTIONS = ("integers", "text", "integers inside")
 
 
 class Spaces(gymnasium.Env[Any, Any]):
@@ -315,11 +345,32 @@ class Spaces(gymnasium.Env[Any, Any]):
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, Info]:
         """Show another random observation. The reward is the sum of the action."""
-        box = isinstance(self.action_space, spaces.Box)
-        if not self.action_space.contains(np.asarray(action) if box else action):  # a scalar Box iterates as scalars
+        if not self.action_space.contains(_with_arrays(action)):
             raise ValueError(f"action: expected one of {self.action_space}, got {action!r} of type {type(action).__name__}")
         self._steps += 1
-        return self.observation_space.sample(), float(np.sum(action)), False, self._steps == 4, {}
+        return self.observation_space.sample(), _sum(action), False, self._steps == 4, {}
+
+
+def _with_arrays(action: Any) -> Any:
+    """The same action, with an array in place of each number of a Box without dimensions: it iterates as scalars."""
+    match action:
+        case dict():
+            return {key: _with_arrays(inner) for key, inner in action.items()}
+        case tuple():
+            return tuple(map(_with_arrays, action))
+        case _:
+            return np.asarray(action) if isinstance(action, np.floating) else action
+
+
+def _sum(action: Any) -> float:
+    """The sum of all numbers of an action."""
+    match action:
+        case dict():
+            return sum(map(_sum, action.values()))
+        case tuple():
+            return sum(map(_sum, action))
+        case _:
+            return float(np.sum(action))
 
 
 class Odd:
@@ -380,6 +431,6 @@ class Informs(gymnasium.Env[Any, Any]):
 
 for _toy in (
     Informs, Scripted, OneStep, Both, Countdown, Identity, Recall, Slow, Frames, Raises, NaNReward, NaNObservation, Hangs,
-    Dies, Spaces,
+    Dies, Spaces, Steer,
 ):  # fmt: skip
     gymnasium.register(id=f"{_toy.__name__}-v0", entry_point=f"{__name__}:{_toy.__name__}")

@@ -9,6 +9,7 @@ import numpy as np
 
 from millrace.learner.algorithm_check import toy_batches
 from millrace.learner.algorithm_check.toy_batches import ToyActor
+from millrace.protocol.action_parts import mixed
 from millrace.protocol.arrays import Array
 from millrace.protocol.policy.distributions import distribution
 from millrace.protocol.policy.numpy_policy import NumpyPolicy
@@ -18,6 +19,8 @@ from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
 BOX = Leaf("", "box", (4,), "float32")
 DISCRETE = PolicySpec((BOX,), ActionSpec("discrete", (), "int64", (4,), (0,)), (16,))
 GAUSSIAN = PolicySpec((BOX,), ActionSpec("box", (2,), "float32", low=(-1.0,) * 2, high=(1.0,) * 2), (16,))
+MIXED = PolicySpec((BOX,), mixed([((0,), GAUSSIAN.action), ((1,), DISCRETE.action)]), (16,))
+"""Of a Tuple of both"""
 IMAGE = PolicySpec((BOX, Leaf("i", "box", (8, 8, 1), "uint8", divisor=255)), DISCRETE.action, (16,))
 LANES, COPIES, T = 2, 3, 20
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete
+from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Tuple
 
 SIZES, STARTS = (3, 2, 5), (0, 3, 0)
 CHOICES = 7
@@ -30,7 +30,7 @@ class _Masked(gymnasium.Env[Any, Any]):
         return self._next()
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        chosen = [int(a) - start for a, start in zip(np.ravel(action), self.starts, strict=True)]
+        chosen = [int(a) - start for a, start in zip(self.choices(action), self.starts, strict=True)]
         if not all(mask[a] for mask, a in zip(self._allowed, chosen, strict=True)):
             raise RuntimeError(f"illegal action {chosen}")
         reward = float(all(a == np.flatnonzero(mask)[-1] for mask, a in zip(self._allowed, chosen, strict=True)))
@@ -57,6 +57,10 @@ class _Masked(gymnasium.Env[Any, Any]):
         """The mask as the environment reports it."""
         return bits.astype(np.int8)
 
+    def choices(self, action: Any) -> Any:
+        """What was chosen of each entry."""
+        return np.ravel(action)
+
 
 class InInfo(_Masked):
     """A mask of int8 in info."""
@@ -70,10 +74,25 @@ class Parts(_Masked):
 
     sizes, starts = SIZES, STARTS
     observation_space = Box(0, 1, (sum(SIZES),))
-    action_space = MultiDiscrete(list(SIZES), start=list(STARTS))
+    action_space: Any = MultiDiscrete(list(SIZES), start=list(STARTS))
 
     def given(self, bits: Any) -> Any:
         return tuple(np.split(bits.astype(bool), np.cumsum(SIZES)[:-1]))
+
+
+class Mixed(Parts):
+    """The same choices as two of three parts of a Dict: between them are numbers, which a mask says nothing of."""
+
+    action_space = Dict(
+        {
+            "a": Discrete(SIZES[0]),
+            "b": Box(-1, 1, (2,)),
+            "c": Tuple([MultiBinary(2), MultiDiscrete(list(SIZES[1:]), start=list(STARTS[1:]))]),
+        }
+    )
+
+    def choices(self, action: Any) -> Any:
+        return [action["a"], *action["c"][1]]
 
 
 class InObservation(_Masked):
@@ -88,6 +107,7 @@ class InObservation(_Masked):
         return {"seen": observation, **info}, self._info
 
 
+gymnasium.register("Mixed-v0", "tests.support.users_code.mask_envs:Mixed")
 gymnasium.register("InInfo-v0", "tests.support.users_code.mask_envs:InInfo")
 gymnasium.register("Parts-v0", "tests.support.users_code.mask_envs:Parts")
 gymnasium.register("InObservation-v0", "tests.support.users_code.mask_envs:InObservation")

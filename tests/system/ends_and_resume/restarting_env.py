@@ -58,4 +58,17 @@ class Push(gymnasium.ActionWrapper[Any, Any, Any]):
         return int(action[0] > 0)
 
 
+class Both(gymnasium.ActionWrapper[Any, Any, Any]):
+    """A Tuple for an action: a number, and which way to push if the number is small."""
+
+    def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
+        super().__init__(env)
+        self.action_space: Any = gymnasium.spaces.Tuple([gymnasium.spaces.Box(-1, 1, (1,)), gymnasium.spaces.Discrete(2)])
+
+    def action(self, action: Any) -> int:
+        """Left or right."""
+        number, way = action
+        return int(way) if abs(number[0]) < 0.5 else int(number[0] > 0)
+
+
 gymnasium.register("Restarting-v0", f"{__name__}:Restarting", max_episode_steps=MOST_STEPS)

@@ -48,6 +48,7 @@ PUSHES = {
 VARIANTS: dict[str, dict[str, Any]] = {
     "ppo": {**PPO_SETTINGS, **NORMAL, "learning_rate_schedule": "linear", "clip_range_schedule": "linear"},
     "ppo, lstm": {**PPO_SETTINGS, "core": "lstm", "core_size": 4, "normalize_rewards": True},
+    "ppo, mixed actions": {**PPO_SETTINGS, "wrappers": ("tests.system.ends_and_resume.restarting_env:Both",)},
     "a2c": {"algo": "a2c", **NORMAL},
     "impala": {"algo": "impala", **NORMAL},
     "reinforce": {"algo": "reinforce", **NORMAL, "rollout_steps": 31, "steps": 12 * 31 * ENVS, "eval_every": 200},

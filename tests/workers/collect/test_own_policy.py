@@ -69,6 +69,32 @@ def test_without_log_probs_there_are_zeros() -> None:
     assert rollout.extras == ()
 
 
+class Pairs:
+    """Returns rows of a Tuple of a Discrete(3) and a Box of two numbers. `choice`: of all of them."""
+
+    def __init__(self, choice: float) -> None:
+        self.choice = choice
+
+    def act(self, obs: Any, state: Any, rng: np.random.Generator) -> tuple[Any, Any, None]:
+        return np.column_stack([np.full(len(obs), self.choice), rng.normal(size=(len(obs), 2))]), state, None
+
+
+def run_of_pairs(choice: float) -> RunSpec:
+    run = run_of("tests.support.envs.toy:Spaces-v0", kwargs={"action": "pair"})
+    spec = Declared(Pairs, {}, kwargs={"choice": choice}).spec(run.policy.observation, run.policy.action)
+    return msgspec.structs.replace(run, policy=spec)
+
+
+def test_of_a_tuple_it_returns_rows_and_the_environment_gets_the_tuple() -> None:
+    run = run_of_pairs(2)
+    (rollout,) = collect(Collector(run, CalledPolicy(run.policy, ())), run)  # the toy checks its actions
+    assert rollout.action.shape == (8, 2, 3)
+    assert (rollout.action[..., 0] == 2).all()
+    wrong = run_of_pairs(1.5)
+    with pytest.raises(PolicyFailed, match=r"act: the action: expected 0 to 2, got 1.5 at copy 0"):
+        collect(Collector(wrong, CalledPolicy(wrong.policy, ())), wrong)
+
+
 class Shifts(gymnasium.Env[Any, Any]):
     """Adds 1 to its action in place."""
 

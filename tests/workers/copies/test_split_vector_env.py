@@ -119,7 +119,7 @@ def test_a_lost_step_is_in_no_valid_row(at: int) -> None:
     split = SplitVectorEnv(env, LANES)
     collector = Collector(run, random_policy(run.policy), split.open_lane, split.step_all)
     by_lane = zip(*(collect(collector, run, k, lanes=range(LANES)) for k in range(4)), strict=True)
-    assembler = EpisodeAssembler(lambda actions: actions)
+    assembler = EpisodeAssembler(lambda actions: (actions,))
     whole = []
     for lane, rollouts in enumerate(by_lane):
         valid = np.concatenate([rollout.valid for rollout in rollouts])  # [12, N]

@@ -143,6 +143,14 @@ def masked_run(T: int, N: int) -> RunSpec:
     return RunSpec(name, policy, T, N, lanes=8, seed=1, masked=True)
 
 
+def tuple_run(T: int, N: int) -> RunSpec:
+    name = EnvSpec.of("tests.support.users_code.tuple_envs:Lamps-v0", wrappers=["millrace:TupleOfAgents"])
+    env = name.make()
+    policy = PolicySpec(observation_leaves(env.observation_space), action_spec(env.action_space))
+    seats = ("agent_0", "agent_1")
+    return RunSpec(name, policy, T, N, lanes=8, seed=1, seats=seats, facts=seat_returns(seats))
+
+
 RUNS: dict[str, Callable[[int, int], RunSpec]] = {
     "discrete": lambda T, N: run_of("CartPole-v1", T, N),
     "gaussian": lambda T, N: run_of("Pendulum-v1", T, N),
@@ -150,11 +158,13 @@ RUNS: dict[str, Callable[[int, int], RunSpec]] = {
     "lstm": lambda T, N: run_of("CartPole-v1", T, N, core="lstm", core_size=5),
     "gru": lambda T, N: run_of(f"{TOY}Recall-v0", T, N, core="gru", core_size=3),
     "dict": lambda T, N: run_of(f"{TOY}Spaces-v0", T, N, {"observation": "dict", "action": "table"}),
+    "mixed": lambda T, N: run_of(f"{TOY}Spaces-v0", T, N, {"action": "mixed"}),
     "masks": masked_run,
     "turns": lambda T, N: seated_run(Game, T, N),
     "turns, lstm": lambda T, N: seated_run(Game, T, N, core="lstm", core_size=3),
     "turns, masks": lambda T, N: seated_run(MaskedGame, T, N),
     "together": lambda T, N: seated_run(Crowd, T, N),
+    "together, a tuple": tuple_run,
     "together, gru": lambda T, N: seated_run(Crowd, T, N, core="gru", core_size=3),
 }
 

@@ -18,6 +18,7 @@ from torch import Tensor
 from millrace.learner.algorithms.kernels import mlp as layers
 from millrace.learner.algorithms.kernels import trained_networks
 from millrace.learner.algorithms.kernels.trained_networks import SmallActorAndCritics, SmallActorCritic, SmallQNetwork
+from millrace.protocol.action_parts import parts_of
 from millrace.protocol.policy import networks
 from millrace.protocol.policy.networks import ActorAndCritics, ActorCriticNetwork, FlatNetwork, QNetwork
 from millrace.protocol.specs import ActionSpec, PolicySpec
@@ -52,6 +53,10 @@ def pair(kind: type[FlatNetwork], small: type[FlatNetwork], spec: PolicySpec, se
 
 
 def some_actions(spec: ActionSpec, rows: int, generator: np.random.Generator) -> Tensor:
+    if spec.parts:
+        drawn = [some_actions(part.spec, rows, generator).reshape(rows, -1) for part in parts_of(spec)]
+        order = np.argsort([part.columns.start for part in parts_of(spec)])
+        return torch.cat([drawn[i].to(torch.get_default_dtype()) for i in order], 1)
     if spec.kind == "box":
         return torch.tensor(generator.normal(size=(rows, *spec.shape)), dtype=torch.get_default_dtype())
     high = np.reshape(spec.sizes, spec.shape) if spec.sizes else 2

@@ -1,0 +1,124 @@
+"""`millrace:TupleOfAgents`, a wrapper for gymnasium environments of several agents, whose spaces are Tuples.
+
+Rule: element i of the observations, actions and rewards is agent i's, and an episode ends for all agents at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+
+from millrace.protocol.bounds import one_line
+from millrace.protocol.envs.answers import WrongAnswer, reset_answer, wrong_step
+from millrace.protocol.errors import UsageError, safe_repr
+
+
+def agents_in_tuples(observation: gymnasium.Space[Any], action: gymnasium.Space[Any]) -> int:
+    """How many agents these spaces may be of: that of the elements, if both are Tuples of equal length; else 0."""
+    count = len(_elements(action))
+    return count if count == len(_elements(observation)) else 0
+
+
+def _elements(space: gymnasium.Space[Any]) -> tuple[gymnasium.Space[Any], ...]:
+    """Those of a Tuple; none of another space."""
+    return space.spaces if isinstance(space, spaces.Tuple) else ()
+
+
+class TupleOfAgents:
+    """The agents of a gymnasium environment that takes and returns tuples with an element for each agent.
+
+    Environments such as those of rware, lbforaging and vmas have this form. The wrapper gives them PettingZoo's parallel
+    interface, so that each element is trained as an agent: `--wrappers millrace:TupleOfAgents`. Without it, the Tuple is one
+    action of one agent, and the environment must return one reward.
+
+    >>> import gymnasium, millrace
+    >>> class Lights(gymnasium.Env):
+    ...     observation_space = gymnasium.spaces.Tuple([gymnasium.spaces.Discrete(2)] * 2)
+    ...     action_space = gymnasium.spaces.Tuple([gymnasium.spaces.Discrete(2)] * 2)
+    ...
+    ...     def reset(self, seed=None, options=None):
+    ...         return (0, 1), {}
+    ...
+    ...     def step(self, action):
+    ...         return (0, 1), [1.0, 0.0], True, False, {}
+    >>> env = millrace.TupleOfAgents(Lights())
+    >>> env.possible_agents
+    ['agent_0', 'agent_1']
+    >>> env.reset()
+    ({'agent_0': 0, 'agent_1': 1}, {})
+    """
+
+    def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
+        """Raises `UsageError` unless the observation and the action space are Tuples of equal length."""
+        observation = env.observation_space
+        action = env.action_space
+        count = agents_in_tuples(observation, action)
+        if not count:
+            raise UsageError(
+                "TupleOfAgents: expected an observation space and an action space that are Tuples with an element for each "
+                f"agent, got {observation} and {action}"
+            )
+        self.env = env
+        self.metadata = env.metadata
+        self.render_mode = env.render_mode
+        self.possible_agents = [f"agent_{number}" for number in range(count)]
+        self.agents: list[str] = []
+        self._observation_spaces = dict(zip(self.possible_agents, _elements(observation), strict=True))
+        self._action_spaces = dict(zip(self.possible_agents, _elements(action), strict=True))
+
+    @property
+    def unwrapped(self) -> gymnasium.Env[Any, Any]:
+        """The environment inside all wrappers."""
+        return self.env.unwrapped
+
+    def observation_space(self, agent: str) -> gymnasium.Space[Any]:
+        """The agent's element of the observation space."""
+        return self._observation_spaces[agent]
+
+    def action_space(self, agent: str) -> gymnasium.Space[Any]:
+        """The agent's element of the action space."""
+        return self._action_spaces[agent]
+
+    def reset(
+        self, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
+        """Begin an episode, with all agents. Returns observations and infos by agent."""
+        observations, _ = reset_answer(self.env.reset(seed=seed, options=options))
+        self.agents = list(self.possible_agents)
+        return self._by_agent("observation", observations), {}
+
+    def step(self, actions: dict[str, Any]) -> tuple[dict[str, Any], ...]:
+        """Step with the actions of all agents. Returns observations, rewards, terminated, truncated and infos by agent."""
+        answer = self.env.step(tuple(actions[agent] for agent in self.possible_agents))
+        try:
+            observations, rewards, terminated, truncated, info = answer
+        except (TypeError, ValueError) as error:
+            raise wrong_step(answer) from error
+        ends = bool(np.all(terminated)), bool(np.all(truncated))
+        if any(ends):
+            self.agents = []
+        return (
+            self._by_agent("observation", observations),
+            self._by_agent("reward", rewards),
+            dict.fromkeys(self.possible_agents, ends[0]),
+            dict.fromkeys(self.possible_agents, ends[1]),
+            dict.fromkeys(self.possible_agents, info),
+        )
+
+    def _by_agent(self, what: str, values: Any) -> dict[str, Any]:
+        if not isinstance(values, Sequence | np.ndarray) or len(values) != len(self.possible_agents):
+            got = one_line(safe_repr(values), 80)
+            raise WrongAnswer(f"{what}: expected one for each of {len(self.possible_agents)} agents, got {got}")
+        return dict(zip(self.possible_agents, values, strict=True))
+
+    def render(self) -> Any:
+        """What the environment renders."""
+        return self.env.render()
+
+    def close(self) -> None:
+        """Close the environment."""
+        self.env.close()
