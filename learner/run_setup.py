@@ -14,6 +14,7 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
+from millrace.learner.algorithms.replay.hindsight import goals_not_used
 from millrace.learner.config.config import Config
 from millrace.learner.config.costs import endless_evaluations
 from millrace.learner.env_spaces import EnvSpaces
@@ -186,6 +187,8 @@ def known_environment(config: Config, env: EnvSpec, resume: Resumption | None, l
     if env.factory is None and not env.wrappers and (ours := preprocessed(env.id)):
         log_notice(log, f"{env.id} shows raw frames, one at a time; {ours} has the usual wrappers, and presets")
     if line := endless_evaluations(config, evaluation):
+        log_notice(log, line)
+    if line := goals_not_used(config.algorithm, spaces.observation, config.env):
         log_notice(log, line)
     return KnownEnvironment(env, spaces, described, evaluation.max_episode_steps)
 

@@ -45,8 +45,8 @@ Tools:
 - `gae`, `vtrace` and `EpisodeEnds`: advantages and targets of arrays [T, N].
 - `ActorCriticNetwork`, `QNetwork` and `ActorAndCritics`: the networks that workers act with, and `log_prob_and_entropy`,
   `policy_log_prob` or `squashed_sample` of their outputs. `trainable`: a leaf of autograd's graph for a flat tensor.
-- `ReplayBuffer`, which gives a `Sample` of transitions, `MixedReplay`, which also draws prior data, `Transitions`, the
-  tensors of a sample, and `CriticLoss`, what a loss says of them.
+- `ReplayBuffer`, which gives a `Sample` of transitions, `MixedReplay`, which also draws prior data, `Hindsight`, which gives
+  transitions another goal, `Transitions`, the tensors of a sample, and `CriticLoss`, what a loss says of them.
 - `ObservationNormalizer` and `RewardScaler`: running statistics of observations and of returns.
 - `features` and `normalize`: observations as these networks take them; `random_shift`: images, moved at random.
 - `UsageError`: raise it, in one line, for settings or spaces that cannot be used.
@@ -67,6 +67,7 @@ from millrace.learner.algorithms.ppo import PPO
 from millrace.learner.algorithms.prior_data import PriorData
 from millrace.learner.algorithms.reinforce import REINFORCE
 from millrace.learner.algorithms.replay.continuous import Continuous
+from millrace.learner.algorithms.replay.hindsight import Hindsight
 from millrace.learner.algorithms.replay.mixed_replay import MixedReplay
 from millrace.learner.algorithms.replay.off_policy import CriticLoss, OffPolicy, Transitions
 from millrace.learner.algorithms.replay.random_shift import random_shift
@@ -125,6 +126,7 @@ __all__ = [
     "Fixed",
     "Free",
     "GradientDescent",
+    "Hindsight",
     "IMPALAConfig",
     "Leaf",
     "LossInput",

@@ -346,6 +346,21 @@ class TrainKeywords(RolloutKeywords, total=False):
     """dqn, rainbow, sac, td3, tqc, crossq, xqc: Number of gradient steps on prior data alone, before the first rollouts
     are collected. Needs --prior.
     """
+    hindsight: float
+    """dqn, rainbow, sac, td3, tqc, crossq, xqc: Hindsight experience replay: the share of the transitions of a minibatch
+    whose goal is replaced by one that was achieved later in their episode. 0: off. Andrychowicz et al. 2017 use 0.8.
+    Needs observations with achieved_goal and desired_goal, and goal_reward.
+    """
+    goal_reward: str | None
+    """dqn, rainbow, sac, td3, tqc, crossq, xqc: How the environment computes rewards from achieved and desired goals, for
+    hindsight. sparse:0.05: 0 within this distance of the goal, else -1. success:0.45: 1 within this distance, else 0.
+    dense: minus the distance. Or a function of your own, such as my_module:reward, of two arrays [B, G], which returns
+    an array [B].
+    """
+    goal_ends: float | None
+    """dqn, rainbow, sac, td3, tqc, crossq, xqc: The distance from its goal at which a task ends, for hindsight. none: it
+    does not end at its goal.
+    """
     n_step: int
     """dqn, rainbow, sac, td3, tqc, crossq, xqc: Number of rewards in a target before it bootstraps; those of one agent,
     in its own time, if there are several.

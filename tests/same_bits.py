@@ -38,6 +38,7 @@ COMMON = "--preset none --seed 3 --lanes 4 --envs 8 --device cpu --torch-threads
 ON_POLICY = "--rollout-steps 32 --steps 1500 --eval-every 700 --eval-episodes 4"
 REPLAY = "--rollout-steps 8 --learning-starts 200 --batch-size 32 --net 32 --steps 900 --eval-every 400 --eval-episodes 4"
 NORMALIZED = "--normalize-observations --normalize-rewards"
+HINDSIGHT = "--hindsight 0.8 --goal-reward sparse:0.1"
 IMAGES = "--env-kwargs observation nested action multibinary"
 RECORDED = "same/training-v0"
 RUNS: dict[str, tuple[str, ...]] = {
@@ -52,6 +53,7 @@ RUNS: dict[str, tuple[str, ...]] = {
     "tqc": (f"train Pendulum-v1 --algo tqc --updates-per-step 0.5 {REPLAY}",),
     "crossq": (f"train Pendulum-v1 --algo crossq --critic-net 32 32 --updates-per-step 0.5 {REPLAY}",),
     "xqc": (f"train Pendulum-v1 --algo xqc --critic-net 32 32 --updates-per-step 0.5 {REPLAY}",),
+    "hindsight": (f"train reach:Reach-v0 --algo sac {HINDSIGHT} --updates-per-step 0.5 --n-step 2 {REPLAY}",),
     "lstm": (f"train toy:Recall-v0 --algo ppo --core lstm --core-size 16 {ON_POLICY}",),
     "images": (f"train toy:Spaces-v0 {IMAGES} --algo ppo {ON_POLICY}",),
     "masks": (f"train Taxi-v4 --algo ppo --action-masks info {ON_POLICY}",),

@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 
 import msgspec
 
-from millrace.flags.fields import NotNegative, Positive
+from millrace.flags.fields import Flag, NotNegative, Positive
 from millrace.learner.config.resume_rules import Fixed, Free
 from millrace.protocol.bounds import Count, Natural
 
@@ -198,6 +198,18 @@ class OffPolicyConfig(AlgorithmConfig, frozen=True):
     """Share of each minibatch that is prior data, in a run with --prior (Ball et al. 2023 use 0.5)."""
     prior_steps: Free[Natural] = 0
     """Number of gradient steps on prior data alone, before the first rollouts are collected. Needs --prior."""
+    hindsight: Fixed[Fraction] = 0.0
+    """Hindsight experience replay: the share of the transitions of a minibatch whose goal is replaced by one that was
+    achieved later in their episode. 0: off. Andrychowicz et al. 2017 use 0.8. Needs observations with achieved_goal and
+    desired_goal, and goal_reward.
+    """
+    goal_reward: Annotated[Free[str | None], Flag("NAME")] = None
+    """How the environment computes rewards from achieved and desired goals, for hindsight. sparse:0.05: 0 within this
+    distance of the goal, else -1. success:0.45: 1 within this distance, else 0. dense: minus the distance. Or a function of
+    your own, such as my_module:reward, of two arrays [B, G], which returns an array [B].
+    """
+    goal_ends: Free[Positive | None] = None
+    """The distance from its goal at which a task ends, for hindsight. none: it does not end at its goal."""
     n_step: Free[Count] = 1
     """Number of rewards in a target before it bootstraps; those of one agent, in its own time, if there are several."""
     tau: Free[Annotated[float, msgspec.Meta(gt=0, le=1)]] = 0.005

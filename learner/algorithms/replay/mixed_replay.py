@@ -6,31 +6,28 @@ they are and are drawn uniformly. They are no part of a saved state: whoever loa
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
 
 from millrace.learner.algorithms.replay.available_memory import GIB, available_bytes
-from millrace.learner.algorithms.replay.replay_buffer import DISCRETE, ReplayBuffer, Sample, memory_bytes
+from millrace.learner.algorithms.replay.replay_buffer import Content, ReplayBuffer, Sample
 from millrace.protocol.arrays import Floats, Ints
 from millrace.protocol.errors import UsageError
 from millrace.protocol.random_streams import Purpose
 from millrace.protocol.rollout import Batch
-from millrace.protocol.specs import ActionSpec, Leaf
 
 PRIOR_SLOT = -1  # `Sample.slots` of a prior transition
 
 
-def check_dataset_fits_memory(
-    observation: Sequence[Leaf], size: int, prioritized: bool, action: ActionSpec = DISCRETE, choices: int = 0
-) -> None:
+def check_dataset_fits_memory(content: Content) -> None:
     """Raise `UsageError` if a dataset of this size does not fit the free memory. It takes its own size, once."""
-    needed = memory_bytes(observation, size, prioritized, action, choices)
+    needed = content.bytes
     free = available_bytes()
     if free is not None and needed > free:
         raise UsageError(
-            f"prior: {size} observations of the dataset take {needed / GIB:.1f} GiB, "
+            f"prior: {content.size} observations of the dataset take {needed / GIB:.1f} GiB, "
             f"but {free / GIB:.1f} GiB of memory are free; record a smaller dataset"
         )
 
@@ -52,14 +49,22 @@ class MixedReplay(ReplayBuffer):
     def add_prior(self, batches: Iterable[Batch], slots: int, share: float) -> None:
         """Store prior transitions. `slots`: how many observations they have. `share`: of each draw, how much is prior.
 
-        Raises `UsageError` if memory is too small.
+        Raises `UsageError` if memory is too small, or, with hindsight, if rewards are not those of the goals.
         """
-        observation, _, _, action = self._content
         prior = PriorTransitions(
-            observation, size=slots, n_step=self._n_step, gamma=self._gamma, seed=self._seed, action=action
+            self._content.observation,
+            size=slots,
+            n_step=self._n_step,
+            gamma=self._gamma,
+            seed=self._seed,
+            action=self._content.action,
+            hindsight=self._hindsight,
         )
-        for batch in batches:
-            prior.add(batch)
+        for episode, batch in enumerate(batches):
+            try:
+                prior.add(batch)
+            except UsageError as error:
+                raise UsageError(f"prior: episode {episode}: {error}") from error
         self.prior = prior
         self._prior_share = share
 

@@ -18,12 +18,13 @@ from torch import Tensor
 
 from millrace.learner.algorithms.gradient_descent import GradientDescent, UpdateMetrics
 from millrace.learner.algorithms.prior_data import PriorData
+from millrace.learner.algorithms.replay.hindsight import Hindsight
 from millrace.learner.algorithms.replay.mixed_replay import MixedReplay
 from millrace.learner.algorithms.replay.replay_buffer import Sample
 from millrace.learner.config.hyperparameters import AlgorithmConfig, OffPolicyConfig
 from millrace.protocol.arrays import Array
 from millrace.protocol.rollout import Batch
-from millrace.protocol.specs import PolicySpec
+from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
 
 
 class Transitions(NamedTuple):
@@ -68,6 +69,12 @@ class OffPolicy(GradientDescent):
 
     Config: ClassVar[type[AlgorithmConfig]] = OffPolicyConfig
 
+    @staticmethod
+    def policy_spec(config: Any, observation: tuple[Leaf, ...], action: ActionSpec) -> PolicySpec:
+        """See `Algorithm.policy_spec`. Raises `UsageError` if the run can't have the hindsight that its settings want."""
+        Hindsight.of(config, observation)
+        return GradientDescent.policy_spec(config, observation, action)
+
     def __init__(self, config: OffPolicyConfig, policy: PolicySpec, *, total_steps: int, seed: int) -> None:
         super().__init__(config, policy, total_steps=total_steps)
         self.replay = MixedReplay(
@@ -78,6 +85,7 @@ class OffPolicy(GradientDescent):
             seed=seed,
             alpha=config.priority_alpha or None,
             action=policy.action,
+            hindsight=Hindsight.of(config, policy.observation),
         )
         self.gradient_steps = 0  # what Stable-Baselines3 calls n_updates
         self.prior_gradient_steps = 0  # of these, the ones before the first rollouts

@@ -8,6 +8,9 @@ a truncated episode, or the newest observation of an env copy, whose row comes w
 Rule: rows that are not valid are never stored. A row's next observation is newer than the row, and the ring overwrites
 the oldest slot first. So a row that is still stored always finds the rows that follow it: those of the same seat, however
 long it waits between them. The observation in which it waits is the one that its row led to, and stands in that slot.
+
+With hindsight (`hindsight.py`), a share of the rows get another goal when they are drawn. Then the final observation of a
+terminated episode has a slot too, because it holds the goal that was achieved last.
 """
 
 from __future__ import annotations
@@ -19,6 +22,8 @@ import numpy as np
 import torch
 
 from millrace.learner.algorithms.replay.available_memory import GIB, available_bytes
+from millrace.learner.algorithms.replay.episode_paths import NO_SLOT, EpisodePaths
+from millrace.learner.algorithms.replay.hindsight import Goals, Hindsight
 from millrace.learner.algorithms.replay.sum_tree import SumTree
 from millrace.learner.algorithms.returns import EpisodeEnds
 from millrace.protocol.arrays import Array, Bools, Doubles, Floats, Ints
@@ -28,7 +33,6 @@ from millrace.protocol.rollout import Batch
 from millrace.protocol.specs import ActionSpec, Leaf
 
 PRIORITY_OFFSET = 1e-6  # added to errors, so that every transition can be drawn again
-NO_SLOT = -1
 DRAWN_AT_ONCE = 1 << 20  # bytes of the transitions that are drawn together, at most: they stay in the cache
 DISCRETE = ActionSpec("discrete", (), "int64")
 
@@ -65,22 +69,36 @@ class Sample(NamedTuple):
         )
 
 
-def memory_bytes(
-    observation: Sequence[Leaf], size: int, prioritized: bool, action: ActionSpec = DISCRETE, choices: int = 0
-) -> int:
-    """Memory of a replay buffer with `size` slots, in bytes. `choices`: those of an action mask; 0 without masks."""
-    row = sum(int(np.prod(leaf.shape)) * np.dtype(leaf.dtype).itemsize for leaf in observation) + choices
-    return size * (row + row_dtype(action).itemsize) + (SumTree.memory_bytes(size) if prioritized else 0)
+class Content(NamedTuple):
+    """What a replay buffer holds, as far as its memory depends on it."""
+
+    observation: tuple[Leaf, ...]
+    size: int
+    """slots"""
+    prioritized: bool = False
+    action: ActionSpec = DISCRETE
+    linked: bool = False
+    """whether it can find the later rows of an episode"""
+    choices: int = 0
+    """of an action mask; 0 without masks"""
+
+    @property
+    def bytes(self) -> int:
+        """Memory of the replay buffer, in bytes."""
+        leaves = sum(int(np.prod(leaf.shape)) * np.dtype(leaf.dtype).itemsize for leaf in self.observation)
+        slots = self.size * (leaves + self.choices + row_dtype(self.action).itemsize)
+        tree = SumTree.memory_bytes(self.size) if self.prioritized else 0
+        paths = EpisodePaths.memory_bytes(self.size) if self.linked else 0
+        return slots + tree + paths
 
 
-def check_fits_memory(
-    observation: Sequence[Leaf], size: int, prioritized: bool, action: ActionSpec = DISCRETE, choices: int = 0
-) -> None:
+def check_fits_memory(content: Content) -> None:
     """Raise `UsageError`, which names a size that fits, if the memory is too small for the buffer and a copy of it.
 
-    A checkpoint makes such a copy. Arguments: see `memory_bytes`.
+    A checkpoint makes such a copy.
     """
-    needed = 2 * memory_bytes(observation, size, prioritized, action, choices)
+    size = content.size
+    needed = 2 * content.bytes
     free = available_bytes()
     if free is None or needed <= free:
         return
@@ -139,15 +157,16 @@ class ReplayBuffer:
         seed: int,
         alpha: float | None = None,
         action: ActionSpec = DISCRETE,
+        hindsight: Hindsight | None = None,
     ) -> None:
         """`action`: the action space. `alpha`: draw in proportion to |error|^alpha, or uniformly if None.
 
         Raises `UsageError` if memory is too small.
         """
-        self._content = observation, size, alpha is not None, action
+        self._content = Content(observation, size, alpha is not None, action, linked=hindsight is not None)
         self.size = size  # slots
-        self._check_memory(*self._content)
-        self.bytes = memory_bytes(*self._content)
+        self._check_memory(self._content)
+        self.bytes = self._content.bytes
         self._transition_bytes = 2 * self.bytes // size  # of a draw: two observations
         self._n_step = n_step
         self._gamma = gamma
@@ -160,9 +179,11 @@ class ReplayBuffer:
         self._action: Array = self._row["action"]  # this and the next four: views of `_row`
         self._reward: Floats = self._row["reward"]
         self._terminated: Bools = self._row["terminated"]
-        self._follows: Ints = self._row["follows"]  # slot of the next observation; itself if terminated
+        self._follows: Ints = self._row["follows"]  # slot of the next observation; itself if that one is not stored
         self._is_row: Bools = self._row["is_row"]
         self._tree = None if alpha is None else SumTree(size)
+        self._hindsight = hindsight
+        self._paths = None if hindsight is None else EpisodePaths(size)
         self._highest = 1.0  # greatest priority so far: new transitions get it
         self._written = 0  # slots ever written; the next one is this, modulo the size
         self._rows = 0
@@ -177,7 +198,13 @@ class ReplayBuffer:
     # ---------------------------------------------------------------- writing
 
     def add(self, batch: Batch) -> None:
-        """Store the valid rows. Raises `UsageError` when a single rollout does not fit, or the first masks do not."""
+        """Store the valid rows.
+
+        Raises `UsageError` when a single rollout does not fit, or the first masks do not, or, with hindsight, if rewards are
+        not those of the goals.
+        """
+        if self._hindsight is not None:
+            self._hindsight.check(batch)
         if batch.mask is not None:
             self._make_mask(batch.mask.shape[-1])
         for at in range(0, len(batch.lane), batch.columns_per_rollout):  # rollouts of a lane are in the order of collection
@@ -195,9 +222,10 @@ class ReplayBuffer:
         newest = np.where(fresh, NO_SLOT, known)
         continues = self._continues([leaf[0] for leaf in obs], newest, most)
         goes_on = _goes_on(EpisodeEnds.of(batch).columns(columns), continues)  # [T+1, N]
+        leads = valid & ~terminated if self._paths is None else valid  # [T, N] to an observation to store
         needed = np.zeros(goes_on.shape, bool)  # [T+1, N] observations to store
         needed[:-1] = valid & ~goes_on[:-1]
-        needed[1:] |= valid & ~terminated
+        needed[1:] |= leads
         written = np.full(needed.shape, NO_SLOT)  # [T+1, N] value of `_written` for each
         written[needed] = self._written + np.arange(np.count_nonzero(needed))
         written[0][continues] = newest[continues]
@@ -213,13 +241,18 @@ class ReplayBuffer:
         self._is_row[new] = False
         if self._tree is not None:
             self._tree.set(new, 0.0)
+        if self._paths is not None:
+            before = np.full(needed.shape, NO_SLOT)  # [T+1, N] slot of the row that led to an observation
+            before[1:][valid] = slot[:-1][valid]
+            self._paths.overwrite(new)
+            self._paths.append(new, before[needed])
         for kept, leaf in zip(self._per_observation(), obs, strict=True):
             kept[new] = leaf[needed]
         rows = slot[:-1][valid]
         self._action[rows] = batch.action[:, columns][valid]
         self._reward[rows] = batch.reward[:, columns][valid]
         self._terminated[rows] = terminated[valid]
-        self._follows[rows] = np.where(terminated[valid], rows, slot[1:][valid])
+        self._follows[rows] = np.where(leads[valid], slot[1:][valid], rows)
         self._is_row[rows] = True
         self._rows += len(rows)
         if self._tree is not None and self._alpha is not None:
@@ -228,8 +261,9 @@ class ReplayBuffer:
 
     def _make_mask(self, choices: int) -> None:
         if self._mask is None:
-            self._check_memory(*self._content, choices)
-            self.bytes = memory_bytes(*self._content, choices)
+            content = self._content._replace(choices=choices)
+            self._check_memory(content)
+            self.bytes = content.bytes
             self._mask = np.ones((self.size, choices), bool)
 
     def _per_observation(self) -> tuple[Array, ...]:
@@ -253,17 +287,33 @@ class ReplayBuffer:
     def sample(self, count: int, beta: float = 1.0) -> Sample:
         """Draw transitions with replacement. `beta`: how much the weights correct for the priorities; 1 corrects fully."""
         slots, row, weight = self._uniform(count) if self._tree is None else self._by_priority(self._tree, count, beta)
-        reward, discount, last = self._follow(row)
+        goals = None if self._hindsight is None else self._other_goals(self._hindsight.share, slots)
+        reward, discount, last = self._follow(row, goals)
         return Sample(
             slots=slots,
-            leaves=tuple(leaf[slots] for leaf in self._obs),
+            leaves=self._leaves(slots, goals),
             action=row["action"],
             reward=reward.astype(np.float32),
             discount=discount.astype(np.float32),
-            next_leaves=tuple(leaf[last] for leaf in self._obs),
+            next_leaves=self._leaves(last, goals),
             weight=weight,
             next_mask=None if self._mask is None else self._mask[last],
         )
+
+    def _other_goals(self, share: float, slots: Ints) -> Goals:
+        """Goals for a share of the rows in these slots: each was achieved at a later step of its row's episode."""
+        assert self._paths is not None
+        assert self._hindsight is not None
+        rows = np.flatnonzero(self.generator.random(len(slots)) < share)
+        later = self._paths.later(slots[rows], self.generator.random(len(rows)))
+        return Goals(rows, self._obs[self._hindsight.achieved][later])
+
+    def _leaves(self, slots: Ints, goals: Goals | None) -> tuple[Array, ...]:
+        """Copies of the observations in these slots, with other goals if there are any."""
+        leaves = tuple(leaf[slots] for leaf in self._obs)
+        if goals is not None and self._hindsight is not None:
+            leaves[self._hindsight.desired][goals.rows] = goals.goal
+        return leaves
 
     def samples(self, number: int, count: int, beta: float = 1.0) -> Iterator[Sample]:
         """So many draws of `count` transitions. The buffer may change between them only in its priorities.
@@ -290,18 +340,36 @@ class ReplayBuffer:
         weight = (self._rows * chance) ** -beta
         return slots, self._row[slots], (weight / weight.max()).astype(np.float32)
 
-    def _follow(self, row: Array) -> tuple[Doubles, Doubles, Ints]:
-        """Follow each row for up to n steps. Returns the discounted reward, γᵏ (0 if the task ended) and the last slot."""
+    def _follow(self, row: Array, goals: Goals | None) -> tuple[Doubles, Doubles, Ints]:
+        """Follow each row for up to n steps. Returns the discounted reward, γᵏ (0 if the task ended) and the last slot.
+
+        `row` is a copy, in which rows with another goal get their outcome.
+        """
+        self._set_outcome(row, goals)
         reward = row["reward"].astype(np.float64)
         discount = self._gamma * ~row["terminated"]
+        ended = row["terminated"]
         at = row["follows"]
         for _ in range(self._n_step - 1):
             row = self._row[at]
-            going = row["is_row"]  # without a row, stay at this slot; a terminated row follows itself with discount 0
+            self._set_outcome(row, goals)
+            going = row["is_row"] & ~ended  # else stay at this slot
             reward += np.where(going, discount * row["reward"], 0)
             discount = np.where(going, discount * self._gamma * ~row["terminated"], discount)
+            ended |= going & row["terminated"]
             at = np.where(going, row["follows"], at)
         return reward, discount, at
+
+    def _set_outcome(self, row: Array, goals: Goals | None) -> None:
+        """Set reward and end of the rows with another goal. What stands in a slot without a row stays without meaning."""
+        if goals is None or self._hindsight is None:
+            return
+        led_to = row["follows"][goals.rows]
+        achieved = self._obs[self._hindsight.achieved][led_to]
+        desired = self._obs[self._hindsight.desired][led_to]
+        outcome = self._hindsight.outcome(achieved, desired, row["terminated"][goals.rows], goals.goal)
+        row["reward"][goals.rows] = outcome.reward
+        row["terminated"][goals.rows] = outcome.terminated
 
     @property
     def prioritized(self) -> bool:
@@ -342,6 +410,14 @@ class ReplayBuffer:
             if self._tree is not None and old.weights is not None:
                 self._tree.set(old.slots, old.weights)
         self._overwritten.clear()
+        self._find_paths()
+
+    def _find_paths(self) -> None:
+        """Find the paths of the rows that are stored now, after these were set in another way than by `add`."""
+        if self._paths is not None:
+            used = min(self._written, self.size)
+            by_age = np.arange(self._written - used, self._written) % self.size
+            self._paths = EpisodePaths.rebuilt(self.size, by_age, self._is_row, self._follows)
 
     def _keep(self, slots: Ints, leaves: tuple[Array, ...]) -> None:
         """Keep what these slots hold, if `remember` was called: they are written next."""
@@ -388,4 +464,5 @@ class ReplayBuffer:
             self._tree.set(np.arange(used), state["arrays"]["weight"].numpy())
         self._rows = int(np.count_nonzero(self._is_row))
         self._newest = {int(lane): written.numpy().copy() for lane, written in state["newest"].items()}
+        self._find_paths()
         self.generator.bit_generator.state = state["generator"]

@@ -85,7 +85,7 @@ def test_what_weights_or_state_depend_on_is_fixed() -> None:
     assert {"env", "env_kwargs", "algo", "seed"} <= set(fixed(Config))
     every = {"net", "activation", "encoder", "normalize_observations", "gamma"}
     some = {"shared_net", "normalize_rewards", "core", "core_size", "optimizer", "amsgrad", "dueling"}
-    some |= {"replay_size", "priority_alpha"}
+    some |= {"replay_size", "priority_alpha", "hindsight"}
     for record in HYPERPARAMETERS.values():
         own = every | some & set(record.__struct_fields__)
         assert own <= set(fixed(record))

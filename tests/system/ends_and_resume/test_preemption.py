@@ -58,9 +58,30 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "tqc": {**PUSHES, "algo": "tqc", "quantiles": 5},
     "crossq": {**PUSHES, "algo": "crossq", "critic_net": (8,), "renormalize_after": 40},
     "xqc": {**PUSHES, "algo": "xqc", "critic_net": (8,), "atoms": 21, "priority_alpha": 0.6, "normalize_observations": True},
+    "sac, hindsight": {
+        "env": "tests.support.envs.reach:Reach-v0",
+        "env_kwargs": {"limit": 9, "within": 0.5, "ends": True},
+        "algo": "sac",
+        "learning_starts": 100,
+        "updates_per_step": 0.1,
+        "batch_size": 16,
+        "replay_size": 300,
+        "n_step": 3,
+        "hindsight": 0.8,
+        "goal_reward": "sparse:0.5",
+        "goal_ends": 0.5,
+    },
     "ppo, evaluated beside": {**PPO_SETTINGS, **NORMAL, "eval_workers": 1, "learning_rate": 0.02},
 }
-IN_MAKE_TEST = ("ppo", "ppo, lstm", "dqn, prioritized", "rainbow", "xqc", "ppo, evaluated beside")  # `make soak`: others
+IN_MAKE_TEST = (
+    "ppo",
+    "ppo, lstm",
+    "dqn, prioritized",
+    "rainbow",
+    "xqc",
+    "sac, hindsight",
+    "ppo, evaluated beside",
+)  # `make soak` runs the others
 STOP = 6  # the update after which a run is interrupted
 Watch = Callable[[Progress], None]
 
@@ -70,7 +91,8 @@ def silent(progress: Progress) -> None:
 
 
 def run(tmp_path: Path, watch: Watch = silent, resume: Path | None = None, **settings: Any) -> Path:
-    return train(resolve(ENV, run_dir=str(tmp_path), **{**COMMON, **settings}), resume, watch)
+    keywords = {"env": ENV, **COMMON, **settings}
+    return train(resolve(keywords.pop("env"), run_dir=str(tmp_path), **keywords), resume, watch)
 
 
 def restarted(tmp_path: Path, after: int, **settings: Any) -> Path:

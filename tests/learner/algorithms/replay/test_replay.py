@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 from millrace.learner.algorithms.replay import replay_buffer as module
 from millrace.learner.algorithms.replay.available_memory import GIB
-from millrace.learner.algorithms.replay.replay_buffer import ReplayBuffer, Sample, memory_bytes
+from millrace.learner.algorithms.replay.replay_buffer import Content, ReplayBuffer, Sample
 from millrace.learner.algorithms.replay.sum_tree import SumTree
 from millrace.protocol.errors import UsageError
 from millrace.protocol.rollout import Batch
@@ -143,7 +143,7 @@ def side_by_side(*batches: Batch) -> Batch:
         name: np.concatenate([getattr(batch, name) for batch in batches], 1)
         for name in ("action", "log_prob", "reward", "terminated", "truncated", "valid")
     }
-    joined["obs"] = (np.concatenate([batch.obs[0] for batch in batches], 1),)
+    joined["obs"] = tuple(np.concatenate(leaves, 1) for leaves in zip(*(batch.obs for batch in batches), strict=True))
     joined |= {name: np.concatenate([getattr(batch, name) for batch in batches]) for name in ("lane", "fresh")}
     return msgspec.structs.replace(batches[0], **joined)
 
@@ -465,7 +465,7 @@ def test_the_memory_that_is_foretold_is_what_it_takes(alpha: float | None) -> No
     kept = ReplayBuffer(observation, size=50, n_step=1, gamma=GAMMA, seed=0, alpha=alpha)
     arrays = kept._row.nbytes + sum(leaf.nbytes for leaf in kept._obs)
     tree = 0 if kept._tree is None else kept._tree._nodes.nbytes
-    assert kept.bytes == memory_bytes(observation, 50, alpha is not None) == arrays + tree
+    assert kept.bytes == Content(observation, 50, alpha is not None).bytes == arrays + tree
 
 
 def test_a_replay_that_does_not_fit_is_refused_before_it_is_made(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -480,11 +480,11 @@ def test_a_replay_that_does_not_fit_is_refused_before_it_is_made(monkeypatch: py
     assert "\n" not in line
     assert "replay_size 1000000: 1000000 transitions take 26.3 GiB" in line
     assert "2.0 GiB of memory are free; take --replay-size 38000 or less" in line
-    module.check_fits_memory(image, 38_000, False)
+    module.check_fits_memory(Content(image, 38_000))
     with pytest.raises(UsageError):
-        module.check_fits_memory(image, 39_000, False)
+        module.check_fits_memory(Content(image, 39_000))
     monkeypatch.setattr(module, "available_bytes", lambda: None)
-    module.check_fits_memory(image, 1_000_000, False)
+    module.check_fits_memory(Content(image, 1_000_000))
 
 
 def test_a_rollout_that_does_not_fit_is_refused() -> None:
