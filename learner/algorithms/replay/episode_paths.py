@@ -21,7 +21,7 @@ FEW = 64
 
 
 @dataclass
-class Path:
+class EpisodePath:
     """The slots of one episode."""
 
     slots: array[int] = field(default_factory=lambda: array("q"))
@@ -40,7 +40,7 @@ class EpisodePaths:
     def __init__(self, size: int) -> None:
         self._number: Ints = np.full(size, NO_PATH)  # [size] of the path on which a slot is
         self._place: Ints = np.zeros(size, np.int64)  # [size] where on it
-        self._paths: dict[int, Path] = {}
+        self._paths: dict[int, EpisodePath] = {}
         self._next = 0
 
     @staticmethod
@@ -68,7 +68,7 @@ class EpisodePaths:
             if before == NO_SLOT:
                 number = self._next
                 self._next += 1
-                self._paths[number] = Path()
+                self._paths[number] = EpisodePath()
             else:
                 number = int(self._number[before])
             path = self._paths[number]
