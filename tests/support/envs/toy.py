@@ -124,7 +124,7 @@ class Steer(Identity):
 
     def __init__(self) -> None:
         super().__init__(4)
-        self.action_space: Any = spaces.Tuple([spaces.Box(-2, 2, (1,), np.float32), spaces.Discrete(4, start=1)])
+        self.action_space: Any = spaces.Tuple([spaces.Box(-1, 1, (1,), np.float32), spaces.Discrete(4, start=1)])
 
     def step(self, action: Any) -> tuple[Floats, float, bool, bool, Info]:
         """Reward both parts, and show the next sign."""
