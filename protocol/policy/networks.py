@@ -195,6 +195,12 @@ def trainable(values: Tensor, gradient: Tensor | None) -> Tensor:
     return leaf
 
 
+def named_leaves(values: Tensor, gradient: Tensor, fields: Sequence[Field]) -> dict[str, Tensor]:
+    """A leaf of autograd's graph for each field, by name: views of `values`, whose gradients are views of `gradient`."""
+    gradients = named_views(gradient, fields)
+    return {name: trainable(view, gradients[name]) for name, view in named_views(values, fields).items()}
+
+
 class Encoder:
     """What comes before the MLPs: the convolutions of each image, or the user's own module."""
 
@@ -210,10 +216,7 @@ class Encoder:
         cls, spec: PolicySpec, values: Tensor, gradient: Tensor, device: str | torch.device, *, seed: int
     ) -> Encoder:
         """An encoder whose parameters and gradients are these flat tensors."""
-        fields, _ = encoder_layout(spec)
-        gradients = named_views(gradient, fields)
-        leaves = {name: trainable(view, gradients[name]) for name, view in named_views(values, fields).items()}
-        return cls(spec, leaves, device, seed=seed)
+        return cls(spec, named_leaves(values, gradient, encoder_layout(spec)[0]), device, seed=seed)
 
     def __call__(self, x: Tensor, images: Sequence[Tensor]) -> Tensor:
         """Features [B, D] and images [B, *leaf] uint8 -> input of the MLPs [B, D + IMAGE_FEATURES per image].
@@ -272,10 +275,7 @@ class FlatNetwork:
         """[P] float32: give this to the optimizer"""
         self.flat_grad = torch.zeros_like(self.flat)  # [P] float32: zero it before each backward pass
         self.flat.grad = self.flat_grad
-        gradients = named_views(self.flat_grad, self.fields)
-        self.parameters: dict[str, Tensor] = {
-            name: trainable(values, gradients[name]) for name, values in named_views(self.flat, self.fields).items()
-        }  # leaves of the graph: views of `flat`, gradients are views of `flat_grad`
+        self.parameters = named_leaves(self.flat, self.flat_grad, self.fields)
         self._relu = spec.activation == "relu"
         self.encode = Encoder(spec, self.parameters, device, seed=seed)
         if spec.needs_torch:

@@ -14,12 +14,11 @@ def random_shift(images: Tensor, most: int, *, channels_last: bool, generator: t
     """Images [B, H, W, C] or [B, C, H, W] of any dtype, each moved by -most to most pixels in both directions."""
     if not most:
         return images
-    batch = len(images)
-    height, width = images.shape[1:3] if channels_last else images.shape[2:4]
+    pixels = images if channels_last else images.movedim(1, 3)
+    batch, height, width, _ = pixels.shape
     moves = torch.randint(-most, most + 1, (2, batch, 1), generator=generator).to(images.device)
     rows = (torch.arange(height, device=images.device) + moves[0]).clamp_(0, height - 1)  # [B, H]
     columns = (torch.arange(width, device=images.device) + moves[1]).clamp_(0, width - 1)  # [B, W]
     image = torch.arange(batch, device=images.device)[:, None, None]
-    if channels_last:
-        return images[image, rows[:, :, None], columns[:, None, :]]
-    return images.movedim(1, 3)[image, rows[:, :, None], columns[:, None, :]].movedim(3, 1)
+    moved = pixels[image, rows[:, :, None], columns[:, None, :]]
+    return moved if channels_last else moved.movedim(3, 1)
