@@ -46,7 +46,9 @@ Tools:
 - `ActorCriticNetwork`, `QNetwork` and `ActorAndCritics`: the networks that workers act with, and `log_prob_and_entropy`,
   `policy_log_prob` or `squashed_sample` of their outputs. `trainable`: a leaf of autograd's graph for a flat tensor.
 - `ReplayBuffer`, which gives a `Sample` of transitions, `MixedReplay`, which also draws prior data, `Hindsight`, which gives
-  transitions another goal, `Transitions`, the tensors of a sample, and `CriticLoss`, what a loss says of them.
+  transitions another goal, and `SequenceReplay`, which gives a `SequenceSample` for a policy with memory; `Transitions`, the
+  tensors of either, with their `Sequences`; and `CriticLoss`, what a loss says of them.
+- `Encoder`: what stands before the hidden layers of a network; `RecurrentInput`: what its recurrent core needs.
 - `ObservationNormalizer` and `RewardScaler`: running statistics of observations and of returns.
 - `features` and `normalize`: observations as these networks take them; `random_shift`: images, moved at random.
 - `UsageError`: raise it, in one line, for settings or spaces that cannot be used.
@@ -69,9 +71,11 @@ from millrace.learner.algorithms.reinforce import REINFORCE
 from millrace.learner.algorithms.replay.continuous import Continuous
 from millrace.learner.algorithms.replay.hindsight import Hindsight
 from millrace.learner.algorithms.replay.mixed_replay import MixedReplay
-from millrace.learner.algorithms.replay.off_policy import CriticLoss, OffPolicy, Transitions
+from millrace.learner.algorithms.replay.off_policy import CriticLoss, OffPolicy
 from millrace.learner.algorithms.replay.random_shift import random_shift
 from millrace.learner.algorithms.replay.replay_buffer import ReplayBuffer, Sample
+from millrace.learner.algorithms.replay.sequence_replay import SequenceReplay, SequenceSample
+from millrace.learner.algorithms.replay.transitions import Sequences, Transitions
 from millrace.learner.algorithms.returns import EpisodeEnds, gae, vtrace
 from millrace.learner.algorithms.running_statistics import ObservationNormalizer, RewardScaler
 from millrace.learner.algorithms.sac import SAC
@@ -92,7 +96,14 @@ from millrace.learner.config.hyperparameters import (
 from millrace.learner.config.resume_rules import Adaptable, Fixed, Free
 from millrace.protocol.errors import UsageError
 from millrace.protocol.policy.features import features
-from millrace.protocol.policy.networks import ActorAndCritics, ActorCriticNetwork, QNetwork, trainable
+from millrace.protocol.policy.networks import (
+    ActorAndCritics,
+    ActorCriticNetwork,
+    Encoder,
+    QNetwork,
+    RecurrentInput,
+    trainable,
+)
 from millrace.protocol.policy.normalize import normalize
 from millrace.protocol.policy.torch_distributions import log_prob_and_entropy, policy_log_prob, squashed_sample
 from millrace.protocol.random_streams import Purpose, torch_seed
@@ -121,6 +132,7 @@ __all__ = [
     "ContinuousConfig",
     "CriticLoss",
     "DQNConfig",
+    "Encoder",
     "EpisodeEnds",
     "Estimates",
     "Fixed",
@@ -141,10 +153,14 @@ __all__ = [
     "Purpose",
     "QNetwork",
     "REINFORCEConfig",
+    "RecurrentInput",
     "ReplayBuffer",
     "RewardScaler",
     "SACConfig",
     "Sample",
+    "SequenceReplay",
+    "SequenceSample",
+    "Sequences",
     "Start",
     "TD3Config",
     "Transitions",

@@ -294,12 +294,16 @@ class TrainKeywords(RolloutKeywords, total=False):
     core: Literal["lstm", "gru"] | None
     """ppo, a2c, impala: Recurrent layer in front of the hidden layers. Minibatches then consist of whole sequences: all T
     steps of some env copies.
+    dqn, rainbow, sac, td3, tqc, crossq, xqc: Recurrent layer in front of the hidden layers. A gradient step then takes
+    whole sequences: the rollout_steps steps of an env copy, after its rollout before, in which the layer warms up.
+    Actor and critics share it, and critics train it.
     """
     core_size: int
-    """ppo, a2c, impala: Number of units of the recurrent layer."""
+    """ppo, a2c, dqn, rainbow, impala, sac, td3, tqc, crossq, xqc: Number of units of the recurrent layer."""
     batch_size: int
     """ppo: Largest number of rows (steps of one env copy) in a minibatch. With core, whole sequences may be more.
-    dqn, rainbow, sac, td3, tqc, crossq, xqc: Number of transitions in a gradient step.
+    dqn, rainbow, sac, td3, tqc, crossq, xqc: Number of transitions in a gradient step. With core, as many sequences as
+    have so many, but at least one.
     """
     n_epochs: int
     """ppo: Number of epochs: how often an update uses each row.

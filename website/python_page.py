@@ -83,7 +83,9 @@ GROUPS = {
         "Tools of algorithms",
         "Networks, replay buffers, running statistics and functions that our algorithms use.",
         "algorithms.ActorCriticNetwork algorithms.QNetwork algorithms.ActorAndCritics algorithms.ReplayBuffer "
-        "algorithms.Sample algorithms.MixedReplay algorithms.Hindsight algorithms.ObservationNormalizer "
+        "algorithms.Sample algorithms.MixedReplay algorithms.Hindsight algorithms.SequenceReplay "
+        "algorithms.SequenceSample algorithms.Sequences algorithms.Encoder algorithms.RecurrentInput "
+        "algorithms.ObservationNormalizer "
         "algorithms.RewardScaler algorithms.EpisodeEnds algorithms.gae algorithms.vtrace "
         "algorithms.log_prob_and_entropy algorithms.policy_log_prob algorithms.squashed_sample "
         "algorithms.trainable algorithms.features algorithms.normalize algorithms.random_shift "

@@ -9,7 +9,8 @@ from __future__ import annotations
 from millrace.learner.algorithms.bodies.actor_with_critics import ActorWithCritics, layer_sizes
 from millrace.learner.algorithms.bodies.normalized_sac import NormalizedSAC
 from millrace.learner.algorithms.bodies.stacked_mlps import MLPShape, Normalized
-from millrace.learner.algorithms.replay.off_policy import CriticLoss, Transitions
+from millrace.learner.algorithms.replay.off_policy import CriticLoss
+from millrace.learner.algorithms.replay.transitions import Transitions
 from millrace.learner.config.hyperparameters import CrossQConfig
 from millrace.protocol.specs import PolicySpec
 

@@ -19,7 +19,10 @@ from millrace.learner.algorithms import losses
 from millrace.learner.algorithms.gradient_descent import UpdateMetrics, clip_norm
 from millrace.learner.algorithms.kernels.optimizer_step import make_optimizer, take_step
 from millrace.learner.algorithms.kernels.trained_networks import ActionValueNetwork, q_network
-from millrace.learner.algorithms.replay.off_policy import CriticLoss, OffPolicy, Transitions
+from millrace.learner.algorithms.replay.off_policy import CriticLoss, OffPolicy
+from millrace.learner.algorithms.replay.replay_buffer import Sample
+from millrace.learner.algorithms.replay.sequence_replay import SequenceSample
+from millrace.learner.algorithms.replay.transitions import Transitions
 from millrace.learner.config.hyperparameters import DQNConfig, QLearningConfig
 from millrace.protocol.arrays import Floats
 from millrace.protocol.errors import UsageError
@@ -70,6 +73,13 @@ class DQN(OffPolicy):
         """The same number of gradient steps in each update, once learning has started."""
         return self.config.gradient_steps if self.env_steps >= self.config.learning_starts else 0
 
+    def transitions(self, sample: Sample | SequenceSample) -> Transitions:
+        """See `OffPolicy`; x, next_x and target_x are encoded, so that losses need neither images nor sequences."""
+        rows = super().transitions(sample)
+        if not self.policy.needs_torch and self.policy.core is None:
+            return rows
+        return rows.encoded(self.net.encode)._replace(target_x=rows.encoded_next(self.target.encode))
+
     def update(self, batch: Batch, pulse: Callable[[], None]) -> dict[str, float]:
         """See `OffPolicy.update`; the metrics also have ε."""
         metrics = super().update(batch, pulse)
@@ -82,13 +92,13 @@ class DQN(OffPolicy):
         a′ = argmax Q′(s′, ·), or argmax Q(s′, ·) if double (van Hasselt et al. 2016). Q′ is the target network. With action
         masks, a′ is the best of the actions that are allowed in s′.
         """
-        values = self.target.params(rows.next_x, rows.next_images)
-        chooses = self.net.params(rows.next_x, rows.next_images) if self.config.double else values
+        values = self.target.head(rows.target_x)
+        chooses = self.net.head(rows.next_x) if self.config.double else values
         return rows.reward + rows.discount * values.gather(1, best_action(chooses, rows.next_mask)[:, None])[:, 0]
 
     def loss(self, rows: Transitions) -> CriticLoss:
         """E[w ℓ(Q(s, a) − y)], where ℓ is the Huber loss or the square."""
-        values = self.net.params(rows.x, rows.images).gather(1, rows.action[:, None])[:, 0]
+        values = self.net.head(rows.x).gather(1, rows.action[:, None])[:, 0]
         error = values - self.targets(rows)
         return CriticLoss(LOSSES[self.config.loss](error, rows.weight), error, {"q_mean": values.mean()})
 

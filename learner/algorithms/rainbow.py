@@ -17,10 +17,13 @@ from millrace.learner.algorithms.bodies.heads import quantile_huber
 from millrace.learner.algorithms.bodies.quantile_q_network import QuantileQNetwork
 from millrace.learner.algorithms.bodies.stacked_mlps import Normalized
 from millrace.learner.algorithms.dqn import DQN, best_action
-from millrace.learner.algorithms.replay.off_policy import CriticLoss, Transitions
+from millrace.learner.algorithms.replay.off_policy import CriticLoss, OffPolicy
+from millrace.learner.algorithms.replay.replay_buffer import Sample
+from millrace.learner.algorithms.replay.sequence_replay import SequenceSample
+from millrace.learner.algorithms.replay.transitions import Transitions
 from millrace.learner.config.hyperparameters import QLearningConfig, RainbowConfig
 from millrace.protocol.errors import UsageError
-from millrace.protocol.specs import PolicySpec
+from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
 
 
 class Rainbow(DQN):
@@ -40,6 +43,17 @@ class Rainbow(DQN):
         """See `DQN`."""
         normalized = Normalized.BEFORE if self.config.batch_norm else Normalized.NOWHERE
         return QuantileQNetwork(self.policy, self.config.quantiles, normalized, device, seed)
+
+    @classmethod
+    def policy_spec(cls, config: QLearningConfig, observation: tuple[Leaf, ...], action: ActionSpec) -> PolicySpec:
+        """See `DQN`. Raises `UsageError` for a policy with memory."""
+        if config.core is not None:
+            raise UsageError(f"rainbow: core: expected none, got {config.core}; take --algo dqn for a policy with memory")
+        return super().policy_spec(config, observation, action)
+
+    def transitions(self, sample: Sample | SequenceSample) -> Transitions:
+        """See `OffPolicy`. Nothing is encoded yet: observations pass the encoder together with those that followed."""
+        return OffPolicy.transitions(self, sample)
 
     @torch.no_grad()
     def targets(self, rows: Transitions) -> Tensor:

@@ -1,6 +1,6 @@
 """Returns and advantages. Pure: arrays [T, N] in, arrays [T, N] out; T steps of N env copies.
 
-n-step returns aren't here: the replay buffer sums them when it draws a transition (`replay/replay_buffer.py`).
+The replay buffer of single rows has its own n-step returns: it follows rows from slot to slot (`replay/replay_buffer.py`).
 
 Every function follows the row format (`millrace.protocol.rollout`): row t bootstraps from `values[t+1]`, the value of
 `obs[t+1]`, which is the true final observation of a truncated episode. No function adds rewards or values across the end of
@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from millrace.protocol.arrays import Bools, Doubles, Floats
+from millrace.protocol.arrays import Bools, Doubles, Floats, Ints
 from millrace.protocol.rollout import Batch
 
 
@@ -101,6 +101,39 @@ def vtrace(
         following = np.where(ends.valid[t], vs_minus_v[t], following) if ends.with_seats else vs_minus_v[t]
     target = np.where(ends.valid, vs_minus_v + values[:-1], zero)
     return target, delta + rho * discount * mix * ahead
+
+
+class NStepReturns(NamedTuple):
+    """The k steps of each valid row [T, N]: n, or fewer where its episode or the rollout ends. Other rows mean nothing."""
+
+    reward: Doubles
+    """Σ γⁱ r over the k steps"""
+    discount: Doubles
+    """γᵏ; 0 where the task terminated"""
+    last: Ints
+    """the step of the observation that they lead to, at most T; where the task terminated, that of the last row: none of
+    what stands behind it has a meaning"""
+
+
+def n_step_returns(reward: Floats, ends: EpisodeEnds, gamma: float, n_step: int) -> NStepReturns:
+    """The discounted sums of up to n rewards [T, N] of an episode, of the valid rows that follow each other."""
+    T, N = reward.shape
+    following = np.full((T, N), T)  # [T, N] the next valid row of the same episode; T if there is none
+    next_valid = np.full(N, T)
+    for t in range(T - 1, -1, -1):
+        following[t] = np.where(ends.ended[t], T, next_valid)
+        next_valid = np.where(ends.valid[t], t, next_valid if ends.with_seats else T)
+    column = np.arange(N)
+    at = np.repeat(np.arange(T)[:, None], N, axis=1)
+    total = reward.astype(np.float64)
+    discount = np.where(ends.terminated, 0.0, gamma)
+    for _ in range(n_step - 1):
+        next_row = following[at, column]
+        going = next_row < T
+        at = np.where(going, next_row, at)
+        total += np.where(going, discount * reward[at, column], 0)
+        discount = np.where(going, discount * gamma * ~ends.terminated[at, column], discount)
+    return NStepReturns(total, discount, at + ~ends.terminated[at, column])
 
 
 def complete(ends: EpisodeEnds) -> Bools:

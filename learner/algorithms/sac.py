@@ -15,7 +15,8 @@ from millrace.learner.algorithms.algorithm import Start
 from millrace.learner.algorithms.gradient_descent import UpdateMetrics
 from millrace.learner.algorithms.kernels.optimizer_step import make_optimizer
 from millrace.learner.algorithms.replay.continuous import Continuous
-from millrace.learner.algorithms.replay.off_policy import CriticLoss, Transitions
+from millrace.learner.algorithms.replay.off_policy import CriticLoss
+from millrace.learner.algorithms.replay.transitions import Transitions
 from millrace.learner.config.hyperparameters import SACConfig
 from millrace.protocol.errors import UsageError
 from millrace.protocol.policy.networks import trainable

@@ -14,7 +14,8 @@ from torch import Tensor
 from millrace.learner.algorithms.bodies.actor_with_critics import ActorWithCritics, layer_sizes
 from millrace.learner.algorithms.bodies.heads import lowest, quantile_huber
 from millrace.learner.algorithms.bodies.stacked_mlps import MLPShape
-from millrace.learner.algorithms.replay.off_policy import CriticLoss, Transitions
+from millrace.learner.algorithms.replay.off_policy import CriticLoss
+from millrace.learner.algorithms.replay.transitions import Transitions
 from millrace.learner.algorithms.sac import SAC
 from millrace.learner.config.hyperparameters import TQCConfig
 from millrace.protocol.errors import UsageError

@@ -17,7 +17,8 @@ from millrace.learner.algorithms.bodies.actor_with_critics import ActorWithCriti
 from millrace.learner.algorithms.bodies.heads import Categories
 from millrace.learner.algorithms.bodies.normalized_sac import NormalizedSAC
 from millrace.learner.algorithms.bodies.stacked_mlps import MLPShape, Normalized
-from millrace.learner.algorithms.replay.off_policy import CriticLoss, Transitions
+from millrace.learner.algorithms.replay.off_policy import CriticLoss
+from millrace.learner.algorithms.replay.transitions import Transitions
 from millrace.learner.config.hyperparameters import XQCConfig
 from millrace.protocol.arrays import Floats
 from millrace.protocol.specs import PolicySpec

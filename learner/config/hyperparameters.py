@@ -176,12 +176,18 @@ class OffPolicyConfig(AlgorithmConfig, frozen=True):
     """T, the steps of each env copy in a rollout."""
     activation: Fixed[Literal["tanh", "relu"]] = "relu"
     """Activation function of the hidden layers."""
+    core: Fixed[Literal["lstm", "gru"] | None] = None
+    """Recurrent layer in front of the hidden layers. A gradient step then takes whole sequences: the rollout_steps steps of
+    an env copy, after its rollout before, in which the layer warms up. Actor and critics share it, and critics train it.
+    """
+    core_size: Fixed[Count] = 64
+    """Number of units of the recurrent layer."""
     learning_rate: Free[Positive] = 3e-4
     """Learning rate of the optimizer."""
     learning_rate_schedule: Free[Schedule] = "constant"
     """linear: the learning rate falls to zero over the run."""
     batch_size: Free[Count] = 64
-    """Number of transitions in a gradient step."""
+    """Number of transitions in a gradient step. With core, as many sequences as have so many, but at least one."""
     learning_starts: Free[Natural] = 1000
     """Number of env steps before the first gradient step."""
     replay_size: Fixed[Count] = 100_000
@@ -305,7 +311,7 @@ class ContinuousConfig(OffPolicyConfig, frozen=True):
     net: Fixed[tuple[Count, ...]] = (256, 256)
     """Sizes of the hidden layers: of the actor and of each critic."""
     batch_size: Free[Count] = 256
-    """Number of transitions in a gradient step."""
+    """Number of transitions in a gradient step. With core, as many sequences as have so many, but at least one."""
     learning_starts: Free[Natural] = 100
     """Number of env steps before the first gradient step. Until then, actions are drawn uniformly."""
     replay_size: Fixed[Count] = 1_000_000

@@ -207,6 +207,10 @@ def _check_prior(config: Config) -> None:
             raise UsageError(f"prior {config.prior}: {config.algo} can only clone it; add --clone-epochs 50")
         case RecurrentConfig(core=str(), clone_epochs=epochs) if epochs:
             raise UsageError(f"clone_epochs: expected 0 with a recurrent core, got {epochs}; take --core none")
+        case OffPolicyConfig(core=str()) if config.prior:
+            raise UsageError(
+                f"prior {config.prior}: expected core none, because datasets have no states of a core; drop --core"
+            )
     for name in ("prior_steps", "clone_epochs"):
         number: int = getattr(config.algorithm, name, 0)
         if number and not config.prior:

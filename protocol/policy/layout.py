@@ -74,10 +74,6 @@ def parameter_layout(spec: PolicySpec) -> tuple[tuple[Field, ...], tuple[Field, 
         return tuple(Field(array.name, array.shape, 0) for array in spec.own.arrays), ()
     encoder, width = encoder_layout(spec)
     acting = [] if spec.stores_scaled_actions else [*encoder]
-    if spec.core is not None:
-        from_input, from_state = core_shapes(spec, width)
-        acting += [*_linear("core.input", *from_input[::-1], 1.0), *_linear("core.state", *from_state[::-1], 1.0)]
-        width = spec.core_size
     hidden, last = _hidden(_trunk(spec), width, spec.net)
     acting += hidden
     action = spec.action
@@ -104,7 +100,10 @@ def parameter_layout(spec: PolicySpec) -> tuple[tuple[Field, ...], tuple[Field, 
 
 
 def encoder_layout(spec: PolicySpec) -> tuple[list[Field], int]:
-    """The fields of what comes before the linear layers, for images or of the user's own; and how many features it gives."""
+    """The fields of what comes before the hidden layers, and how many features it gives.
+
+    That is: for each image its convolutions, or the user's own module; then the recurrent core, if there is one.
+    """
     fields: list[Field] = []
     width = feature_size(spec)
     if spec.encoder is not None:
@@ -123,6 +122,10 @@ def encoder_layout(spec: PolicySpec) -> tuple[list[Field], int]:
             channels = conv.channels
         fields += _linear(f"image{i}.out", flattened, IMAGE_FEATURES, math.sqrt(2))
         width += IMAGE_FEATURES
+    if spec.core is not None:
+        from_input, from_state = core_shapes(spec, width)
+        fields += [*_linear("core.input", *from_input[::-1], 1.0), *_linear("core.state", *from_state[::-1], 1.0)]
+        width = spec.core_size
     return fields, width
 
 

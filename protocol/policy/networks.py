@@ -9,6 +9,7 @@ already normalized.
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import partial
@@ -202,7 +203,7 @@ def named_leaves(values: Tensor, gradient: Tensor, fields: Sequence[Field]) -> d
 
 
 class Encoder:
-    """What comes before the MLPs: the convolutions of each image, or the user's own module."""
+    """What comes before the MLPs: the convolutions of each image or the user's own module, then the recurrent core."""
 
     def __init__(self, spec: PolicySpec, parameters: dict[str, Tensor], device: str | torch.device, *, seed: int) -> None:
         """`parameters`: leaves of the graph, by name. Those of the user's own module take their places."""
@@ -218,17 +219,58 @@ class Encoder:
         """An encoder whose parameters and gradients are these flat tensors."""
         return cls(spec, named_leaves(values, gradient, encoder_layout(spec)[0]), device, seed=seed)
 
-    def __call__(self, x: Tensor, images: Sequence[Tensor]) -> Tensor:
+    def __call__(self, x: Tensor, images: Sequence[Tensor], recurrent: RecurrentInput | None = None) -> Tensor:
         """Features [B, D] and images [B, *leaf] uint8 -> input of the MLPs [B, D + IMAGE_FEATURES per image].
 
         With the user's own module, the input of the MLPs is the module's output [B, K].
+
+        With a core, it is the core's output [B, H], for x and images of [T · C, …]. `recurrent` says where episodes begin
+        and which B rows to return. None: each observation is the first of its episode.
         """
+        if self._spec.core is None:
+            return self._seen(x, images)
+        h, _ = self.advance(x, images, self._first_steps(x) if recurrent is None else recurrent)
+        return h if recurrent is None or recurrent.output_rows is None else h[recurrent.output_rows]
+
+    def advance(self, x: Tensor, images: Sequence[Tensor], recurrent: RecurrentInput) -> tuple[Tensor, Tensor]:
+        """The core's outputs [T · C, H] for x and images of [T · C, …], and its last state [C, S]."""
+        return self.core(self._seen(x, images), recurrent)
+
+    def act(self, x: Tensor, images: Sequence[Tensor], state: Tensor) -> tuple[Tensor, Tensor]:
+        """The input of the MLPs at one step of B copies, and the core's state after it [B, S]: `state` without a core."""
+        if self._spec.core is None:
+            return self._seen(x, images), state
+        return self.advance(x, images, RecurrentInput(state, x.new_ones(1, len(x))))
+
+    def _first_steps(self, x: Tensor) -> RecurrentInput:
+        return RecurrentInput(x.new_zeros(len(x), self._spec.state_size), x.new_ones(1, len(x)))
+
+    def _seen(self, x: Tensor, images: Sequence[Tensor]) -> Tensor:
         if self._module is not None:
             out: Tensor = self._module(x, *images)
             return out
         parts = [x]
         parts += [convolutions(image) for convolutions, image in zip(self._images, images, strict=True)]
         return torch.cat(parts, -1) if images else x
+
+    def core(self, x: Tensor, recurrent: RecurrentInput) -> tuple[Tensor, Tensor]:
+        """Inputs [T · C, D] -> the core's outputs [T · C, H] and its last state [C, S]; see `recurrent.py`."""
+        weights = [self._parameters[f"core.{side}.{kind}"] for kind in ("weight", "bias") for side in ("input", "state")]
+        outputs = []
+        state = recurrent.initial_state
+        advances = recurrent.advances
+        keeps = recurrent.keep_state.unsqueeze(-1)
+        for t, (step, keep) in enumerate(zip(x.view(*recurrent.keep_state.shape, -1), keeps, strict=True)):
+            before = state = state * keep
+            if self._spec.core == "lstm":
+                h, c = torch.lstm_cell(step, state.chunk(2, -1), *weights)
+                state = torch.cat((h, c), -1)
+            else:
+                h = state = torch.gru_cell(step, state, *weights)
+            if advances is not None:
+                state = torch.where(advances[t, :, None], state, before)
+            outputs.append(h)
+        return torch.cat(outputs), state
 
     def use_bfloat16(self) -> None:
         """Process images in bfloat16 from now on, with copies of the current parameters and without gradients."""
@@ -260,8 +302,8 @@ class Encoder:
         return Convolutions(channels_last, parameters, [conv.stride for conv in stack], leaf.divisor)
 
 
-class FlatNetwork:
-    """Named parameters that are views of one flat tensor, and the layers before the heads: encoder and core."""
+class FlatNetwork(ABC):
+    """Named parameters that are views of one flat tensor, and the layers before the heads."""
 
     def __init__(self, spec: PolicySpec, device: str | torch.device = "cpu", *, seed: int = 0) -> None:
         """Initialize each field orthogonally with its gain, or with zeros if the gain is 0. The values depend on `seed`."""
@@ -297,24 +339,14 @@ class FlatNetwork:
         out = self.mlp(x, layers)
         return torch.relu(out) if self._relu else torch.tanh(out)
 
-    def core(self, x: Tensor, recurrent: RecurrentInput) -> tuple[Tensor, Tensor]:
-        """Inputs [T · C, D] -> the core's outputs [T · C, H] and its last state [C, S]; see `recurrent.py`."""
-        weights = [self.parameters[f"core.{side}.{kind}"] for kind in ("weight", "bias") for side in ("input", "state")]
-        outputs = []
-        state = recurrent.initial_state
-        advances = recurrent.advances
-        keeps = recurrent.keep_state.unsqueeze(-1)
-        for t, (step, keep) in enumerate(zip(x.view(*recurrent.keep_state.shape, -1), keeps, strict=True)):
-            before = state = state * keep
-            if self.spec.core == "lstm":
-                h, c = torch.lstm_cell(step, state.chunk(2, -1), *weights)
-                state = torch.cat((h, c), -1)
-            else:
-                h = state = torch.gru_cell(step, state, *weights)
-            if advances is not None:
-                state = torch.where(advances[t, :, None], state, before)
-            outputs.append(h)
-        return torch.cat(outputs), state
+    @abstractmethod
+    def head(self, h: Tensor) -> Tensor:
+        """Distribution params [B, P] of the encoder's outputs h [B, H]."""
+
+    def act(self, x: Tensor, images: Sequence[Tensor], state: Tensor) -> tuple[Tensor, Tensor]:
+        """Distribution params [B, P] of one step of B copies, and the core's state after it [B, S]."""
+        h, state = self.encode.act(x, images, state)
+        return self.head(h), state
 
 
 class ActorCriticNetwork(FlatNetwork):
@@ -334,11 +366,7 @@ class ActorCriticNetwork(FlatNetwork):
         return out if log_std is None else torch.cat([out, log_std.expand(len(out), -1)], -1)
 
     def _common(self, x: Tensor, images: Sequence[Tensor], recurrent: RecurrentInput | None) -> Tensor:
-        h = self.encode(x[:, : self._acting_features], images)
-        if recurrent is not None:
-            h, _ = self.core(h, recurrent)
-            h = h if recurrent.output_rows is None else h[recurrent.output_rows]
-        return self.hidden(h, self._trunk)
+        return self.hidden(self.encode(x[:, : self._acting_features], images, recurrent), self._trunk)
 
     def _value(self, h: Tensor, x: Tensor, recurrent: RecurrentInput | None) -> Tensor:
         """V [B] of what the actor sees, `h`, and the features behind it."""
@@ -387,12 +415,9 @@ class ActorCriticNetwork(FlatNetwork):
             params = params.masked_fill(F.pad(~mask, (0, others)), FORBIDDEN)
         return *log_prob_and_entropy(self.spec.action, params, action), value
 
-    def act(self, x: Tensor, images: Sequence[Tensor], state: Tensor) -> tuple[Tensor, Tensor]:
-        """Distribution params [B, P] of one step of B copies, and the core's state after it [B, S]."""
-        h = self.encode(x, images)
-        if self.spec.core is not None:
-            h, state = self.core(h, RecurrentInput(state, x.new_ones(1, len(x))))
-        return self._params(self.hidden(h, self._trunk)), state
+    def head(self, h: Tensor) -> Tensor:
+        """See `FlatNetwork`."""
+        return self._params(self.hidden(h, self._trunk))
 
 
 class QNetwork(FlatNetwork):
@@ -405,7 +430,10 @@ class QNetwork(FlatNetwork):
 
     def params(self, x: Tensor, images: Sequence[Tensor] = ()) -> Tensor:
         """Action values [B, n] of features [B, D] float32 and images [B, *leaf] uint8."""
-        h = self.encode(x, images)
+        return self.head(self.encode(x, images))
+
+    def head(self, h: Tensor) -> Tensor:
+        """Action values [B, n] of the encoder's outputs h [B, H]."""
         if not self.spec.dueling:
             return self.mlp(h, self._without_dueling)
         h = self.hidden(h, self._hidden)
@@ -461,6 +489,10 @@ class ActorAndCritics(FlatNetwork):
     def params(self, x: Tensor, images: Sequence[Tensor] = ()) -> Tensor:
         """As `actor_params`, for features [B, D] float32 and images [B, *leaf] uint8: to act."""
         return self.actor_params(self.encode(x, images))
+
+    def head(self, h: Tensor) -> Tensor:
+        """See `FlatNetwork`."""
+        return self.actor_params(h)
 
     def actor_params(self, h: Tensor) -> Tensor:
         """The actor's output before the tangent: [B, D′] (deterministic) or [B, 2 D′].

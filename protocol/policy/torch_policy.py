@@ -13,7 +13,7 @@ import torch
 from millrace.protocol.arrays import Array, Floats
 from millrace.protocol.policy.features import features
 from millrace.protocol.policy.layout import appended_params, buffer_layout, buffer_size, named_views
-from millrace.protocol.policy.networks import ActorCriticNetwork, defaults_of_thread, network_of
+from millrace.protocol.policy.networks import defaults_of_thread, network_of
 from millrace.protocol.policy.normalize import normalize
 from millrace.protocol.policy.recurrent import zero_state
 from millrace.protocol.specs import PolicySpec
@@ -73,8 +73,6 @@ class TorchPolicy:
         """Distribution parameters [N, P] of one lane, for x [N, D], images [N, *leaf] and state [N, S], updated in place."""
         inputs = torch.tensor(x, device=self._device), [torch.tensor(image, device=self._device) for image in images]
         with defaults_of_thread(), torch.no_grad():
-            if not isinstance(self._net, ActorCriticNetwork):
-                return np.asarray(self._net.params(*inputs).cpu().numpy())
             params, after = self._net.act(*inputs, torch.tensor(state, device=self._device))
         state[:] = after.cpu().numpy()
         return np.asarray(params.cpu().numpy())

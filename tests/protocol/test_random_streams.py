@@ -16,6 +16,7 @@ from torch import nn
 
 from millrace.extras.datasets.played_episodes import recording_seeds
 from millrace.learner.algorithms.ppo import PPO
+from millrace.learner.algorithms.replay.mixed_replay import MixedReplay
 from millrace.learner.algorithms.sac import SAC
 from millrace.learner.config.hyperparameters import PPOConfig, SACConfig
 from millrace.learner.rollouts.evaluation_dealer import episode_seeds
@@ -156,6 +157,7 @@ def test_no_two_generators_of_a_run_coincide(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(torch.nn.init, "orthogonal_", initial)
     config = SACConfig()
     sac = SAC(config, SAC.policy_spec(config, (BOX,), GAUSSIAN.action), total_steps=100, seed=seed)
+    assert isinstance(sac.replay, MixedReplay)
     sac.replay.add_prior([], 500, 0.5)
     assert sac.replay.prior is not None
     streams |= {"replay": draws(sac.replay.generator), "prior": draws(sac.replay.prior.generator)}

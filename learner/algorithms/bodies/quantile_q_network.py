@@ -45,22 +45,26 @@ class QuantileQNetwork:
         self.flat.grad = self.flat_grad
         self._encoder, layers = torch.split(self.flat, sizes)
         of_encoder, of_layers = torch.split(self.flat_grad, sizes)
-        self._encode = Encoder.of_flat(policy, self._encoder, of_encoder, device, seed=seed)
+        self.encode = Encoder.of_flat(policy, self._encoder, of_encoder, device, seed=seed)
         self.statistics = initial_statistics(shape).to(device)
         """[S] the running statistics; empty without normalization"""
         self.body = StackedMLPs(shape, trainable(layers, of_layers), self.statistics)
 
     def trained(self, x: Tensor, images: Sequence[Tensor]) -> Tensor:
         """The quantiles [B, N, n] of features [B, D] and images [B, *leaf] uint8, to train the network by."""
-        return self._by_action(self.body.trained(self._encode(x, images)))
+        return self._by_action(self.body.trained(self.encode(x, images)))
 
     def of_minibatch(self, x: Tensor, images: Sequence[Tensor]) -> Tensor:
         """As `trained`, normalized by the statistics of this minibatch, but nothing is trained or moves: for targets."""
-        return self._by_action(self.body.of_minibatch(self._encode(x, images)))
+        return self._by_action(self.body.of_minibatch(self.encode(x, images)))
 
     def params(self, x: Tensor, images: Sequence[Tensor] = ()) -> Tensor:
-        """The action values [B, n] by which workers act: means of the quantiles, normalized by the running statistics."""
-        return self._by_action(self.body.evaluated(self._encode(x, images))).mean(1)
+        """The action values [B, n] of features [B, D] and images [B, *leaf] uint8, by which workers act."""
+        return self.head(self.encode(x, images))
+
+    def head(self, h: Tensor) -> Tensor:
+        """Action values [B, n] of the encoder's outputs h [B, H]: means of quantiles, normalized by running statistics."""
+        return self._by_action(self.body.evaluated(h)).mean(1)
 
     def _by_action(self, outputs: Tensor) -> Tensor:
         """Outputs [1, B, N (n + 1)] as quantiles [B, N, n]."""

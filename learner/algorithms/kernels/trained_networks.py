@@ -17,7 +17,14 @@ from millrace.learner.algorithms.kernels.mlp import SmallMLP, Trunks, Values
 from millrace.protocol.arrays import Array, Floats
 from millrace.protocol.policy.features import feature_size
 from millrace.protocol.policy.layout import CRITICS, hidden_names
-from millrace.protocol.policy.networks import ActorAndCritics, ActorCriticNetwork, QNetwork, RecurrentInput, trainable
+from millrace.protocol.policy.networks import (
+    ActorAndCritics,
+    ActorCriticNetwork,
+    Encoder,
+    QNetwork,
+    RecurrentInput,
+    trainable,
+)
 from millrace.protocol.specs import PolicySpec
 
 MAX_UNITS = 256  # of a layer; in larger layers, matrix products take nearly all the time (`benchmarks.update`)
@@ -43,8 +50,13 @@ class ActionValueNetwork(Protocol):
     flat_grad: Tensor
     """[P] their gradient"""
 
-    def params(self, x: Tensor, images: Sequence[Tensor] = ()) -> Tensor:
-        """Action values [B, n] of features [B, D] and images [B, *leaf] uint8."""
+    @property
+    def encode(self) -> Encoder:
+        """Makes h of features [B, D] and images [B, *leaf] uint8."""
+        ...
+
+    def head(self, h: Tensor) -> Tensor:
+        """Action values [B, n] of the encoder's outputs h [B, H]."""
         ...
 
     def acting_parameters(self) -> Floats:
@@ -109,9 +121,9 @@ class SmallQNetwork(QNetwork):
         trunks = Trunks([hidden_names(spec)], [(name, 0) for name in names])
         self._small = SmallMLP(trainable(self.flat, self.flat_grad), self.fields, trunks, spec.activation == "relu")
 
-    def params(self, x: Tensor, images: Sequence[Tensor] = ()) -> Tensor:
+    def head(self, h: Tensor) -> Tensor:
         """See `QNetwork`."""
-        return self.action_values(*self._small(x))
+        return self.action_values(*self._small(h))
 
 
 class SmallActorAndCritics(ActorAndCritics):

@@ -7,7 +7,7 @@ size of the rollouts and the number and speed of the workers. Where these settin
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from fractions import Fraction
 from typing import Any, ClassVar, Protocol
 
@@ -20,12 +20,15 @@ from millrace.learner.algorithms.algorithm import Start
 from millrace.learner.algorithms.gradient_descent import UpdateMetrics
 from millrace.learner.algorithms.kernels.optimizer_step import make_optimizer, take_step
 from millrace.learner.algorithms.kernels.trained_networks import actor_and_critics
-from millrace.learner.algorithms.replay.off_policy import OffPolicy, Transitions
+from millrace.learner.algorithms.replay.off_policy import OffPolicy
 from millrace.learner.algorithms.replay.random_shift import random_shift
 from millrace.learner.algorithms.replay.replay_buffer import Sample
+from millrace.learner.algorithms.replay.sequence_replay import SequenceSample
+from millrace.learner.algorithms.replay.transitions import Transitions
 from millrace.learner.config.hyperparameters import ContinuousConfig
 from millrace.protocol.arrays import Floats
 from millrace.protocol.errors import UsageError
+from millrace.protocol.policy.networks import Encoder
 from millrace.protocol.random_streams import Purpose, torch_seed
 from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
 
@@ -41,7 +44,7 @@ class Networks(Protocol):
     """[E + C] the encoder and the critics, in the memory of `flat`, with a gradient"""
 
     @property
-    def encode(self) -> Callable[[Tensor, Sequence[Tensor]], Tensor]:
+    def encode(self) -> Encoder:
         """Makes h of features [B, D] and images [B, *leaf] uint8."""
         ...
 
@@ -132,7 +135,7 @@ class Continuous(OffPolicy):
         """Normal noise [B, D′]."""
         return torch.randn(rows, math.prod(self.policy.action.shape), generator=self._generator).to(self.net.flat)
 
-    def transitions(self, sample: Sample) -> Transitions:
+    def transitions(self, sample: Sample | SequenceSample) -> Transitions:
         """See `OffPolicy`; an action is a row of numbers, and x and next_x are encoded, so that losses need no images.
 
         Images are shifted at random first. The loss of the critics trains the encoder through `rows.x`; next_x has no
@@ -140,20 +143,19 @@ class Continuous(OffPolicy):
         """
         rows = super().transitions(sample)
         rows = rows._replace(action=rows.action.reshape(len(rows.action), -1).to(rows.x))
-        if not self.policy.needs_torch:
+        if not self.policy.needs_torch and self.policy.core is None:
             return rows
-        x = self.net.encode(rows.x, self._shifted(rows.images))
-        with torch.no_grad():
-            next_x = self.net.encode(rows.next_x, self._shifted(rows.next_images))
-        return rows._replace(x=x, images=(), next_x=next_x, next_images=())
+        images = self._shifted(rows.images)
+        next_images = images if rows.sequences is not None else self._shifted(rows.next_images)
+        return rows._replace(images=images, next_images=next_images).encoded(self.net.encode)
 
-    def _shifted(self, images: Sequence[Tensor]) -> list[Tensor]:
+    def _shifted(self, images: Sequence[Tensor]) -> tuple[Tensor, ...]:
         leaves = [leaf for leaf in self.policy.observation if leaf.is_image]
         most = self.config.random_shift
-        return [
+        return tuple(
             random_shift(image, most, channels_last=leaf.has_channels_last, generator=self._generator)
             for image, leaf in zip(images, leaves, strict=True)
-        ]
+        )
 
     def descend(self, name: str, loss: Tensor, numbers: Mapping[str, Tensor | float]) -> UpdateMetrics:
         """Step the optimizer NAME_optimizer down the gradient of a loss, logged as NAME_loss.

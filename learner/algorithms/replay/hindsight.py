@@ -147,6 +147,8 @@ class Hindsight:
         if not config.hindsight:
             return None
         given = f"hindsight {config.hindsight:g}"
+        if config.core is not None:
+            raise UsageError(f"{given}: expected core none, because whole sequences are drawn as they were; drop --core")
         goals = goals_of(observation)
         if goals is None:
             got = ", ".join(f"{leaf.path or 'one array'} {leaf.dtype}{list(leaf.shape)}" for leaf in observation)

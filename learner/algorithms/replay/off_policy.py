@@ -14,6 +14,7 @@ from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, ClassVar, NamedTuple
 
+from msgspec.structs import replace
 from torch import Tensor
 
 from millrace.learner.algorithms.gradient_descent import GradientDescent, UpdateMetrics
@@ -21,33 +22,14 @@ from millrace.learner.algorithms.prior_data import PriorData
 from millrace.learner.algorithms.replay.hindsight import Hindsight
 from millrace.learner.algorithms.replay.mixed_replay import MixedReplay
 from millrace.learner.algorithms.replay.replay_buffer import Sample
+from millrace.learner.algorithms.replay.sequence_replay import SequenceReplay, SequenceSample
+from millrace.learner.algorithms.replay.transitions import Sequences, Transitions
 from millrace.learner.config.hyperparameters import AlgorithmConfig, OffPolicyConfig
 from millrace.protocol.arrays import Array
+from millrace.protocol.errors import UsageError
+from millrace.protocol.policy.networks import RecurrentInput
 from millrace.protocol.rollout import Batch
 from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
-
-
-class Transitions(NamedTuple):
-    """B transitions of n steps, or of fewer where an episode ends, as a loss takes them."""
-
-    x: Tensor
-    """[B, D] features of the observations, normalized"""
-    images: tuple[Tensor, ...]
-    """[B, *leaf] uint8 each"""
-    action: Tensor
-    """[B] int64, or [B, D′] in [-1, 1]"""
-    reward: Tensor
-    """[B] Σ γⁱ r; with `normalize_rewards`, divided by the standard deviation of returns and clipped to ±10"""
-    discount: Tensor
-    """[B] γᵏ, or 0 if the task has terminated"""
-    next_x: Tensor
-    """[B, D] features of the observations k steps later"""
-    next_images: tuple[Tensor, ...]
-    """[B, *leaf] uint8 each"""
-    next_mask: Tensor | None
-    """[B, choices] the actions that are allowed then; None without action masks"""
-    weight: Tensor
-    """[B] of each row in the loss; 1 unless replay is prioritized"""
 
 
 class CriticLoss(NamedTuple):
@@ -73,11 +55,28 @@ class OffPolicy(GradientDescent):
     def policy_spec(config: Any, observation: tuple[Leaf, ...], action: ActionSpec) -> PolicySpec:
         """See `Algorithm.policy_spec`. Raises `UsageError` if the run can't have the hindsight that its settings want."""
         Hindsight.of(config, observation)
-        return GradientDescent.policy_spec(config, observation, action)
+        spec = GradientDescent.policy_spec(config, observation, action)
+        return replace(spec, core=config.core, core_size=config.core_size)
 
     def __init__(self, config: OffPolicyConfig, policy: PolicySpec, *, total_steps: int, seed: int) -> None:
         super().__init__(config, policy, total_steps=total_steps)
-        self.replay = MixedReplay(
+        self.replay = self._make_replay(config, policy, seed)
+        self.gradient_steps = 0  # what Stable-Baselines3 calls n_updates
+        self.prior_gradient_steps = 0  # of these, the ones before the first rollouts
+
+    @staticmethod
+    def _make_replay(config: OffPolicyConfig, policy: PolicySpec, seed: int) -> MixedReplay | SequenceReplay:
+        if policy.core is not None:
+            return SequenceReplay(
+                policy,
+                rows=config.replay_size,
+                steps=config.rollout_steps,
+                n_step=config.n_step,
+                gamma=config.gamma,
+                seed=seed,
+                alpha=config.priority_alpha or None,
+            )
+        return MixedReplay(
             policy.observation,
             size=config.replay_size,
             n_step=config.n_step,
@@ -87,8 +86,6 @@ class OffPolicy(GradientDescent):
             action=policy.action,
             hindsight=Hindsight.of(config, policy.observation),
         )
-        self.gradient_steps = 0  # what Stable-Baselines3 calls n_updates
-        self.prior_gradient_steps = 0  # of these, the ones before the first rollouts
 
     @abstractmethod
     def steps_due(self) -> int:
@@ -133,16 +130,48 @@ class OffPolicy(GradientDescent):
             yield metrics
             pulse()
 
-    def transitions(self, sample: Sample) -> Transitions:
+    def transitions(self, sample: Sample | SequenceSample) -> Transitions:
         """A sample on the device of the weights, with observations and rewards normalized if the settings say so."""
+        if isinstance(sample, SequenceSample):
+            return self._of_sequences(sample)
+        next_x, next_images = self.inputs(sample.next_leaves)
         return Transitions(
             *self.inputs(sample.leaves),
             self.tensor(sample.action),
             self._number(self.scaled(sample.reward)),
             self._number(sample.discount),
-            *self.inputs(sample.next_leaves),
+            next_x,
+            next_images,
             None if sample.next_mask is None else self.tensor(sample.next_mask),
             self._number(sample.weight),
+            next_x,
+        )
+
+    def _of_sequences(self, sample: SequenceSample) -> Transitions:
+        steps, columns = sample.keep_state.shape
+        x, images = self.inputs([leaf.reshape(steps * columns, *leaf.shape[2:]) for leaf in sample.leaves])
+        keep_state = self._number(sample.keep_state)
+        advances = self.tensor(sample.advances)
+        half = steps // 2
+        sequences = Sequences(
+            RecurrentInput(self._number(sample.state), keep_state[:half], advances=advances[:half]),
+            keep_state[half:],
+            advances[half:],
+            self.tensor(sample.rows),
+            self.tensor(sample.next_rows),
+        )
+        return Transitions(
+            x,
+            images,
+            self.tensor(sample.action),
+            self._number(self.scaled(sample.reward)),
+            self._number(sample.discount),
+            x,
+            images,
+            None if sample.next_mask is None else self.tensor(sample.next_mask),
+            self._number(sample.weight),
+            x,
+            sequences,
         )
 
     def _number(self, array: Array) -> Tensor:
@@ -152,7 +181,12 @@ class OffPolicy(GradientDescent):
     # ---------------------------------------------------------------- prior data
 
     def add_prior(self, prior: PriorData) -> None:
-        """Store the rows of a dataset beside the replay buffer. They count for all statistics."""
+        """Store the rows of a dataset beside the replay buffer. They count for all statistics.
+
+        Raises `UsageError` with a recurrent core: a dataset has no states of it.
+        """
+        if isinstance(self.replay, SequenceReplay):
+            raise UsageError(f"prior: expected no recurrent core, got {self.policy.core}; take --core none, or no --prior")
 
         def counted() -> Iterator[Batch]:
             for batch in prior.batches():

@@ -334,11 +334,8 @@ class ReplayBuffer:
         return slots, row, np.ones(count, np.float32)
 
     def _by_priority(self, tree: SumTree, count: int, beta: float) -> tuple[Ints, Array, Floats]:
-        """P(i) = pᵢ^α / Σ p^α;  wᵢ = (rows · P(i))^−β, divided by the greatest of them (Schaul et al. 2016, section 3.4)."""
-        slots = tree.draw(self.generator, count)
-        chance = tree.weights[slots] / tree.total
-        weight = (self._rows * chance) ** -beta
-        return slots, self._row[slots], (weight / weight.max()).astype(np.float32)
+        slots, weight = tree.draw_weighted(self.generator, count, self._rows, beta)
+        return slots, self._row[slots], weight
 
     def _follow(self, row: Array, goals: Goals | None) -> tuple[Doubles, Doubles, Ints]:
         """Follow each row for up to n steps. Returns the discounted reward, γᵏ (0 if the task ended) and the last slot.

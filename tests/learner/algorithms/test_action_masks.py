@@ -19,6 +19,8 @@ from millrace.learner.algorithms.kernels import trained_networks
 from millrace.learner.algorithms.minibatches import Minibatch, log_probs
 from millrace.learner.algorithms.ppo import PPO
 from millrace.learner.algorithms.replay import replay_buffer
+from millrace.learner.algorithms.replay.mixed_replay import MixedReplay
+from millrace.learner.algorithms.replay.replay_buffer import Sample
 from millrace.learner.config.hyperparameters import DQNConfig, IMPALAConfig, PPOConfig
 from millrace.protocol.arrays import Array, Bools
 from millrace.protocol.envs.spaces import action_spec, observation_leaves
@@ -268,6 +270,7 @@ def test_targets_are_the_best_of_the_allowed_actions_of_the_next_observation(
     for seed in range(3):
         algorithm.replay.add(true_masks(masked_batch(algorithm, seed)))
     sample = algorithm.replay.sample(200)
+    assert isinstance(sample, Sample)
     (following,) = sample.next_leaves
     allowed = masks_of(following)
     assert sample.next_mask is not None
@@ -282,6 +285,7 @@ def test_targets_are_the_best_of_the_allowed_actions_of_the_next_observation(
 
 def kept(algorithm: DQN) -> Array:
     """The masks that its buffer holds."""
+    assert isinstance(algorithm.replay, MixedReplay)
     assert algorithm.replay._mask is not None
     return algorithm.replay._mask.copy()
 
@@ -296,6 +300,7 @@ def test_masks_are_overwritten_with_their_slots() -> None:
         algorithm.replay.add(each)
     assert not np.array_equal(before, kept(algorithm))
     sample = algorithm.replay.sample(500)
+    assert isinstance(sample, Sample)
     assert sample.next_mask is not None
     assert np.array_equal(sample.next_mask, masks_of(sample.next_leaves[0]))
 
@@ -316,6 +321,7 @@ def test_masks_count_for_the_memory_and_are_refused_if_they_do_not_fit(monkeypat
 def test_without_masks_nothing_is_stored() -> None:
     algorithm = dqn()
     algorithm.replay.add(batch(algorithm, 0))
+    assert isinstance(algorithm.replay, MixedReplay)
     assert algorithm.replay._mask is None
     assert algorithm.replay.sample(4).next_mask is None
     assert "mask" not in algorithm.replay.state_dict()["arrays"]

@@ -19,8 +19,8 @@ import millrace.learner.algorithms
 from millrace.learner.algorithms import algorithm_class
 from millrace.learner.algorithms.kernels import trained_networks
 from millrace.learner.algorithms.replay.continuous import Continuous
-from millrace.learner.algorithms.replay.off_policy import Transitions
 from millrace.learner.algorithms.replay.replay_buffer import Sample
+from millrace.learner.algorithms.replay.transitions import Transitions
 from millrace.learner.config.hyperparameters import HYPERPARAMETERS
 from millrace.protocol.arrays import Floats
 from millrace.protocol.envs.env_actions import action_converter_of
@@ -216,7 +216,8 @@ def rows_of(algorithm: Continuous, terminated: bool, truncated: bool) -> Transit
         valid=np.ones((2, 1), bool),
     )
     algorithm.replay.add(walk)
-    sample: Sample = algorithm.replay.sample(64)
+    sample = algorithm.replay.sample(64)
+    assert isinstance(sample, Sample)
     second = sample.leaves[0][:, 1] == 1
     assert second.any()
     assert not second.all()

@@ -154,6 +154,7 @@ def test_a_step_follows_the_gradient_of_the_usual_loss(dueling: bool) -> None:
     first = made.replay.sample(30)
     made.replay.update_priorities(first.slots, np.linspace(0, 5, 30, dtype=np.float32))
     drawn = made.replay.sample(64, beta=0.5)
+    assert isinstance(drawn, Sample)
     x, following = torch.from_numpy(drawn.leaves[0]).double(), torch.from_numpy(drawn.next_leaves[0]).double()
     reward, discount, weight = (torch.from_numpy(each).double() for each in (drawn.reward, drawn.discount, drawn.weight))
     networks: list[Any] = [made.net, made.target]
@@ -246,7 +247,9 @@ def test_priorities_are_the_errors_and_beta_grows_to_one(monkeypatch: pytest.Mon
 
     def watched_sample(count: int, beta: float) -> Sample:
         betas.append(beta)
-        return sample(count, beta)
+        drawn = sample(count, beta)
+        assert isinstance(drawn, Sample)
+        return drawn
 
     def watched_telling(slots: Ints, error: Floats) -> None:
         seen.append((slots, error))
@@ -280,7 +283,7 @@ def test_what_is_published_acts_as_the_network_and_explores_by_epsilon() -> None
     assert made.weights()[1][:4] == pytest.approx([2] * 4, abs=1)
     assert made.weights()[1][4:8] == pytest.approx([3] * 4, abs=1)
     with torch.no_grad():
-        values = made.net.params(*made.inputs([obs[0]])).numpy()
+        values = made.net.head(made.inputs([obs[0]])[0]).numpy()
     np.testing.assert_allclose(params[0, :, :-1], values, atol=1e-5)
     assert (distribution(made.policy).mode(params) == values.argmax(-1)).all()  # greedy: ε plays no part
 
@@ -416,7 +419,7 @@ def test_it_learns_a_corridor_and_what_its_end_is_worth(ends: str, settings: dic
     for _ in range(30):
         made.update(corridor(made, generator, ends), no_pulse)
     with torch.no_grad():
-        values = made.net.params(torch.eye(4)).numpy()
+        values = made.net.head(torch.eye(4)).numpy()
     assert (values.argmax(1) == 1).all()
     at_the_end = 1.0 if ends == "terminated" else 2.0  # v = 1 + ½ v
     expected = at_the_end * 0.5 ** np.arange(3, -1, -1)

@@ -47,6 +47,8 @@ STEPS: dict[str, dict[str, Any]] = {
     "crossq": {"updates_per_step": 0.03, "critic_net": (12, 10), "policy_delay": 2, "renormalize_after": 4},
     "xqc": {"updates_per_step": 0.03, "critic_net": (12, 10), "policy_delay": 2, "atoms": 11},
 }
+MEMORY_STEPS = 6
+MEMORY: dict[str, Any] = {"core": "gru", "core_size": 8, "rollout_steps": MEMORY_STEPS}
 CHOICES = ("dqn", "rainbow")
 CONTINUOUS = [name for name in STEPS if name not in CHOICES]
 
@@ -69,6 +71,12 @@ def kinds() -> dict[str, tuple[str, PolicySpec, dict[str, Any]]]:
     found["rainbow, not normalized"] = ("rainbow", DISCRETE, REPLAY | STEPS["rainbow"] | {"batch_norm": False})
     for name in CONTINUOUS:
         found[f"{name}, images"] = (name, msgspec.structs.replace(IMAGE, action=GAUSSIAN.action), REPLAY | STEPS[name])
+    for name in CONTINUOUS:
+        found[f"{name}, GRU"] = (name, GAUSSIAN, REPLAY | STEPS[name] | MEMORY | {"updates_per_step": 0.1})
+    of_dqn = REPLAY | STEPS["dqn"] | MEMORY
+    found["dqn, GRU"] = ("dqn", DISCRETE, of_dqn)
+    found["dqn, LSTM, everything"] = ("dqn", DISCRETE, of_dqn | MORE_REPLAY | MORE_DQN | {"core": "lstm"})
+    found["dqn, GRU, masks"] = ("dqn", spec_of("discrete"), of_dqn | MORE_REPLAY | {"rollout_steps": T})
     for name in CHOICES:
         found[f"{name}, images"] = (name, IMAGE, REPLAY | MORE_REPLAY | STEPS[name])
         found[f"{name}, masks"] = (name, spec_of("discrete"), REPLAY | MORE_REPLAY | STEPS[name])
@@ -79,7 +87,7 @@ def subject_of(name: str, spec: PolicySpec, settings: dict[str, Any], masks: boo
     """The algorithm, and four batches that its first weights acted on."""
     kind, config = algorithm_class(name), msgspec.convert(settings, HYPERPARAMETERS[name])
     policy = kind.policy_spec(config, spec.observation, spec.action) if name in STEPS else spec
-    steps = T if spec.core is None else 6  # each is many small steps of the core
+    steps = T if policy.core is None or masks else MEMORY_STEPS  # each is many small steps of the core
     if len(spec.observation) > 1 and name not in STEPS:
         steps = T // 2  # images
     subject = Subject(kind, config, policy, steps, ())
@@ -94,6 +102,8 @@ ONE_KIND = (
     "impala, LSTM",
     "reinforce, masks",
     "dqn, everything",
+    "dqn, LSTM, everything",
+    "sac, GRU",
     "rainbow, masks",
     *CONTINUOUS,
 )

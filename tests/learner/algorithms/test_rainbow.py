@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from millrace.learner.algorithms.rainbow import Rainbow
-from millrace.learner.algorithms.replay.off_policy import Transitions
+from millrace.learner.algorithms.replay.transitions import Transitions
 from millrace.learner.config.hyperparameters import RainbowConfig
 from millrace.protocol.errors import UsageError
 from millrace.protocol.policy.layout import named_views, parameter_layout, total_size
@@ -205,7 +205,7 @@ def test_convolutions_are_trained_with_the_layers_behind_them() -> None:
     algorithm.step(
         Transitions(
             x[:10], tuple(half[0] for half in halves), action, ones, ones,
-            x[10:], tuple(half[1] for half in halves), None, ones,
+            x[10:], tuple(half[1] for half in halves), None, ones, x[10:],
         )
     )  # fmt: skip
     moved = named_views(algorithm.net.acting_parameters() - before, parameter_layout(algorithm.policy)[0])

@@ -215,7 +215,7 @@ def test_action_values_are_theirs(activation: str) -> None:
     torch.manual_seed(0)
     other = DQNPolicy(OBSERVATION, space, lambda _: 0.0, net_arch=list(spec.net), activation_fn=ACTIVATIONS[activation])
     obs = np.random.default_rng(5).normal(0, 2, (ROWS, 4)).astype(np.float32)
-    ours, before = algorithm.net.params(torch.tensor(obs)).detach(), other.q_net(torch.tensor(obs)).detach()
+    ours, before = algorithm.net.head(torch.tensor(obs)).detach(), other.q_net(torch.tensor(obs)).detach()
     assert float((ours - before).abs().max()) > 0.1, "two policies that differ look alike"
     net: Any = algorithm.net
     arrays = [parameter.detach() for parameter in net.parameters.values()]

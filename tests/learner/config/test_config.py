@@ -162,8 +162,10 @@ def test_a_target_that_no_evaluation_can_reach_is_said() -> None:
         ({"learning_rate": -1.0}, "learning_rate: expected float > 0.0, got -1.0"),
         ({"target_return": "high"}, "target_return: expected float or \"none\", got 'high'"),
         ({"learning_rat": 1.0}, "unknown setting learning_rat; did you mean learning_rate?"),
-        ({"algo": "dqn", "core": "gru"}, "unknown setting core; it is one of ppo, a2c, impala alone"),
-        ({"algo": "reinforce", "core": "gru"}, "unknown setting core; it is one of ppo, a2c, impala alone"),
+        (
+            {"algo": "reinforce", "core": "gru"},
+            "unknown setting core; it is one of ppo, a2c, impala, dqn, rainbow, sac, td3, tqc, crossq, xqc alone",
+        ),
         ({"core": "rnn"}, "core: expected one of lstm, gru, none, got 'rnn'"),
         ({"algo": "pp0"}, "algo pp0: expected one of ppo"),
         ({"seed": 2**64}, "seed: expected int <= 18446744073709551615, got 18446744073709551616"),

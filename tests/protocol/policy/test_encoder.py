@@ -19,7 +19,7 @@ from millrace.protocol.env_spec import AllowedCode, EnvSpec
 from millrace.protocol.errors import UsageError
 from millrace.protocol.policy.encoder import describe_encoder, make_encoder
 from millrace.protocol.policy.layout import acting_size
-from millrace.protocol.policy.networks import ActorCriticNetwork, QNetwork
+from millrace.protocol.policy.networks import ActorCriticNetwork, QNetwork, RecurrentInput
 from millrace.protocol.policy.policy import make_policy
 from millrace.protocol.policy.torch_policy import TorchPolicy
 from millrace.protocol.specs import NamedShape, PolicySpec
@@ -52,6 +52,8 @@ def test_its_parameters_are_views_of_the_flat_ones_and_keep_their_first_values(s
     x = torch.randn(6, 4)
     images = [torch.randint(0, 256, (6, *leaf.shape), dtype=torch.uint8) for leaf in spec.observation[1:]]
     expected = alone(x, *images)
+    if spec.core is not None:
+        expected, _ = net.encode.core(expected, RecurrentInput(torch.zeros(6, spec.state_size), torch.ones(1, 6)))
     assert torch.equal(net.encode(x, images), expected)
     net.encode(x, images).square().sum().backward()  # type: ignore[no-untyped-call]
     assert (net.flat_grad != 0).any()

@@ -81,10 +81,10 @@ def test_it_computes_what_torch_computes(core: Core) -> None:
     begun = tuple(part[None].contiguous() for part in state.chunk(2, -1)) if core == "lstm" else state[None]
     with torch.no_grad():
         expected, after = own(x, begun)
-        found, last = net.core(x.flatten(0, 1), RecurrentInput(state, torch.ones(T, C)))
+        found, last = net.encode.core(x.flatten(0, 1), RecurrentInput(state, torch.ones(T, C)))
     parameters, exact = {name: tensor.detach().numpy() for name, tensor in net.parameters.items()}, in_float64(net)
     given = doubles(RecurrentInput(state, torch.ones(T, C)))
-    outputs, of_state = sampled(lambda: exact.core(x.double().flatten(0, 1), given))
+    outputs, of_state = sampled(lambda: exact.encode.core(x.double().flatten(0, 1), given))
     outputs_tolerance = outputs.tolerance.reshape(T, C, 8)
     outputs.assert_is(found.numpy(), expected.flatten(0, 1).numpy())
     of_state.assert_is(last.numpy(), (torch.cat(after, -1)[0] if core == "lstm" else after[0]).numpy())

@@ -20,7 +20,7 @@ from millrace.extras.datasets.prior_dataset import PriorDataset
 from millrace.launch.training import train
 from millrace.learner.algorithms.dqn import DQN
 from millrace.learner.algorithms.ppo import PPO
-from millrace.learner.algorithms.replay.off_policy import Transitions
+from millrace.learner.algorithms.replay.transitions import Transitions
 from millrace.learner.config.layers import resolve
 from millrace.learner.run_folder.metrics_log import read_rows
 from millrace.learner.run_folder.run_folder import Interrupted

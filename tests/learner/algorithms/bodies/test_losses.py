@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from millrace.learner.algorithms.bodies.stacked_mlps import StackedMLPs
-from millrace.learner.algorithms.replay.off_policy import Transitions
+from millrace.learner.algorithms.replay.transitions import Transitions
 from millrace.protocol.arrays import Doubles
 from tests.learner.algorithms.bodies import plain_formula as plain
 from tests.learner.algorithms.test_continuous import batch, made, sample_of

@@ -144,7 +144,7 @@ def side_by_side(*batches: Batch) -> Batch:
         for name in ("action", "log_prob", "reward", "terminated", "truncated", "valid")
     }
     joined["obs"] = tuple(np.concatenate(leaves, 1) for leaves in zip(*(batch.obs for batch in batches), strict=True))
-    joined |= {name: np.concatenate([getattr(batch, name) for batch in batches]) for name in ("lane", "fresh")}
+    joined |= {name: np.concatenate([getattr(batch, name) for batch in batches]) for name in ("state", "lane", "fresh")}
     return msgspec.structs.replace(batches[0], **joined)
 
 

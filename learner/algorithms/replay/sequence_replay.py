@@ -1,0 +1,347 @@
+"""The replay buffer of a policy with memory: keeps sequences, and draws each with the one before it. Seeded; no files.
+
+A sequence is what a rollout holds of one env copy, or of one seat: T rows, and the state of the recurrent core before them,
+as the worker had it. That state comes from older weights. So the sequence before is passed through the core first, from its
+own stored state and without a gradient, until the core has a state of today's weights (stored state and burn-in, Kapturowski
+et al. 2019, R2D2).
+
+Rule: each row is in one sequence, and each sequence has the same chance. So each row is learned from equally often,
+whatever the length of its episode. Rows follow the row format (`millrace.protocol.rollout`): episodes may end inside a
+sequence, where the state becomes zeros, and a row that is not valid passes the state on.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+
+from millrace.learner.algorithms.replay.available_memory import GIB, available_bytes
+from millrace.learner.algorithms.replay.replay_buffer import PRIORITY_OFFSET, Remembered
+from millrace.learner.algorithms.replay.sum_tree import SumTree
+from millrace.learner.algorithms.returns import EpisodeEnds, n_step_returns
+from millrace.protocol.arrays import Array, Bools, Doubles, Floats, Ints
+from millrace.protocol.errors import UsageError
+from millrace.protocol.random_streams import Purpose, generator
+from millrace.protocol.rollout import Batch
+from millrace.protocol.specs import PolicySpec
+
+NONE = -1  # stands for the number of a sequence
+HIGHEST_SHARE = 0.9  # of the priority of a sequence; the rest is the mean of its errors (Kapturowski et al. 2019)
+
+
+class SequenceSample(NamedTuple):
+    """B rows in C sequences of T rows, with the T rows before each. Arrays of steps are in time order."""
+
+    slots: Ints  # [B] of the sequence that each row is in
+    leaves: tuple[Array, ...]  # [2 T + 1, C, *leaf] each: T observations before, then those of the sequence
+    state: Floats  # [C, S] of the core before the first of these that counts
+    keep_state: Bools  # [2 T + 1, C] False where an episode begins
+    advances: Bools  # [2 T + 1, C] False where the row leaves the state as it is
+    rows: Ints  # [B] where they are in [T, C], flattened
+    next_rows: Ints  # [B] where the observations k steps later are in [T + 1, C], flattened
+    action: Array  # [B, *action] int64 or float32, as rows store them
+    reward: Floats  # [B] Σ γⁱ r over k steps: n, or fewer where the episode or the sequence ends
+    discount: Floats  # [B] γᵏ; 0 where the task ended
+    weight: Floats  # [B] importance-sampling weight of the loss, at most 1
+    next_mask: Bools | None  # [B, choices] actions allowed k steps later; None without action masks
+
+
+class ReplacedSequences(NamedTuple):
+    """What some slots held before they were written."""
+
+    slots: Ints
+    arrays: dict[str, Array]
+    weights: Doubles | None
+
+
+class SequenceReplay:
+    """The newest sequences of all lanes, drawn uniformly or by priority."""
+
+    def __init__(
+        self,
+        policy: PolicySpec,
+        *,
+        rows: int,
+        steps: int,
+        n_step: int,
+        gamma: float,
+        seed: int,
+        alpha: float | None = None,
+    ) -> None:
+        """Room for this many `rows`, in sequences of T = `steps`. `alpha`: as in `ReplayBuffer`.
+
+        Raises `UsageError` if memory is too small.
+        """
+        self.size = max(1, rows // steps)  # slots; a sequence takes one
+        self._steps = steps
+        self._n_step = n_step
+        self._gamma = gamma
+        self._alpha = alpha
+        T = steps
+        shapes: dict[str, tuple[tuple[int, ...], Any]] = {
+            f"obs{i}": ((T + 1, *leaf.shape), leaf.dtype) for i, leaf in enumerate(policy.observation)
+        }
+        shapes |= {
+            "action": ((T, *policy.action.shape), policy.action.stored_dtype),
+            "reward": ((T,), "float32"),
+            "terminated": ((T,), "bool"),
+            "truncated": ((T,), "bool"),
+            "valid": ((T,), "bool"),
+            "begins": ((T,), "bool"),
+            "state": ((policy.state_size,), "float32"),
+            "before": ((), "int64"),
+        }
+        self._leaves = [f"obs{i}" for i in range(len(policy.observation))]
+        self._shapes = shapes
+        self._check_memory()
+        self.arrays = {name: np.zeros((self.size, *shape), dtype) for name, (shape, dtype) in shapes.items()}
+        """One entry for each slot, by name. `begins`: whether the episode of obs[t+1] begins there. `before`: the number of
+        the sequence before; numbers count all sequences that were ever written."""
+        self.generator = generator(seed, Purpose.REPLAY)  # decides what is drawn
+        self._tree = None if alpha is None else SumTree(self.size)
+        self._highest = 1.0  # greatest priority so far: new sequences get it
+        self._written = 0  # sequences ever written; the next one's slot is this, modulo the size
+        self._rows = 0
+        self._newest: dict[int, Ints] = {}  # lane -> [columns] number of its newest sequence
+        self._remembered: Remembered | None = None
+        self._overwritten: list[ReplacedSequences] = []  # since `remember`, oldest first
+
+    def __len__(self) -> int:
+        """The number of rows that can be drawn."""
+        return self._rows
+
+    @property
+    def bytes(self) -> int:
+        """Memory of all slots, in bytes."""
+        slot: int = sum(math.prod(shape) * np.dtype(dtype).itemsize for shape, dtype in self._shapes.values())
+        return self.size * slot + (0 if self._alpha is None else SumTree.memory_bytes(self.size))
+
+    @property
+    def prioritized(self) -> bool:
+        """Whether priorities decide what is drawn."""
+        return self._tree is not None
+
+    def _check_memory(self) -> None:
+        free = available_bytes()
+        if free is not None and 2 * self.bytes > free:
+            fits = self.size * free // (2 * self.bytes) * self._steps
+            raise UsageError(
+                f"replay_size {self.size * self._steps}: its sequences take {self.bytes / GIB:.1f} GiB, and as much again "
+                f"while a checkpoint is written, but {free / GIB:.1f} GiB of memory are free; "
+                f"take --replay-size {fits} or less"
+            )
+
+    # ---------------------------------------------------------------- writing
+
+    def add(self, batch: Batch) -> None:
+        """Store the sequences that have a valid row. Raises `UsageError` if a rollout doesn't fit."""
+        N = batch.columns_per_rollout
+        if self.size < 2 * N:
+            least = 2 * N * self._steps
+            raise UsageError(
+                f"replay_size {self.size * self._steps}: expected room for two rollouts of a lane, {least} rows; "
+                f"take --replay-size {least} or more"
+            )
+        if batch.mask is not None and "mask" not in self.arrays:
+            self._make_mask(batch.mask.shape[-1])
+        begins = _begins(batch)
+        for at in range(0, len(batch.lane), N):  # rollouts of a lane are in the order of collection
+            self._add(batch, begins, slice(at, at + N), int(batch.lane[at]))
+
+    def _add(self, batch: Batch, begins: Bools, columns: slice, lane: int) -> None:
+        arrays = {
+            name: leaf[:, columns].swapaxes(0, 1) for name, leaf in zip(self._leaves, batch.obs, strict=True)
+        }  # [N, T + 1, *leaf] each
+        for name in ("action", "reward", "terminated", "truncated", "valid"):
+            arrays[name] = getattr(batch, name)[:, columns].swapaxes(0, 1)
+        if batch.mask is not None:
+            arrays["mask"] = batch.mask[:, columns].swapaxes(0, 1)
+        arrays["begins"] = begins[:, columns].swapaxes(0, 1)
+        arrays["state"] = batch.state[columns]
+        arrays["before"] = self._before(lane, batch.fresh[columns], arrays)
+        used = np.flatnonzero(arrays["valid"].any(1))  # of the columns
+        numbers = self._written + np.arange(len(used))
+        slots = numbers % self.size
+        self._keep(slots, all_arrays=True)
+        self._rows += int(np.count_nonzero(arrays["valid"])) - int(np.count_nonzero(self.arrays["valid"][slots]))
+        for name, array in arrays.items():
+            self.arrays[name][slots] = array[used]
+        if self._tree is not None and self._alpha is not None:
+            self._tree.set(slots, self._highest**self._alpha)
+        self._written += len(used)
+        newest = np.full(len(arrays["valid"]), NONE)
+        newest[used] = numbers
+        self._newest[lane] = newest
+
+    def _before(self, lane: int, fresh: Bools, arrays: dict[str, Array]) -> Ints:
+        """[N] the number of the sequence that a column continues; NONE if there is none.
+
+        The observations are compared, in case a caller that stacks rollouts itself has left one out.
+        """
+        known = self._newest.get(lane)
+        if known is None or len(known) != len(fresh):
+            return np.full(len(fresh), NONE)
+        continues = ~fresh & (known != NONE)
+        for name in self._leaves:
+            same = self.arrays[name][known % self.size, -1] == arrays[name][:, 0]
+            continues &= same.reshape(len(fresh), -1).all(1)
+        return np.where(continues, known, NONE)
+
+    def _make_mask(self, choices: int) -> None:
+        self._shapes["mask"] = ((self._steps + 1, choices), "bool")
+        self._check_memory()
+        self.arrays["mask"] = np.ones((self.size, self._steps + 1, choices), bool)
+
+    # ---------------------------------------------------------------- reading
+
+    def samples(self, number: int, count: int, beta: float = 1.0) -> Iterator[SequenceSample]:
+        """So many draws. `count` and `beta`: see `sample`."""
+        return (self.sample(count, beta) for _ in range(number))
+
+    def sample(self, count: int, beta: float = 1.0) -> SequenceSample:
+        """Draw sequences with replacement, as many as have `count` rows if all are valid, but at least one.
+
+        `beta`: as in `ReplayBuffer`.
+        """
+        sequences = max(1, count // self._steps)
+        if self._tree is None:
+            slots = self.generator.integers(0, min(self._written, self.size), sequences)
+            weight = np.ones(sequences, np.float32)
+        else:
+            slots, weight = self._tree.draw_weighted(self.generator, sequences, min(self._written, self.size), beta)
+        return self._drawn(slots, weight)
+
+    def _drawn(self, slots: Ints, weight: Floats) -> SequenceSample:
+        T, C = self._steps, len(slots)
+        own = {name: array[slots].swapaxes(0, 1) for name, array in self.arrays.items() if array.ndim > 1}  # [T, C, …] each
+        number = self.arrays["before"][slots]
+        has_before = (number != NONE) & (number >= self._written - self.size)  # else it was overwritten
+        earlier = number % self.size
+        before = {name: self.arrays[name][earlier].swapaxes(0, 1) for name in (*self._leaves, "valid", "begins")}
+        begins_before = before["begins"] & has_before
+        first = np.zeros((1, C), bool)
+        begins = np.concatenate([first, begins_before, own["begins"]])  # [2 T + 1, C]
+        advances = np.concatenate([before["valid"] & has_before, own["valid"], first])
+        state = np.where(has_before[:, None], self.arrays["state"][earlier], self.arrays["state"][slots])
+        ends = EpisodeEnds(own["terminated"], own["truncated"], own["valid"], with_seats=True)
+        returns = n_step_returns(own["reward"], ends, self._gamma, self._n_step)
+        rows = np.flatnonzero(own["valid"])
+        next_rows = (returns.last * C + np.arange(C)).ravel()[rows]
+        column = rows % C
+        return SequenceSample(
+            slots=slots[column],
+            leaves=tuple(np.concatenate([before[name][:T], own[name]]) for name in self._leaves),
+            state=state,
+            keep_state=~begins,
+            advances=advances,
+            rows=rows,
+            next_rows=next_rows,
+            action=_flat(own["action"])[rows],
+            reward=returns.reward.ravel()[rows].astype(np.float32),
+            discount=returns.discount.ravel()[rows].astype(np.float32),
+            weight=weight[column],
+            next_mask=_flat(own["mask"])[next_rows] if "mask" in own else None,
+        )
+
+    def update_priorities(self, slots: Ints, error: Floats) -> None:
+        """Set the priorities of sequences from the errors [B] of their rows, whose slots [B] these are."""
+        if self._tree is None or self._alpha is None:
+            return
+        sequences, of_row = np.unique(slots, return_inverse=True)
+        size = np.abs(error).astype(np.float64)
+        highest = np.zeros(len(sequences))
+        np.maximum.at(highest, of_row, size)
+        mean = np.bincount(of_row, size) / np.bincount(of_row)
+        priority = HIGHEST_SHARE * highest + (1 - HIGHEST_SHARE) * mean + PRIORITY_OFFSET
+        self._highest = max(self._highest, float(priority.max()))
+        self._keep(sequences)
+        self._tree.set(sequences, priority**self._alpha)
+
+    # ---------------------------------------------------------------- taking back
+
+    def remember(self) -> None:
+        """Remember this state, for `roll_back`: from now on, what a slot held is kept before it is written."""
+        self._overwritten.clear()
+        self._remembered = Remembered(
+            self._written, self._rows, self._highest, dict(self._newest), self.generator.bit_generator.state
+        )
+
+    def roll_back(self) -> None:
+        """Return to the state that was remembered last."""
+        remembered = self._remembered
+        assert remembered is not None, "nothing was remembered"
+        self._written = remembered.written
+        self._rows = remembered.rows
+        self._highest = remembered.highest
+        self._newest = dict(remembered.newest)
+        self.generator.bit_generator.state = remembered.generator
+        for old in reversed(self._overwritten):
+            for name, array in old.arrays.items():
+                self.arrays[name][old.slots] = array
+            if self._tree is not None and old.weights is not None:
+                self._tree.set(old.slots, old.weights)
+        self._overwritten.clear()
+
+    def _keep(self, slots: Ints, *, all_arrays: bool = False) -> None:
+        """Keep what these slots hold, if `remember` was called: they are written next."""
+        if self._remembered is not None and len(slots):
+            weights = None if self._tree is None else self._tree.weights[slots]
+            arrays = {name: array[slots] for name, array in self.arrays.items()} if all_arrays else {}
+            self._overwritten.append(ReplacedSequences(slots, arrays, weights))
+
+    # ---------------------------------------------------------------- saving
+
+    def state_dict(self) -> dict[str, Any]:
+        """A copy of the slots in use, as tensors and plain data."""
+        used = min(self._written, self.size)
+        weights = {} if self._tree is None else {"weight": torch.tensor(self._tree.weights[:used])}
+        return {
+            "size": self.size,
+            "steps": self._steps,
+            "arrays": {name: torch.tensor(array[:used]) for name, array in self.arrays.items()} | weights,
+            "newest": {lane: torch.tensor(numbers) for lane, numbers in self._newest.items()},
+            "written": self._written,
+            "highest": self._highest,
+            "generator": self.generator.bit_generator.state,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from a `state_dict`, bit for bit. Raises ValueError if its sequences have another length or number."""
+        for name, expected, got in (
+            ("rollout_steps", state["steps"], self._steps),
+            ("replay_size", state["size"] * state["steps"], self.size * self._steps),
+        ):
+            if expected != got:
+                raise ValueError(f"{name}: expected {expected}, got {got}")
+        self._written = state["written"]
+        self._highest = state["highest"]
+        used = min(self._written, self.size)
+        arrays = dict(state["arrays"])
+        weights = arrays.pop("weight", None)
+        if "mask" in arrays and "mask" not in self.arrays:
+            self._make_mask(arrays["mask"].shape[-1])
+        for name, array in self.arrays.items():
+            array[:used] = arrays[name].numpy()
+        self.arrays["valid"][used:] = False
+        if self._tree is not None and weights is not None:
+            self._tree.set(np.arange(self.size), 0.0)
+            self._tree.set(np.arange(used), weights.numpy())
+        self._rows = int(np.count_nonzero(self.arrays["valid"]))
+        self._newest = {int(lane): numbers.numpy().copy() for lane, numbers in state["newest"].items()}
+        self.generator.bit_generator.state = state["generator"]
+
+
+def _begins(batch: Batch) -> Bools:
+    """[T, ΣN] whether row t only resets its copy, so that obs[t+1] begins an episode."""
+    if batch.resets is None:
+        return ~batch.valid
+    return np.repeat(batch.resets[:-1], batch.valid.shape[1] // batch.resets.shape[1], axis=1)
+
+
+def _flat(array: Array) -> Array:
+    """[T, C, …] as [T · C, …]."""
+    return array.reshape(-1, *array.shape[2:])
