@@ -55,6 +55,8 @@ RUNS: dict[str, tuple[str, ...]] = {
     "xqc": (f"train Pendulum-v1 --algo xqc --critic-net 32 32 --updates-per-step 0.5 {REPLAY}",),
     "hindsight": (f"train reach:Reach-v0 --algo sac {HINDSIGHT} --updates-per-step 0.5 --n-step 2 {REPLAY}",),
     "lstm": (f"train toy:Recall-v0 --algo ppo --core lstm --core-size 16 {ON_POLICY}",),
+    "dqn lstm": (f"train toy:Recall-v0 --algo dqn --core lstm --core-size 16 --gradient-steps 8 {REPLAY}",),
+    "sac gru": (f"train Pendulum-v1 --algo sac --core gru --core-size 16 --updates-per-step 0.1 {REPLAY}",),
     "images": (f"train toy:Spaces-v0 {IMAGES} --algo ppo {ON_POLICY}",),
     "masks": (f"train Taxi-v4 --algo ppo --action-masks info {ON_POLICY}",),
     "mixed": (f"train toy:Spaces-v0 --env-kwargs action mixed --algo ppo --record {RECORDED} {ON_POLICY}",),

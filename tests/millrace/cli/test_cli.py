@@ -85,8 +85,8 @@ def asked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[Any]:
         (["train", "--worker", "3", "CartPole-v1"], "train: unknown flag --worker; did you mean --workers?"),
         (["train", "CartPole-v1", "--zzz"], "train: unknown flag --zzz"),
         (
-            ["train", "CartPole-v1", "--algo", "dqn", "--core", "lstm"],
-            "train: unknown flag --core; it is one of ppo, a2c, impala alone",
+            ["train", "CartPole-v1", "--algo", "reinforce", "--core", "lstm"],
+            "train: unknown flag --core; it is one of ppo, a2c, dqn, rainbow, impala, sac, td3, tqc, crossq, xqc alone",
         ),
         (["train", "--env", "CartPole-v1"], "train: ENV has no flag; expected it as in: millrace train ENV"),
         (["train", "CartPole-v1", "more"], "train: unexpected argument more"),

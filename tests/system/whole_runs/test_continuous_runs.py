@@ -66,6 +66,15 @@ def test_bits_and_replay_ratio_do_not_depend_on_the_number_of_workers(tmp_path: 
     assert policy_of(learner) == policy_of(folders[0])
 
 
+@pytest.mark.parametrize("max_lag", [0, 1])
+def test_with_memory_bits_do_not_depend_on_the_number_of_workers(tmp_path: Path, max_lag: int) -> None:
+    memory: dict[str, Any] = {"algo": "sac", "core": "lstm", "core_size": 8, "max_lag": max_lag}
+    policies = [policy_of(run(tmp_path, f"{workers}", workers=workers, **memory)) for workers in (1, 2, 4)]
+    if not max_lag:
+        policies.append(policy_of(run(tmp_path, "learner", workers=2, inference="learner", **memory)))
+    assert policies == [policies[0]] * len(policies)
+
+
 @ALGORITHMS
 def test_the_replay_ratio_holds_with_lag_and_after_a_resume(tmp_path: Path, algo: str) -> None:
     folder = run(tmp_path, "first", algo=algo, workers=2, steps=300, max_lag=2)

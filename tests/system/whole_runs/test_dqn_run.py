@@ -45,6 +45,7 @@ def ratios(folder: Path) -> list[float]:
         pytest.param({}, marks=pytest.mark.soak),
         {"priority_alpha": 0.6, "n_step": 3, "dueling": True, "normalize_observations": True},
         {"algo": "rainbow", "net": (16,), "quantiles": 8},
+        {"core": "gru", "core_size": 8, "priority_alpha": 0.6, "n_step": 3},
     ],
 )
 def test_curve_and_replay_ratio_do_not_depend_on_the_number_of_workers(tmp_path: Path, settings: dict[str, Any]) -> None:
