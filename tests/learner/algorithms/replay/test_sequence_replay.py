@@ -161,6 +161,17 @@ def test_where_an_episode_begins_the_state_is_not_kept() -> None:
             assert sample.keep_state[T + t + 1, c] != begins
 
 
+def test_a_fresh_lane_continues_nothing_even_where_observations_are_the_same() -> None:
+    given = Given(Lanes(0, T=4), replay(4))
+    batch = given.use(0)
+    again = msgspec.structs.replace(batch, obs=(batch.obs[0][::-1].copy(),))
+    for fresh, continues in ((False, True), (True, False)):
+        into = replay(4)
+        into.add(batch)
+        into.add(msgspec.structs.replace(again, fresh=np.array([fresh, fresh])))
+        assert ((into.arrays["before"][into._written - 2 : into._written] >= 0) == continues).all()
+
+
 def test_every_sequence_has_the_same_chance() -> None:
     given = filled()
     draws = 48_000
@@ -234,7 +245,7 @@ def test_a_restored_replay_goes_on_to_the_bit(sequences: int, alpha: float | Non
 def test_it_returns_to_what_was_remembered(sequences: int, alpha: float | None) -> None:
     given = filled(sequences=sequences, alpha=alpha)
     given.into.remember()
-    before = given.into.state_dict()
+    before, rows = given.into.state_dict(), len(given.into)
     for lane in (0, 1, 0, 1):
         drawn = given.into.sample(16)
         given.into.update_priorities(drawn.slots, np.linspace(0, 3, len(drawn.slots), dtype=np.float32))
@@ -242,6 +253,7 @@ def test_it_returns_to_what_was_remembered(sequences: int, alpha: float | None) 
     assert not equal(before, given.into.state_dict())
     given.into.roll_back()
     assert equal(before, given.into.state_dict())
+    assert len(given.into) == rows
 
 
 def test_a_state_of_another_length_or_size_is_refused() -> None:
