@@ -1,9 +1,10 @@
 """The replay buffer: keeps rows, and draws n-step transitions, uniformly or by priority. No sockets, no files; seeded.
 
 It is a ring of preallocated numpy arrays. A slot holds a raw observation. If a valid row began with it, the slot also holds
-that row: action, reward, whether it terminated, and the slot of the next observation. So each observation is stored once,
-and n-step returns follow the rows from slot to slot when they are drawn. A slot without a row holds the final observation of
-a truncated episode, or the newest observation of an env copy, whose row comes with its next rollout.
+that row: action, reward, whether it terminated, and the slot of the next observation. So each observation is stored once
+(of a frame stack each frame, `shared_channels.py`), and n-step returns follow the rows from slot to slot when they are
+drawn. A slot without a row holds the final observation of a truncated episode, or the newest observation of an env copy,
+whose row comes with its next rollout.
 
 Rule: rows that are not valid are never stored. A row's next observation is newer than the row, and the ring overwrites
 the oldest slot first. So a row that is still stored always finds the rows that follow it: those of the same seat, however
@@ -15,6 +16,7 @@ terminated episode has a slot too, because it holds the goal that was achieved l
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -24,6 +26,7 @@ import torch
 from millrace.learner.algorithms.replay.available_memory import GIB, available_bytes
 from millrace.learner.algorithms.replay.episode_paths import NO_SLOT, EpisodePaths
 from millrace.learner.algorithms.replay.hindsight import Goals, Hindsight
+from millrace.learner.algorithms.replay.shared_channels import SharedChannels
 from millrace.learner.algorithms.replay.sum_tree import SumTree
 from millrace.learner.algorithms.returns import EpisodeEnds
 from millrace.protocol.arrays import Array, Bools, Doubles, Floats, Ints
@@ -166,14 +169,13 @@ class ReplayBuffer:
         self._content = Content(observation, size, alpha is not None, action, linked=hindsight is not None)
         self.size = size  # slots
         self._check_memory(self._content)
-        self.bytes = self._content.bytes
-        self._transition_bytes = 2 * self.bytes // size  # of a draw: two observations
+        self._transition_bytes = 2 * self._content.bytes // size  # of a draw: two observations
         self._n_step = n_step
         self._gamma = gamma
         self._alpha = alpha
         self._seed = seed
         self.generator = generator(seed, self._purpose)  # decides what is drawn
-        self._obs = tuple(np.zeros((size, *leaf.shape), leaf.dtype) for leaf in observation)
+        self._obs = tuple(self._room(leaf) for leaf in observation)
         self._mask: Bools | None = None  # [size, choices], as `_obs`; made when the first masks come
         self._row = np.zeros(size, row_dtype(action))
         self._action: Array = self._row["action"]  # this and the next four: views of `_row`
@@ -195,6 +197,15 @@ class ReplayBuffer:
         """The number of transitions that can be drawn."""
         return self._rows
 
+    @property
+    def bytes(self) -> int:
+        """Memory of the replay buffer, in bytes."""
+        saved = 0
+        for leaf, stored in zip(self._content.observation, self._obs, strict=True):
+            if isinstance(stored, SharedChannels):
+                saved += self.size * math.prod(leaf.shape) - stored.nbytes
+        return self._content.bytes - saved
+
     # ---------------------------------------------------------------- writing
 
     def add(self, batch: Batch) -> None:
@@ -207,6 +218,8 @@ class ReplayBuffer:
             self._hindsight.check(batch)
         if batch.mask is not None:
             self._make_mask(batch.mask.shape[-1])
+        if not self._written:
+            self._share_channels([leaf[:, 0] for leaf in batch.obs])
         for at in range(0, len(batch.lane), batch.columns_per_rollout):  # rollouts of a lane are in the order of collection
             self._add(batch, slice(at, at + batch.columns_per_rollout), int(batch.lane[at]))
 
@@ -263,10 +276,21 @@ class ReplayBuffer:
         if self._mask is None:
             content = self._content._replace(choices=choices)
             self._check_memory(content)
-            self.bytes = content.bytes
+            self._content = content
             self._mask = np.ones((self.size, choices), bool)
 
-    def _per_observation(self) -> tuple[Array, ...]:
+    def _share_channels(self, first: Sequence[Array]) -> None:
+        """Store the channels of images once each where the first ones, of a copy's rollout, show that it saves memory."""
+        self._obs = tuple(
+            self._room(leaf, shared=leaf.is_image and SharedChannels.worthwhile(leaf, images))
+            for leaf, images in zip(self._content.observation, first, strict=True)
+        )
+
+    def _room(self, leaf: Leaf, *, shared: bool = False) -> Array | SharedChannels:
+        """For an array of each observation."""
+        return SharedChannels(self.size, leaf) if shared else np.zeros((self.size, *leaf.shape), leaf.dtype)
+
+    def _per_observation(self) -> tuple[Array | SharedChannels, ...]:
         """The arrays with one entry for each stored observation: its leaves, and its mask if there are masks."""
         return self._obs if self._mask is None else (*self._obs, self._mask)
 
@@ -416,7 +440,7 @@ class ReplayBuffer:
             by_age = np.arange(self._written - used, self._written) % self.size
             self._paths = EpisodePaths.rebuilt(self.size, by_age, self._is_row, self._follows)
 
-    def _keep(self, slots: Ints, leaves: tuple[Array, ...]) -> None:
+    def _keep(self, slots: Ints, leaves: Sequence[Array | SharedChannels]) -> None:
         """Keep what these slots hold, if `remember` was called: they are written next."""
         if self._remembered is not None and len(slots):
             weights = None if self._tree is None else self._tree.weights[slots]
@@ -429,7 +453,11 @@ class ReplayBuffer:
         own = {name: getattr(self, f"_{name}") for name in ("action", "reward", "terminated", "follows", "is_row")}
         tree = {} if self._tree is None else {"weight": self._tree.weights}
         masks = {} if self._mask is None else {"mask": self._mask}
-        return {f"obs{i}": leaf for i, leaf in enumerate(self._obs)} | masks | own | tree
+        leaves = {f"obs{i}": leaf for i, leaf in enumerate(self._obs) if not isinstance(leaf, SharedChannels)}
+        return leaves | masks | own | tree
+
+    def _shared(self) -> dict[str, SharedChannels]:
+        return {f"obs{i}": leaf for i, leaf in enumerate(self._obs) if isinstance(leaf, SharedChannels)}
 
     def state_dict(self) -> dict[str, Any]:
         """A copy of the slots in use, as tensors and plain data."""
@@ -437,6 +465,7 @@ class ReplayBuffer:
         return {
             "size": self.size,
             "arrays": {name: torch.tensor(array[:used]) for name, array in self._arrays().items()},
+            "shared": {name: list(map(torch.tensor, images.saved(used))) for name, images in self._shared().items()},
             "newest": {lane: torch.tensor(written) for lane, written in self._newest.items()},
             "written": self._written,
             "highest": self._highest,
@@ -453,6 +482,11 @@ class ReplayBuffer:
         self._is_row[used:] = False
         if "mask" in state["arrays"]:
             self._make_mask(state["arrays"]["mask"].shape[1])
+        self._obs = tuple(
+            self._room(leaf, shared=f"obs{i}" in state["shared"]) for i, leaf in enumerate(self._content.observation)
+        )
+        for name, images in self._shared().items():
+            images.load(*(tensor.numpy() for tensor in state["shared"][name]))
         for name, array in self._arrays().items():
             if name != "weight":
                 array[:used] = state["arrays"][name].numpy()
