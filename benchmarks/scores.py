@@ -11,6 +11,7 @@ from pathlib import Path
 
 import msgspec
 
+from benchmarks.intervals import FEWEST, interval_of
 from benchmarks.markdown_tables import table
 
 SCORES, PUBLISHED = (Path(__file__).with_name(name) for name in ("scores.json", "published_scores.toml"))
@@ -94,11 +95,15 @@ def steps_text(env_steps: int) -> str:
 
 
 def seeds_text(returns: dict[int, float]) -> str:
-    """The returns of seeds 1, 2 and 3; other seeds are named."""
+    """The interquartile mean with its interval, from five seeds on; of fewer each return. Other seeds than 1 … N are named."""
     if not returns:
         return "–"
+    first_seeds = sorted(returns) == list(range(1, len(returns) + 1))
+    if first_seeds and len(returns) >= FEWEST:
+        mean, low, high = map(return_text, interval_of(list(returns.values())))
+        return f"**{mean}** [{low}, {high}], {len(returns)} seeds"
     text = ", ".join(return_text(value) for _, value in sorted(returns.items()))
-    if sorted(returns) == [1, 2, 3]:
+    if first_seeds and len(returns) == 3:
         return text
     which = ", ".join(map(str, sorted(returns)))
     return f"{text} (seed {which} only)" if len(returns) == 1 else f"{text} (seeds {which})"

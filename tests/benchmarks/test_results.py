@@ -123,6 +123,8 @@ def test_a_new_run_is_added_to_the_other_seeds_of_its_row() -> None:
         ({1: 8.314, 2: -0.5, 3: 9.999}, "8.31, -0.50, 10.00"),
         ({2: 6967.0}, "6,967 (seed 2 only)"),
         ({1: 1.0, 3: 2.0}, "1.00, 2.00 (seeds 1, 3)"),
+        ({seed: 100.0 + seed for seed in range(1, 5)}, "101, 102, 103, 104 (seeds 1, 2, 3, 4)"),
+        (dict.fromkeys(range(1, 7), 500.0), "**500** [500, 500], 6 seeds"),
         ({}, "–"),
     ],
 )
