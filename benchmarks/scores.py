@@ -95,7 +95,7 @@ def steps_text(env_steps: int) -> str:
 
 
 def seeds_text(returns: dict[int, float]) -> str:
-    """The interquartile mean with its interval, from five seeds on; of fewer each return. Other seeds than 1 … N are named."""
+    """The interquartile mean with its interval of five seeds or more; else each return. Seeds other than 1 … N are named."""
     if not returns:
         return "–"
     first_seeds = sorted(returns) == list(range(1, len(returns) + 1))
