@@ -28,6 +28,7 @@ from rich.table import Table
 
 import millrace
 from benchmarks import programs
+from benchmarks.peers import install
 from benchmarks.programs import CONTENDERS, Contender, contenders
 from benchmarks.slow_env import STEPS_PER_S, TIMELINE, Lognormal
 from benchmarks.writing import write
@@ -65,8 +66,15 @@ OURS |= {
     f"{name}, ResetAhead": each._replace(flags=(*each.flags, "--wrappers", "millrace:ResetAhead"))
     for name, each in list(OURS.items())[:2]
 }
-PEERS = ("TorchRL, 2 workers", "RLlib, 2 runners", "Sample Factory, 2 workers")
-"""Systems that can run 16 processes; their programs take the number from the settings."""
+PEERS = {
+    "TorchRL, MultiSyncCollector": Contender("benchmarks.peers.torchrl_ppo", "sync", "torchrl"),
+    "TorchRL, MultiAsyncCollector": Contender("benchmarks.peers.torchrl_ppo", "async", "torchrl"),
+    "RLlib, 16 env runners": Contender("benchmarks.peers.rllib_ppo", "", "rllib"),
+    "Sample Factory, async": Contender("benchmarks.peers.sample_factory_ppo", "async", "sample_factory"),
+    "Tianshou, SubprocVectorEnv": Contender("benchmarks.peers.tianshou_ppo", "subproc", "tianshou"),
+    "PufferLib, Multiprocessing": Contender("benchmarks.peers.pufferlib_ppo", "processes", "pufferlib"),
+}
+"""Systems that can run 16 processes, each in the way that its own documentation recommends for slow environments"""
 
 
 def rate(name: str, contender: Contender, seed: int) -> float:
@@ -181,8 +189,9 @@ def main() -> None:
     parser.add_argument("--picture", type=Path, help="draw who waits for whom into this SVG, and measure nothing else")
     parser.add_argument("--only-loops", action="store_true", help="measure the two loops and the ideal only")
     arguments = parser.parse_args()
-    here = contenders(arguments.peers)
-    others = {name: CONTENDERS[name] for name in (SUBPROC, *(PEERS if arguments.peers else ())) if name in here}
+    here = contenders()
+    others = {SUBPROC: CONTENDERS[SUBPROC]} if SUBPROC in here else {}
+    others |= {name: each for name, each in PEERS.items() if arguments.peers and each.peer in install.installed()}
     if arguments.picture is not None:
         titles = {
             "Stable-Baselines3": SUBPROC,

@@ -17,10 +17,10 @@ __all__ = ["ALGORITHMS", "Algorithm", "algorithm_class"]
 
 
 def algorithm_class(name: str) -> type[Algorithm]:
-    """The class of this algorithm, imported now: one in `ALGORITHMS`, or one of the user's own.
+    """The class of this algorithm, imported now: one in `ALGORITHMS`, or your own.
 
-    The user's class has the methods of `Algorithm` and need not derive from it. Raises KeyError for any other name, and
-    `UsageError` if the user's cannot be found or lacks something.
+    Your own class has the methods of `Algorithm` and need not derive from it. Raises KeyError for any other name, and
+    `UsageError` if your class cannot be found or lacks a method.
     """
     if is_own(name):
         own: type[Algorithm] = own_class(name)

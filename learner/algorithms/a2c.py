@@ -1,6 +1,6 @@
 """A2C (Mnih et al. 2016, synchronous). Its settings: `learner/config/hyperparameters.py`. No sockets, no files, no clock.
 
-An update is one gradient step on all valid rows of a batch. The batch must have been collected under the newest weights.
+An update is one gradient step on all valid rows of a batch. The batch must have been collected with the newest weights.
 """
 
 from __future__ import annotations

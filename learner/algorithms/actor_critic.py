@@ -1,8 +1,8 @@
-"""The base of PPO, A2C, IMPALA and REINFORCE, and of a user's own actor-critic: everything about an update except the loss.
+"""The base of PPO, A2C, IMPALA, REINFORCE and your own actor-critics: everything about an update except the loss.
 
-An update raises before a gradient step whose loss, logged numbers or gradient are not finite. The training loop checks the
-weights after the update, and takes the whole update back. With one torch thread on a CPU the same batches give the same
-bits, also after `load_state_dict`. No sockets, no files, no clock.
+An update raises before it takes a gradient step whose loss, logged numbers or gradient are not finite. The training loop
+checks the weights after the update, and undoes the whole update if they are not finite. With one torch thread on a CPU the
+same batches give the same bits, also after `load_state_dict`. No sockets, no files, no clock.
 """
 
 from __future__ import annotations
@@ -50,8 +50,8 @@ class ActorCritic(GradientDescent):
     """An actor and a critic, and the update that trains them: epochs of gradient steps on minibatches of a batch.
 
     A subclass defines `loss`, with ordinary torch operations, unless its loss is the policy gradient with a squared value
-    loss. Advantages are generalized advantage estimates; for another rule it defines `estimate`. What else changes in an
-    update, it adds to `other_state` and `load_other_state`.
+    loss. Advantages are generalized advantage estimates (GAE); for others it defines `estimate`. Other state that an update
+    changes belongs into `other_state` and `load_other_state`.
 
     `Config` is the record of the settings, and `self.config` holds their values: those of `ActorCriticConfig`, unless the
     subclass overrides the methods that use them (`n_epochs`, `minibatch_count`, `standardizes_advantages`, `estimate`).
@@ -59,11 +59,11 @@ class ActorCritic(GradientDescent):
 
     Config: ClassVar[type[AlgorithmConfig]] = ActorCriticConfig  # see `Algorithm`
     net: ActorCriticNetwork
-    estimates_each_epoch: ClassVar[bool] = False  # True: `estimate` is called before each epoch, under the newest weights
+    estimates_each_epoch: ClassVar[bool] = False  # True: `estimate` is called before each epoch, with the newest weights
 
     @staticmethod
     def policy_spec(config: PolicyGradientConfig, observation: tuple[Leaf, ...], action: ActionSpec) -> PolicySpec:
-        """An actor and a critic. All spaces that we know are supported."""
+        """An actor and a critic, for every space that millrace supports."""
         spec = replace(Algorithm.policy_spec(config, observation, action), shared_net=config.shared_net)
         if isinstance(config, RecurrentConfig):
             spec = replace(spec, core=config.core, core_size=config.core_size)
@@ -91,7 +91,7 @@ class ActorCritic(GradientDescent):
         return Estimates(advantage, advantage + values[:-1], values, batch.valid, {})
 
     def loss(self, rows: LossInput) -> tuple[Tensor, Mapping[str, Tensor | float]]:
-        """The loss of a minibatch, a tensor of no dimension, and numbers to log by name. Every row is a valid one.
+        """The loss of a minibatch, a 0-dimensional tensor, and numbers to log by name. All rows are valid.
 
         L = −E[A log π(a)] + vf_coef E[(V − target)²] − ent_coef E[H(π)]
         """
@@ -122,10 +122,11 @@ class ActorCritic(GradientDescent):
         return math.ceil(rows / batch_size)
 
     def standardizes_advantages(self) -> bool:
-        """Whether the advantages of each minibatch get mean 0 and standard deviation 1. After cloning they do not.
+        """Whether the advantages of each minibatch are scaled to mean 0 and standard deviation 1. After cloning they are
+        not.
 
-        A policy that acts well from the start has advantages that are little more than small errors of the critic. With a
-        standard deviation of 1, these would change the policy as much as advantages that tell good actions from bad ones.
+        If a policy acts well from the start, its advantages are little more than the critic's small errors. Scaled to a
+        standard deviation of 1, they would change the policy as much as advantages that tell good actions from bad ones.
         """
         normalize: bool = self.config.normalize_advantage
         return normalize and not self.pretraining_steps
@@ -139,8 +140,8 @@ class ActorCritic(GradientDescent):
     def update(self, batch: Batch, pulse: Pulse) -> UpdateMetrics:
         """Learn from a batch, calling `pulse` between minibatches. Returns metrics with the names of Stable-Baselines3.
 
-        Raises `RunError` when a loss, a logged number or the norm of a gradient is not finite, before the step; and when
-        actions of the new weights would not be finite.
+        Raises `RunError`, before the step, if a loss, a logged number or the norm of a gradient is not finite; also if the
+        new weights would give actions that are not finite.
         """
         if not batch.valid.any():  # all seats wait
             self.env_steps += batch.env_steps
@@ -170,7 +171,7 @@ class ActorCritic(GradientDescent):
         return self.metrics(epochs, estimates)
 
     def step(self, minibatch: Minibatch) -> tuple[UpdateMetrics, bool]:
-        """One gradient step on a minibatch. Returns what was measured before it, and whether that ends the update instead.
+        """One gradient step on a minibatch. Returns the metrics, and True if they end the update (then no step was taken).
 
         Sets the gradient to zero, differentiates the loss, raises `RunError` unless the loss, the logged numbers and the
         gradient's norm are finite, scales the gradient by min(1, max_grad_norm / norm), and steps torch's optimizer.
@@ -185,7 +186,7 @@ class ActorCritic(GradientDescent):
         return metrics, ends
 
     def evaluate(self, minibatch: Minibatch) -> LossInput:
-        """The rows of a minibatch with the network's outputs: a pass of the network, and the distribution on top.
+        """The rows of a minibatch with the network's outputs: a forward pass, and the action distribution on top.
 
         The logits of actions that are not allowed become -1e30. A Box has a normal distribution that is not clipped. A small
         network on the CPU computes the same in numpy (`kernels/trained_networks.py`).

@@ -1,7 +1,7 @@
 """The base of every algorithm: what the training loop of `millrace.learner.train` calls, and checks of what it returns.
 
-A user's own algorithm may return anything. What cannot be used is said in one line that names the class. No torch is needed
-for this file.
+Your own algorithm may return anything. If its result cannot be used, one line says why and names the class. This file
+doesn't need torch.
 """
 
 from __future__ import annotations
