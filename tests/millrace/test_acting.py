@@ -72,7 +72,6 @@ POLICIES: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
     "gru": ("Pendulum-v1", {}, {"core": "gru", "core_size": 8, "normalize_observations": True}),
     "action values": ("CartPole-v1", {}, {"head": "q"}),
     "action values, gru": ("CartPole-v1", {}, {"head": "q", "core": "gru", "core_size": 8}),
-    "squashed, lstm": ("Pendulum-v1", {}, {"head": "squashed", "core": "lstm", "core_size": 8}),
     "images, action values, lstm": (f"{TOY}Frames-v0", {}, {"head": "q", "core": "lstm", "core_size": 8}),
     "dict": (f"{TOY}Spaces-v0", {"observation": "dict", "action": "multidiscrete"}, {}),
     "tuple": (f"{TOY}Spaces-v0", {"observation": "tuple", "action": "multibinary"}, {}),
