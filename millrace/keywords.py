@@ -303,7 +303,7 @@ class TrainKeywords(RolloutKeywords, total=False):
     batch_size: int
     """ppo: Largest number of rows (steps of one env copy) in a minibatch. With core, whole sequences may be more.
     dqn, rainbow, sac, td3, tqc, crossq, xqc: Number of transitions in a gradient step. With core, as many sequences as
-    have so many, but at least one.
+    have this number, but at least 16.
     """
     n_epochs: int
     """ppo: Number of epochs: how often an update uses each row.

@@ -30,6 +30,8 @@ from millrace.protocol.rollout import Batch
 from millrace.protocol.specs import PolicySpec
 
 NONE = -1  # stands for the number of a sequence
+FEWEST = 16
+"""Sequences of a draw, at least: rows of one sequence resemble each other, so few sequences make a noisy gradient"""
 HIGHEST_SHARE = 0.9  # of the priority of a sequence; the rest is the mean of its errors (Kapturowski et al. 2019)
 
 
@@ -203,11 +205,11 @@ class SequenceReplay:
         return (self.sample(count, beta) for _ in range(number))
 
     def sample(self, count: int, beta: float = 1.0) -> SequenceSample:
-        """Draw sequences with replacement, as many as have `count` rows if all are valid, but at least one.
+        """Draw sequences with replacement: as many as have `count` rows if all are valid, but at least `FEWEST`.
 
         `beta`: as in `ReplayBuffer`.
         """
-        sequences = max(1, count // self._steps)
+        sequences = max(FEWEST, count // self._steps)
         if self._tree is None:
             slots = self.generator.integers(0, min(self._written, self.size), sequences)
             weight = np.ones(sequences, np.float32)
