@@ -29,6 +29,7 @@ from millrace.learner.extras import started_by
 from millrace.learner.members.lobby import Lobby
 from millrace.learner.members.worker_processes import WorkerProcesses
 from millrace.learner.open_hub import open_hub
+from millrace.learner.resume_checks import naming_run
 from millrace.learner.rollouts.hub import Hub, HubObserver
 from millrace.learner.rollouts.opponent_pool import OpponentPool, PoolSettings, PoolState
 from millrace.learner.run import OpenRun
@@ -61,7 +62,8 @@ def open_run(setup: RunSetup, lobby: Lobby, watch: Watch, observer: HubObserver)
         callbacks.add(started_by("tensorboard")(setup.folder))  # last, so that it gets what the others log
     if line := unused_setting(setup.config):
         log.warning("%s", line)
-    spec = run_spec(setup.config, setup.known.env, setup.known.spaces)
+    with naming_run(setup.folder.shown if setup.resumed else None):
+        spec = run_spec(setup.config, setup.known.env, setup.known.spaces)
     for line in flattened_images(spec.policy):
         log.warning("%s", line)
     if torch_device(setup.config) == "cpu" and (line := large_observations(setup.config, spec.policy)):

@@ -6,7 +6,8 @@ gets a `Resumption`, which only `unless_finished` makes, so no launcher can skip
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
@@ -132,3 +133,14 @@ def _differences(before: Config, config: Config, changed: Sequence[Change]) -> l
                     f"--gradient-steps {max(1, round(has.gradient_steps * now / was))} keeps the replay ratio"
                 )
     return lines
+
+
+@contextmanager
+def naming_run(run: Path | None) -> Iterator[None]:
+    """Let errors name the run that is resumed, because its settings may be wrong in its folder; None: a new run."""
+    try:
+        yield
+    except UsageError as error:
+        if run is None:
+            raise
+        raise UsageError(f"{run}: {error}") from error

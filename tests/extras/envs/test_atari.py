@@ -82,7 +82,7 @@ def test_settings_mean_the_same_in_the_vectorized_form_as_in_the_loop(game: str,
     one, other = OPEN["native"](env, N), OPEN["loop"](env, N)
     np.testing.assert_array_equal(one.reset([3, 4], no_pulse)[0], other.reset([3, 4], no_pulse)[0])
     generator, ended, ends, rewards = np.random.default_rng(0), np.zeros(N, bool), 0, set()
-    for _ in range(450):
+    for _ in range(900):
         actions = np.where(ended, atari.NOOP, generator.integers(4, size=N))
         row, looped = one.step(actions, no_pulse), other.step(actions, no_pulse)
         np.testing.assert_array_equal(row.leaves[0], looped.leaves[0])

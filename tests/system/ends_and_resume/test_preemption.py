@@ -369,7 +369,7 @@ def test_a_process_ends_within_its_grace_time_though_a_worker_does_not_leave(sta
 
 @pytest.mark.soak
 @pytest.mark.parametrize("variant", ["ppo, lstm", "dqn, prioritized", "impala"])
-def test_a_process_that_gets_sigterm_loses_nothing_and_goes_on_as_if_its_lanes_were_started_anew(
+def test_a_process_that_gets_sigterm_loses_nothing_and_goes_on_as_if_it_had_not_been_stopped(
     stage: Stage, tmp_path: Path, variant: str
 ) -> None:
     """Real processes, two workers, SIGTERM at any time; the run that goes on has one worker in this process."""
@@ -398,4 +398,4 @@ def test_a_process_that_gets_sigterm_loses_nothing_and_goes_on_as_if_its_lanes_w
     resumed = stage.start([*command, "--resume", str(folder)], "resumed")
     assert resumed.ends(START_S * crowding()) == 0, resumed.said()
     kept = {name: settings[name] for name in VARIANTS[variant] | {"steps": 0}}
-    assert_equal(restarted(tmp_path / "reference", saved, **kept), folder)
+    assert_equal(run(tmp_path / "reference", **kept), folder)

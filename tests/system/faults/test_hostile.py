@@ -107,6 +107,7 @@ def test_two_runs_in_which_the_same_ticket_kills_its_worker_give_the_same_weight
             "seed": seed,
             "min-workers": 2,
             "env-kwargs": f"after {after} only_seed {only_seed}",
+            "lost-lanes": "restart",  # a copy that is brought back has the same seed, so it would die again
         }
         with closing(Stage(tmp_path / name)) as stage:
             address = f"tcp://127.0.0.1:{free_port()}"
