@@ -49,7 +49,7 @@ unit: .venv/installed-dev
 unit-rest: .venv/installed-dev
 	$(PYTEST) --layer rest
 
-test-learning: .venv/installed-dev  ## published scores, three seeds each; ten minutes
+test-learning: .venv/installed-dev  ## published scores and other facts of learning, three seeds each; half an hour
 	$(BIN)/python -m pytest -m learning --timeout 3600 tests/learning
 
 packages:  ## install Debian's packages for test-clients and test-cluster. Needs root

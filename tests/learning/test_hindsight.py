@@ -42,5 +42,5 @@ def test_sac_reaches_goals_with_hindsight_alone(tmp_path: Path, seed: int) -> No
     with_hindsight, without = (trained(tmp_path, seed, share).facts["success"].mean for share in (0.8, 0.0))
     assert with_hindsight is not None
     assert without is not None
-    assert with_hindsight >= 0.75  # 0.98, 0.90 and 0.98 were measured
+    assert with_hindsight >= 0.75  # 0.96, 0.90 and 0.98 were measured
     assert without <= 0.1
