@@ -15,15 +15,15 @@ class RolloutKeywords(TypedDict, total=False):
 
     env_kwargs: Mapping[str, bool | int | float | str]
     """Keyword arguments for gymnasium.make: NAME VALUE NAME VALUE ... Values are numbers, true, false or text. Texts may
-    use number, slot, lane and copy of each env copy, as in port "{5000 + slot}".
+    use each env copy's number, slot, lane and copy, as in port "{5000 + slot}".
     """
     eval_env_kwargs: Mapping[str, bool | int | float | str]
-    """Keyword arguments of evaluation copies, in addition to env_kwargs or in place of those of the same name."""
+    """Keyword arguments for env copies of evaluations, in addition to env_kwargs; they override those of the same name."""
     seat_id: bool
-    """Of an environment of several agents: tell each agent in its observations which one it is."""
+    """In an environment of several agents, tell each agent in its observations which one it is."""
     critic_keys: Sequence[str]
-    """Keys of a Dict observation that only the critic sees: a policy acts without them (ppo, a2c, impala, reinforce). For
-    PettingZoo, state is the environment's state().
+    """Keys of a Dict observation that only the critic sees: the policy acts without them (ppo, a2c, impala, reinforce).
+    For PettingZoo, the key state is the environment's state().
     """
     seed: int
     """Seed of all random numbers of the run."""
@@ -36,9 +36,9 @@ class RolloutKeywords(TypedDict, total=False):
     distributed over the workers. Results depend on lanes and envs, not on the number of workers.
     """
     max_lag: int
-    """Lag of the rollouts: their weights are exactly this many versions older than the learner's, after the first
-    updates. 0: workers and learner take turns. Above 0: both run at the same time; impala, dqn, sac and td3 are made
-    for that. Results repeat with any lag.
+    """Lag of the rollouts: after the first updates, they are collected with weights that are exactly this many versions
+    older than the learner's. 0: workers and learner take turns. Above 0: both run at the same time; impala, dqn, sac
+    and td3 are made for that. Runs are reproducible with any lag.
     """
     vector: str
     """How the env copies of a lane are stepped. loop: one after another. native: by the environment's own vector version.
@@ -46,27 +46,27 @@ class RolloutKeywords(TypedDict, total=False):
     kinds.
     """
     acting_dtype: Literal["float32", "bfloat16"]
-    """Precision in which workers act; the learner always computes in float32. bfloat16 halves the bytes of the weights
-    that are sent. With images it halves the work of acting on CPUs with AMX, and is slower elsewhere.
+    """Precision in which workers act; the learner always computes in float32. bfloat16 halves the size of the weights
+    that are sent. With images it halves the time of acting on CPUs with AMX; on others it is slower.
     """
     info_keys: Sequence[str]
     """Names of numbers that the environment reports in info at the end of an episode, such as is_success distance. Their
     means are logged.
     """
     action_masks: Literal["auto", "info", "none"]
-    """Which actions are allowed, as the environment says it for a Discrete or MultiDiscrete action. auto: by the key
-    action_mask of a Dict observation, if it has one with a bit for each choice. info: by info["action_mask"] of each
-    reset and step; the key of a Dict observation comes first. none: all actions are allowed, and the key is an
-    observation.
+    """Where the environment says which Discrete or MultiDiscrete actions are allowed. auto: in the key action_mask of a
+    Dict observation, if it has one with a bit for each choice. info: in info["action_mask"] of each reset and step,
+    unless the Dict observation has the key. none: all actions are allowed, and the key is an observation.
     """
     max_env_copies: int
-    """Most env copies of the run on all machines, as for floating licences: those of its lanes, and those that play
-    evaluations, on as few workers as needed. 0: no limit. For a machine, set the variable MILLRACE_COPIES_PER_MACHINE.
+    """Largest number of env copies of the run on all machines together, for example because of floating licences. It
+    includes those that play evaluations, on as few workers as needed. 0: no limit. To limit one machine, set the
+    variable MILLRACE_COPIES_PER_MACHINE.
     """
     min_workers: int
     """Start training when this many workers have joined. 0: wait for all local workers (train) or one worker (learner)."""
     launched_workers: int
-    """Number of workers that a launcher starts for this learner (learner only; `millrace launch` sets it). If so many
+    """Number of workers that a launcher starts for this learner (learner only; `millrace launch` sets it). If this many
     different workers say that the environment cannot be made, the run ends with their reason. 0: wait for another
     worker.
     """
@@ -79,7 +79,7 @@ class RolloutKeywords(TypedDict, total=False):
     this needs keys.
     """
     advertise: str
-    """Host name or IP address at which workers on other machines reach this one (learner only). Default: the name of this
+    """Host name or IP address of this machine for workers on other machines (learner only). Default: the name of this
     machine.
     """
     keys: str | PathLike[str]
@@ -87,10 +87,12 @@ class RolloutKeywords(TypedDict, total=False):
     TCP connections on this machine need keys too.
     """
     insecure: bool
-    """Accept workers of other machines without keys. Whoever reaches the port can then read, disturb and stop the run."""
+    """Accept workers on other machines without keys. Anyone who can reach the port can then read, disturb and stop the
+    run.
+    """
     metrics_bind: str
     """HOST:PORT at which Prometheus can read the metrics, such as 127.0.0.1:9464 (pip install prometheus-client). With
-    0.0.0.0:9464 everybody in the network can read them. Default: no metrics are served.
+    0.0.0.0:9464 anyone in the network can read them. Default: no metrics are served.
     """
     dashboard: bool
     """Show the run in a browser while it trains: its page is served on this machine, and the address is printed."""
@@ -99,13 +101,13 @@ class RolloutKeywords(TypedDict, total=False):
     is not silent while its supervisor says that its environment, or your policy, is busy, however long that takes.
     """
     lost_lanes: Literal["continue", "restart"]
-    """What becomes of running episodes when their worker is lost, when lanes move to another worker, and when the run is
-    resumed. continue: each is repeated on another env copy from its beginning, with the same seed and actions, and
-    goes on where it was. With environments that repeat themselves, results then do not depend on who was lost.
-    restart: new episodes begin.
+    """What happens to running episodes when their worker is lost, when lanes move to another worker, and when the run is
+    resumed. continue: each is replayed on another env copy from its beginning, with the same seed and actions, and
+    continues from there. If the environment is deterministic given its seed, results then don't depend on which
+    workers were lost. restart: new episodes begin.
     """
     replay_limit: int
-    """Longest episode, in steps, that is repeated so that it can go on. Where one is longer, a new one begins. To repeat
+    """Longest episode, in steps, that is replayed so that it can continue. If it is longer, a new one begins. Replaying
     an episode takes as long as its steps took, without the policy.
     """
     no_workers_timeout_s: float
@@ -123,9 +125,9 @@ class RolloutKeywords(TypedDict, total=False):
     max_env_failures: int
     """Two counts of failures end the run. In a row: more than this, or more than 10, in one lane without a rollout in
     between (a failure after env steps counts as a quarter). Within an hour: more failures after env steps than this ×
-    (1 + env copies × hours since the learner began, at most 1, + w / 30), where w is the seconds that the failed
-    workers had worked before. A failure is an exception or an unusable result of the environment or of an `OwnPolicy`,
-    or a worker process that ends without being told to: the environment may have ended it.
+    (1 + env copies × h + w / 30), where h is the hours since the learner began, at most 1, and w the seconds that the
+    failed workers had worked before. A failure is an exception or an unusable result of the environment or of an
+    `OwnPolicy`, or a worker process that ends unasked: the environment may have ended it.
     """
 
 
@@ -140,13 +142,14 @@ class TrainKeywords(RolloutKeywords, total=False):
     """Env steps to train for, summed over all env copies. Training ends before an update that would exceed them."""
     start_from: str | PathLike[str]
     """Start from the policy of this run folder in place of random weights, with its statistics of observations and
-    rewards. A folder with policy.json and policy.safetensors alone does as well. All other settings are those of the
-    new run, and schedules start anew. A resumed run does not read the folder again: see docs/how-to/resume.md.
+    rewards. A folder with only policy.json and policy.safetensors will do. All other settings are those of the new
+    run, and schedules start anew. A resumed run doesn't read the folder again: see docs/how-to/resume.md.
     """
     from_parts: Literal["auto", "policy", "best", "critic", "all"]
     """What `--from` takes. policy: the newest policy and the statistics. best: the policy of the best evaluation. critic:
     also the critic, the target networks and the temperature. all: also the optimizers. A replay buffer is never taken.
-    auto: critic with sac and td3, whose actor follows the critic at once, if the run has a checkpoint; else policy.
+    auto: critic with sac and td3 if the run has a checkpoint, because their actors follow the critic at once; else
+    policy.
     """
     device: Literal["auto", "cpu", "cuda"]
     """Device of the learner. auto: cuda if PyTorch finds a GPU, else cpu."""
@@ -159,57 +162,57 @@ class TrainKeywords(RolloutKeywords, total=False):
     eval_every: int | float
     """Env steps between evaluations during training. 0: evaluate only at the end."""
     eval_workers: int
-    """Number of workers that only evaluate, so that training goes on meanwhile: train starts them, beside workers; a
-    learner waits for none, and takes those that `millrace worker --evaluate` starts. The result counts at the next
-    evaluation, or at the end, where the learner waits for it. If no such worker is left by then, the others play. 0:
-    all workers evaluate, and training waits.
+    """Number of workers that only evaluate, so that training goes on meanwhile: train starts them in addition to workers;
+    a learner doesn't wait for any, and uses those that `millrace worker --evaluate` starts. The result counts at the
+    next evaluation, or at the end, when the learner waits for it. If no such worker is left by then, the others play.
+    0: all workers evaluate, and training waits.
     """
     eval_copies: int
-    """Number of evaluation episodes that a worker plays at the same time, on env copies of their own. The last bits of
+    """Number of evaluation episodes that a worker plays at the same time, each on its own env copy. The last bits of
     results may depend on this number. Results do not depend on the number of workers.
     """
     eval_max_steps: int | float
     """Largest number of env steps of one evaluation. Each episode gets an equal share: with 100 episodes, an episode that
-    reaches 10000 steps is cut. It counts with its return up to that step, and the result says how many were cut.
+    reaches 10000 steps is cut. Its return up to that step counts, and the result says how many were cut.
     """
     target_return: float | None
     """Stop as soon as the mean return of an evaluation is at least this. Needs eval_every."""
     target_mean_return: float | None
     """Stop as soon as the mean return of the last 100 training episodes is at least this."""
     self_play: int
-    """Self-play: of an environment of several agents, the policy plays one team, and opponents play the others. They are
-    drawn from so many earlier versions of the policy, the newest snapshots. 0: it plays all agents, or meets opponents
-    alone.
+    """Self-play in an environment of several agents: the policy plays one team, and opponents play the others. They are
+    drawn from this many snapshots of the policy, the newest ones. 0: the policy plays all agents, or meets only
+    opponents.
     """
     self_play_save_steps: int
     """Env steps between two snapshots."""
     self_play_latest: float
-    """Share of the rollouts in which the policy meets itself, as it is then, in place of an earlier version."""
+    """Share of the rollouts in which the policy plays against its newest version instead of a snapshot."""
     opponents: Sequence[str]
-    """Opponents of your own, which are drawn as the snapshots are, and which evaluations are played against. Without
-    self_play the policy meets them alone. docs/how-to/self_play.md shows what the factory returns.
+    """Your own opponents. They are drawn like the snapshots, and evaluations are played against them. Without self_play
+    the policy meets only them. docs/how-to/self_play.md shows what the factory returns.
     """
     teams: Sequence[str]
-    """The teams, all of one size: a pattern of the names of the agents of each, as in "red_*" "blue_*". Without any, each
+    """The teams, all of the same size: for each a pattern of its agents' names, as in "red_*" "blue_*". Default: each
     agent is a team. In different env copies, the policy plays different teams.
     """
     inference: Literal["workers", "learner"]
-    """Where the policy acts. workers: in each worker. learner: in one place beside the learner, for all env copies at
-    once; workers then only step the environments.
+    """Where the policy acts. workers: in each worker. learner: in a thread of the learner's process, for all env copies
+    at once; workers then only step the environments.
     """
     torch_threads: int | None
     """Number of PyTorch threads in the learner. none: chosen when the run starts, and kept in its config.toml. The choice
-    is 1; with images, an encoder or a layer of 512 x 512 weights it is one for each 34 million multiply-adds of a pass
-    of a minibatch, at most one for each core. If max_lag is above 0, one core is then left to each local worker,
+    is 1; with images, an encoder or a layer of 512 x 512 weights it is one for each 34 million multiply-adds of a
+    minibatch's forward pass, at most one for each core. If max_lag is above 0, each local worker then keeps one core,
     unless this would leave half of the cores or less to the learner. Another number changes the last bits of results.
     """
     grace_s: float
     """Seconds from SIGTERM, SIGHUP or Ctrl-C to the end of the process. The current update gets at most half of them;
-    then it is undone, and the state before it is saved. 0: wait until the update has ended.
+    then it is undone, and the state before it is saved. 0: wait for the update, however long it takes.
     """
     checkpoint_every_s: float
-    """Seconds between checkpoints. The first one is written after the first update, and one before each evaluation. 0:
-    after each update.
+    """Seconds between checkpoints. There is also one after the first update and one before each evaluation. 0: after each
+    update.
     """
     keep_checkpoints: int
     """Number of checkpoints to keep, the newest ones."""
@@ -227,11 +230,11 @@ class TrainKeywords(RolloutKeywords, total=False):
     which prior_share sets.
     """
     rollout_steps: int
-    """ppo, a2c, dqn, rainbow, impala, sac, td3, tqc, crossq, xqc: T, the steps of each env copy in a rollout.
+    """ppo, a2c, dqn, rainbow, impala, sac, td3, tqc, crossq, xqc: T, the number of steps of each env copy in a rollout.
     reinforce: T, the steps of each env copy in a rollout. Must be longer than any episode.
     """
     net: Sequence[int]
-    """ppo, a2c, dqn, impala, reinforce: Sizes of the hidden layers: of the actor and of the critic each, or of the
+    """ppo, a2c, dqn, impala, reinforce: Sizes of the hidden layers, of the actor and of the critic alike, or of the
     Q-network.
     rainbow: Sizes of the hidden layers of the Q-network.
     sac, td3, tqc: Sizes of the hidden layers: of the actor and of each critic.
@@ -279,31 +282,31 @@ class TrainKeywords(RolloutKeywords, total=False):
     normalize_rewards: bool
     """ppo, a2c, impala: Divide rewards by the running standard deviation of the discounted return, and clip them to ±10.
     dqn, rainbow, sac, td3, tqc, crossq: Divide rewards by the running standard deviation of the discounted return,
-    when they are drawn from the buffer, and clip them to ±10; with n_step, the sum of n rewards.
+    when they are drawn from the buffer, and clip them to ±10; with n_step, this clips the sum of n rewards.
     reinforce: Divide rewards by the running standard deviation of the discounted return, and clip them to ±10.
     Otherwise the loss of the baseline dominates the gradient.
-    xqc: Divide rewards by the running standard deviation of the discounted return, and by so much that no discounted
+    xqc: Divide rewards by the running standard deviation of the discounted return, or by more, so that no discounted
     return so far exceeds return_bound.
     """
     clone_epochs: int
     """ppo, a2c, impala, reinforce: Number of epochs of cloning on the dataset of --prior, before the first rollouts are
-    collected: the actor learns its actions, the critic its returns. Needs --prior.
+    collected: the actor learns the dataset's actions, the critic its returns. Needs --prior.
     sac, td3, tqc, crossq, xqc: Number of epochs of cloning on the dataset of --prior, before prior_steps and the first
-    rollouts: the actor learns its actions. Needs --prior.
+    rollouts: the actor learns the dataset's actions. Needs --prior.
     """
     core: Literal["lstm", "gru"] | None
     """ppo, a2c, impala: Recurrent layer in front of the hidden layers. Minibatches then consist of whole sequences: all T
     steps of some env copies.
     dqn, rainbow, sac, td3, tqc, crossq, xqc: Recurrent layer in front of the hidden layers. A gradient step then takes
-    whole sequences: the rollout_steps steps of an env copy, after its rollout before, in which the layer warms up.
-    Actor and critics share it, and critics train it.
+    whole sequences: the rollout_steps steps of an env copy, preceded by its previous rollout as burn-in. Actor and
+    critics share the layer, and the critics' loss trains it.
     """
     core_size: int
     """ppo, a2c, dqn, rainbow, impala, sac, td3, tqc, crossq, xqc: Number of units of the recurrent layer."""
     batch_size: int
-    """ppo: Largest number of rows (steps of one env copy) in a minibatch. With core, whole sequences may be more.
-    dqn, rainbow, sac, td3, tqc, crossq, xqc: Number of transitions in a gradient step. With core, as many sequences as
-    have this number, but at least 16.
+    """ppo: Largest number of rows (steps of one env copy) in a minibatch. With core, whole sequences may exceed it.
+    dqn, rainbow, sac, td3, tqc, crossq, xqc: Number of transitions in a gradient step. With core, it takes as many
+    sequences as have this many, but at least 16.
     """
     n_epochs: int
     """ppo: Number of epochs: how often an update uses each row.
@@ -316,7 +319,7 @@ class TrainKeywords(RolloutKeywords, total=False):
     a2c: Normalize the advantages of each batch to mean 0 and standard deviation 1, unless the policy was cloned.
     """
     clip_range: float
-    """ppo: ε of the clipped objective: the ratio of new to old action probability is clipped to 1 ± ε."""
+    """ppo: ε of the clipped objective: the ratio of the new to the old action probability is clipped to 1 ± ε."""
     clip_range_schedule: Literal["constant", "linear"]
     """ppo: linear: clip_range falls to zero over the run."""
     clip_range_vf: float | None
@@ -330,16 +333,16 @@ class TrainKeywords(RolloutKeywords, total=False):
     """
     replay_size: int | float
     """dqn, rainbow, sac, td3, tqc, crossq, xqc: Capacity of the replay buffer in transitions; the newest are kept. The
-    final observation of a truncated episode takes the place of one.
+    final observation of a truncated episode takes the place of a transition.
     """
     priority_alpha: float
-    """dqn, sac, td3, tqc, crossq, xqc: α of prioritized replay: how far its last TD error decides how often a transition
-    is drawn from the replay buffer. 0: not at all. 1: in proportion. Schaul et al. 2016 use 0.6.
-    rainbow: α of prioritized replay: how far its last TD error decides how often a transition is drawn from the replay
-    buffer. 0: not at all. 1: in proportion.
+    """dqn, sac, td3, tqc, crossq, xqc: α of prioritized replay: how much the probability that a transition is drawn
+    depends on its last TD error. 0: not at all. 1: in proportion. Schaul et al. 2016 use 0.6.
+    rainbow: α of prioritized replay: how much the probability that a transition is drawn depends on its last TD error.
+    0: not at all. 1: in proportion.
     """
     priority_beta: float
-    """dqn, rainbow, sac, td3, tqc, crossq, xqc: Initial β of prioritized replay: how far importance weights correct the
+    """dqn, rainbow, sac, td3, tqc, crossq, xqc: Initial β of prioritized replay: how much importance weights correct the
     bias. It grows to 1 (fully) over the run.
     """
     prior_share: float
@@ -352,26 +355,26 @@ class TrainKeywords(RolloutKeywords, total=False):
     """
     hindsight: float
     """dqn, rainbow, sac, td3, tqc, crossq, xqc: Hindsight experience replay: the share of the transitions of a minibatch
-    whose goal is replaced by one that was achieved later in their episode. 0: off. Andrychowicz et al. 2017 use 0.8.
+    whose goal is replaced by a goal that was achieved later in the episode. 0: off. Andrychowicz et al. 2017 use 0.8.
     Needs observations with achieved_goal and desired_goal, and goal_reward.
     """
     goal_reward: str | None
     """dqn, rainbow, sac, td3, tqc, crossq, xqc: How the environment computes rewards from achieved and desired goals, for
     hindsight. sparse:0.05: 0 within this distance of the goal, else -1. success:0.45: 1 within this distance, else 0.
-    dense: minus the distance. Or a function of your own, such as my_module:reward, of two arrays [B, G], which returns
-    an array [B].
+    dense: minus the distance. Or your own function of two arrays [B, G] that returns an array [B], such as
+    my_module:reward.
     """
     goal_ends: float | None
-    """dqn, rainbow, sac, td3, tqc, crossq, xqc: The distance from its goal at which a task ends, for hindsight. none: it
-    does not end at its goal.
+    """dqn, rainbow, sac, td3, tqc, crossq, xqc: The distance from the goal at which an episode terminates, for hindsight.
+    none: it doesn't terminate at its goal.
     """
     n_step: int
-    """dqn, rainbow, sac, td3, tqc, crossq, xqc: Number of rewards in a target before it bootstraps; those of one agent,
-    in its own time, if there are several.
+    """dqn, rainbow, sac, td3, tqc, crossq, xqc: Number of rewards in a target before it bootstraps. With several agents,
+    each agent's own steps count.
     """
     tau: float
-    """dqn: Fraction by which an update moves the target network. 1: it becomes a copy of the network. With a small one,
-    such as 0.005, take target_every 1 (polyak averaging).
+    """dqn: Fraction by which an update moves the target network. 1: it becomes a copy of the network. With a small
+    fraction, such as 0.005, take target_every 1 (polyak averaging).
     rainbow: Fraction by which an update moves the target network.
     sac, td3, tqc, crossq, xqc: τ of the polyak update: the fraction by which the target network moves in each gradient
     step.
@@ -385,7 +388,9 @@ class TrainKeywords(RolloutKeywords, total=False):
     double: bool
     """dqn, rainbow: Double Q-learning: the network chooses the next action, and the target network values it."""
     dueling: bool
-    """dqn, rainbow: Dueling network: an action value is the state's value plus the action's advantage over the mean."""
+    """dqn, rainbow: Dueling network: an action value is the value of the state plus the action's advantage minus the mean
+    advantage.
+    """
     target_every: int
     """dqn, rainbow: Number of gradient steps between two updates of the target network."""
     epsilon_start: float
@@ -395,8 +400,8 @@ class TrainKeywords(RolloutKeywords, total=False):
     epsilon_schedule: Literal["linear", "exponential"]
     """dqn, rainbow: How ε falls from its initial to its final value."""
     epsilon_steps: int | float
-    """dqn, rainbow: Number of env steps, summed over all env copies, over which ε falls. exponential: until its distance
-    to the final value is 1/e of the initial distance.
+    """dqn, rainbow: Number of env steps, summed over all env copies, over which ε falls. With exponential: until the
+    distance to its final value is 1/e of what it was.
     """
     max_grad_value: float | None
     """dqn, rainbow: Clip each entry of the gradient to ± this, before its norm is clipped. none: no clipping."""
@@ -419,30 +424,28 @@ class TrainKeywords(RolloutKeywords, total=False):
     learned values are to those of the newest policy (without clipping: exactly those).
     """
     c_bar: float
-    """impala: c̄ of V-trace: importance weights of traces are clipped to this. It decides how far back a TD error has
-    effect.
+    """impala: c̄ of V-trace: importance weights of traces are clipped to this. It decides how far back the effect of a TD
+    error reaches.
     """
     baseline: bool
     """reinforce: Subtract the value that the critic predicts from the return."""
     normalize_returns: bool
-    """reinforce: Normalize the returns of each batch (less the baseline) to mean 0 and standard deviation 1."""
+    """reinforce: Normalize the returns of each batch (minus the baseline) to mean 0 and standard deviation 1."""
     updates_per_step: float
     """sac, td3, tqc, crossq, xqc: Replay ratio: gradient steps for each env step after learning_starts. It is exact,
-    whatever the rollouts are.
+    whatever the size of the rollouts.
     """
     random_shift: int
-    """sac, td3, tqc, crossq, xqc: Pixels by which images are moved at random, at most, each time a gradient step takes
-    them (DrQ-v2). It doesn't concern observations without images.
+    """sac, td3, tqc, crossq, xqc: Largest random shift of images, in pixels, each time they are in a minibatch (DrQ-v2).
+    It has no effect on observations without images.
     """
     target_entropy: float | None
-    """sac, tqc, crossq, xqc: The entropy that a learned temperature aims at. none: minus the number of the action's
-    elements.
-    """
+    """sac, tqc, crossq, xqc: The entropy that a learned temperature aims at. none: minus the dimension of the action."""
     exploration_noise: float
     """td3: Standard deviation of the noise that workers add to actions, which are in [-1, 1]."""
     policy_delay: int
-    """td3: Number of gradient steps of the critics for each one of the actor and of the target networks.
-    crossq, xqc: Number of gradient steps of the critics for each one of the actor and of the temperature.
+    """td3: Number of gradient steps of the critics for each step of the actor and of the target networks.
+    crossq, xqc: Number of gradient steps of the critics for each step of the actor and of the temperature.
     """
     target_noise: float
     """td3: Standard deviation of the noise that is added to the actions of targets."""
@@ -451,7 +454,9 @@ class TrainKeywords(RolloutKeywords, total=False):
     critics: int
     """tqc: Number of critics."""
     dropped_quantiles: int
-    """tqc: Number of quantiles for each critic that targets leave out, the highest, so that values are not overestimated."""
+    """tqc: Number of the highest quantiles, for each critic, that targets leave out, so that values are not
+    overestimated.
+    """
     critic_net: Sequence[int]
     """crossq, xqc: Sizes of the hidden layers of each critic."""
     renormalize_after: int

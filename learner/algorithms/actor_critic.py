@@ -122,8 +122,7 @@ class ActorCritic(GradientDescent):
         return math.ceil(rows / batch_size)
 
     def standardizes_advantages(self) -> bool:
-        """Whether the advantages of each minibatch are scaled to mean 0 and standard deviation 1. After cloning they are
-        not.
+        """Whether the advantages of each minibatch get mean 0 and standard deviation 1. After cloning they don't.
 
         If a policy acts well from the start, its advantages are little more than the critic's small errors. Scaled to a
         standard deviation of 1, they would change the policy as much as advantages that tell good actions from bad ones.
@@ -216,10 +215,10 @@ class ActorCritic(GradientDescent):
             metrics["train/std"] = log_std.detach().exp().mean().item()
         return metrics | self.means({"explained_variance": _explained_variance(each), **each.metrics} for each in estimates)
 
-    # ---------------------------------------------------------------- what the network says of a batch
+    # ---------------------------------------------------------------- the network's outputs for a batch
 
     def observations(self, batch: Batch) -> Observations:
-        """The observations as the workers' policy saw them."""
+        """The observations, normalized as the workers' policy saw them."""
         x, images = self.normalizer.inputs(batch.obs, self.statistics)
         recurrent = None
         if self.policy.core is not None:
@@ -228,7 +227,7 @@ class ActorCritic(GradientDescent):
         return Observations(x.shape[:2], features, tuple(pixels), recurrent)
 
     def values(self, observations: Observations, pulse: Pulse) -> Floats:
-        """V(obs) [T+1, ΣN] under the present weights."""
+        """V(obs) [T+1, ΣN] with the current weights."""
         return observations.evaluate(observations.shape[0], lambda inputs, _: self.net.value(*inputs), pulse)
 
     # ---------------------------------------------------------------- weights and checkpoints
@@ -248,7 +247,10 @@ class ActorCritic(GradientDescent):
 
 
 def _recurrent_input(batch: Batch, tensor: Callable[[Array], Tensor]) -> RecurrentInput:
-    """The states before all T+1 steps. An episode begins after a step that resets; rows between those of a seat pass."""
+    """The recurrent states before all T+1 steps.
+
+    An episode begins after a step that resets; rows in which a seat waits leave its state unchanged.
+    """
     begins = ~batch.valid
     first = np.zeros_like(batch.valid[:1])
     advances = None
@@ -265,13 +267,13 @@ def _checked(returned: Any, algorithm: str) -> tuple[Tensor, Mapping[str, Tensor
         case (Tensor() as loss, Mapping() as numbers) if loss.dim() == 0 and loss.requires_grad:
             return loss, numbers
     raise UsageError(
-        f"{algorithm}.loss: expected a tensor of no dimension that depends on log_prob_now, entropy or value of its "
+        f"{algorithm}.loss: expected a 0-dimensional tensor that depends on log_prob_now, entropy or value of its "
         "rows, and a dict of numbers to log"
     )
 
 
 def _check_spread_of_actions(net: ActorCriticNetwork, version: int) -> None:
-    """Raise `RunError` before Box actions overflow: workers would be refused for them, one after the other."""
+    """Raise `RunError` before Box actions overflow: otherwise one worker after the other would be refused for them."""
     log_std = net.parameters.get("actor.log_std")
     if log_std is not None and (largest := log_std.detach().max().item()) > MAX_LOG_STD:
         raise RunError(

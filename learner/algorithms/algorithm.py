@@ -23,25 +23,25 @@ from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
 
 
 class Start(NamedTuple):
-    """What a new run takes from an earlier one, whose policy has the same `PolicySpec`."""
+    """What a new run takes over from an earlier run, whose policy has the same `PolicySpec`."""
 
     state: dict[str, Any]
-    """The `state_dict` of the earlier run's algorithm. Where only its policy is known: `parameters`, and perhaps
-    `observations`, the statistics.
+    """The `state_dict` of the earlier run's algorithm. If only its policy is known: `parameters`, and perhaps the
+    statistics, `observations`.
     """
     acting: int
-    """P: of the `parameters`, the first P act."""
+    """P: the first P of the `parameters` compute actions."""
     critic: bool = False
-    """Take all weights, not only those that act."""
+    """Take all weights, not only those that compute actions."""
     optimizer: bool = False
     """Take the moments of the optimizers, too."""
 
     def into(self, fresh: dict[str, Any], weights: Iterable[str], optimizers: Iterable[str]) -> dict[str, Any]:
-        """The state of a new algorithm, with what is taken in the place of its own; all else starts anew.
+        """The state of a new algorithm, in which the parts that are taken over replace its own; the rest starts anew.
 
-        `weights` and `optimizers`: their names in the state. Of `parameters` and `target`, the first P act; if these are all
-        of the new ones, they must be all of the saved ones. Raises `ValueError` if a tensor has another shape or dtype than
-        in the new algorithm.
+        `weights` and `optimizers`: their names in the state. The first P of `parameters` and `target` compute actions; if
+        the new algorithm has only these, the saved one must have only these, too. Raises `ValueError` if a tensor has
+        another shape or dtype than in the new algorithm.
         """
         state = self.state
         taken = dict[str, Any]()
@@ -77,7 +77,7 @@ class Algorithm(ABC):
 
     @staticmethod
     def policy_spec(config: Any, observation: tuple[Leaf, ...], action: ActionSpec) -> PolicySpec:
-        """The policy to train: an actor and a critic with the layers of the settings, for any space that we know.
+        """The policy to train: an actor and a critic with the layers of the settings, for any supported space.
 
         Raises `UsageError`, with a one-line message, if the algorithm cannot use these spaces.
         """
@@ -99,10 +99,10 @@ class Algorithm(ABC):
 
     @abstractmethod
     def update(self, batch: Batch, pulse: Callable[[], None]) -> dict[str, float]:
-        """Learn from a batch and return metrics by name, as "train/loss".
+        """Learn from a batch and return metrics by name, such as "train/loss".
 
-        Calls `pulse` between gradient steps, so that the learner can answer its workers meanwhile; what `pulse` raises must
-        pass. Uses only rows where `batch.valid`, and changes no array of the batch. Raises `RunError` when a loss or a
+        Calls `pulse` between gradient steps, so that the learner can answer its workers meanwhile; don't catch what `pulse`
+        raises. Uses only rows where `batch.valid`, and changes no array of the batch. Raises `RunError` when a loss or a
         gradient is not finite, before it reaches the weights (`check_finite`).
         """
 
@@ -111,7 +111,10 @@ class Algorithm(ABC):
         """Copies of the acting parameters [P] and of the policy's buffers, both float32, as workers get them."""
 
     def is_finite(self) -> bool:
-        """Whether all weights are finite, also those that do not act, and the policy's buffers. Called after each update."""
+        """Whether all weights, also those that don't compute actions, and the policy's buffers are finite.
+
+        Called after each update.
+        """
         return all(bool(np.isfinite(array).all()) for array in self.weights())
 
     @abstractmethod
@@ -137,7 +140,7 @@ class Algorithm(ABC):
         raise UsageError(f"prior: {type(self).__name__} does not learn from prior data: it has no method add_prior")
 
     def learn_from_prior(self, pulse: Callable[[], None]) -> None:
-        """Make those gradient steps on prior data that come before the first rollouts and are not made yet. Default: none.
+        """Make the gradient steps on prior data that precede the first rollouts, except those already made. Default: none.
 
         Calls `pulse` between gradient steps, and raises `RunError`, as `update` does.
         """
@@ -148,12 +151,12 @@ class Algorithm(ABC):
         self._remembered = copy.deepcopy(self.state_dict())
 
     def roll_back(self) -> None:
-        """Return to the state that was remembered last, from any state in between: an update was not made whole."""
+        """Return to the state that was remembered last. The update may have stopped at any point."""
         self.load_state_dict(copy.deepcopy(self._remembered))
 
 
 def numbers(metrics: Any, who: str) -> dict[str, float]:
-    """The metrics of an update as floats, by name: also numpy's and torch's scalars become floats.
+    """The metrics of an update as floats, by name. Scalars of numpy and torch become floats, too.
 
     `who`: the class of the algorithm. Raises `UsageError` for anything but a dict of numbers by name.
     """
@@ -170,7 +173,7 @@ def numbers(metrics: Any, who: str) -> dict[str, float]:
 
 
 def wrong_weights(weights: Any, policy: PolicySpec) -> Iterator[str]:
-    """What is wrong with the form of an algorithm's weights: a line for each array that is not as the policy needs it."""
+    """What is wrong with the form of an algorithm's weights: one line for each array that doesn't fit the policy."""
     if not isinstance(weights, tuple) or len(weights) != 2:
         yield f"weights: expected a pair of arrays, got {type(weights).__name__}"
         return

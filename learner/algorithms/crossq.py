@@ -1,7 +1,7 @@
 """CrossQ (Bhatt et al. 2024): SAC with batch normalization in actor and critics, and without target networks.
 
-The newest critics value the next observations, too. That is stable because these pass them together with the observations,
-and are normalized alike. `NormalizedSAC` has what XQC shares.
+The newest critics also value the next observations. That is stable because observations and next observations pass the
+critics together, and are normalized alike. `NormalizedSAC` has what XQC shares.
 """
 
 from __future__ import annotations

@@ -70,7 +70,7 @@ class DQN(OffPolicy):
         return q_network(self.policy, device, seed)
 
     def steps_due(self) -> int:
-        """The same number of gradient steps in each update, once learning has started."""
+        """The number of gradient steps, which is the same in each update once learning has started."""
         return self.config.gradient_steps if self.env_steps >= self.config.learning_starts else 0
 
     def transitions(self, sample: Sample | SequenceSample) -> Transitions:
@@ -134,5 +134,5 @@ class DQN(OffPolicy):
 
 
 def best_action(values: Tensor, mask: Tensor | None) -> Tensor:
-    """The actions [B] of the highest values [B, n], of those that the mask [B, n] allows."""
+    """The actions [B] with the highest of the values [B, n], among those that the mask [B, n] allows."""
     return (values if mask is None else values.masked_fill(~mask, FORBIDDEN)).argmax(1)

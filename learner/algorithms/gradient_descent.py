@@ -1,7 +1,7 @@
-"""The base of the algorithms that step flat tensors down the gradients of their losses: what an update needs, and the state.
+"""The base of the algorithms that train flat tensors by gradient descent: what an update needs, and the state.
 
-Rule: the loss that an algorithm writes in torch is the one that is differentiated. A step is taken only after its loss and
-its gradient were found finite; `roll_back` takes back what an update did before it raised.
+Rule: the loss that an algorithm writes in torch is the one that is differentiated. A step is taken only if its loss and its
+gradient are finite; `roll_back` undoes what an update did before it raised.
 """
 
 from __future__ import annotations
@@ -31,17 +31,17 @@ ADVICE = "a lower learning_rate, or normalize_observations and normalize_rewards
 
 
 class Network(Protocol):
-    """What every network is."""
+    """What every network has."""
 
     flat: Tensor
     """[P] all parameters"""
 
 
 class GradientDescent(Algorithm):
-    """Flat tensors, an optimizer for each that learns, schedules, and running statistics of observations and returns.
+    """Flat tensors, an optimizer for each trained one, schedules, and running statistics of observations and returns.
 
-    A subclass puts everything that a step changes into `tensors` and `optimizers`, and what else the next update depends on
-    into `other_state`.
+    A subclass puts everything that a step changes into `tensors` and `optimizers`, and everything else that the next update
+    depends on into `other_state`.
     """
 
     tensors: dict[str, Tensor]
@@ -56,7 +56,7 @@ class GradientDescent(Algorithm):
         self.env_steps = 0  # of all batches so far; schedules depend on it
         self.version = 0  # updates made
         self._total_steps = total_steps
-        # What exploration needs also stands in the policy's buffers, so the normalizer gets the policy with another head.
+        # The policy's buffers also contain what exploration needs, so the normalizer gets the policy with another head.
         self.normalizer = ObservationNormalizer(replace(policy, head="actor_critic"))
         self.statistics: Floats = self.normalizer.buffers()  # float32 means and standard deviations, as published
         self.rewards = RewardScaler(config.gamma)
@@ -77,7 +77,7 @@ class GradientDescent(Algorithm):
 
     @property
     def learning_rate(self) -> float:
-        """That of this update, which all optimizers have."""
+        """The learning rate of all optimizers in this update."""
         rate: float = next(iter(self.optimizers.values())).param_groups[0]["lr"]
         return rate
 
@@ -87,7 +87,7 @@ class GradientDescent(Algorithm):
         return self.tensor(x).to(self.net.flat.dtype), tuple(map(self.tensor, images))
 
     def tensor(self, array: Array) -> Tensor:
-        """On the device of the weights."""
+        """The array as a tensor, on the device of the weights."""
         return torch.from_numpy(array).to(self.net.flat.device)
 
     def count(self, batch: Batch) -> None:
@@ -108,11 +108,11 @@ class GradientDescent(Algorithm):
         self.statistics = self.normalizer.buffers()
 
     def differentiate(self, loss: Tensor, optimizer: Optimizer, numbers: Mapping[str, Tensor | float]) -> UpdateMetrics:
-        """Write the gradient of a loss into `grad` of the flat tensor of an optimizer, the memory of all its gradients.
+        """Write the gradient of a loss into `grad` of the optimizer's flat tensor, which all its gradients share.
 
         Sets it to zero first, and calls `loss.backward()`. Returns the numbers, and `grad_norm`, as floats.
 
-        Raises `RunError` if one of them is not finite, and `UsageError` for what is no number.
+        Raises `RunError` if one of them is not finite, and `UsageError` if one isn't a number.
         """
         (flat,) = optimizer.param_groups[0]["params"]
         gradient = flat.grad
@@ -126,7 +126,7 @@ class GradientDescent(Algorithm):
         return metrics
 
     def _logged(self, name: str, number: Any, like: Tensor) -> Tensor:
-        """A number that a loss logs, as a tensor of no dimension. Raises `UsageError` for anything else."""
+        """A number that a loss logs, as a 0-dimensional tensor. Raises `UsageError` for anything else."""
         if isinstance(number, Tensor) and not number.dim():
             return number.detach()
         got = type(number).__name__
@@ -151,11 +151,11 @@ class GradientDescent(Algorithm):
     # ---------------------------------------------------------------- the state
 
     def is_finite(self) -> bool:
-        """Whether all weights are finite, also those that do not act, and the observation statistics."""
+        """Whether all weights, also those that don't compute actions, and the observation statistics are finite."""
         return bool(all(tensor.isfinite().all() for tensor in self.tensors.values()) and np.isfinite(self.statistics).all())
 
     def other_state(self) -> dict[str, Any]:
-        """What the next update depends on besides tensors, optimizers and statistics: plain data, copied."""
+        """What the next update depends on besides tensors, optimizers and statistics, as plain data, copied."""
         return {"env_steps": self.env_steps, "version": self.version, "pretraining_steps": self.pretraining_steps}
 
     def load_other_state(self, state: dict[str, Any]) -> None:
@@ -185,9 +185,9 @@ class GradientDescent(Algorithm):
         self.load_other_state(state)
 
     def start_from(self, start: Start) -> None:
-        """See `Algorithm.start_from`. A replay buffer is empty.
+        """See `Algorithm.start_from`. A replay buffer starts empty.
 
-        Target networks start as the networks; if the critic is taken, as they were.
+        Target networks start as copies of the networks; if the critic is taken over, so are the target networks.
         """
         own = GradientDescent.state_dict(self)
         GradientDescent.load_state_dict(self, start.into(own, self.tensors, self.optimizers))
@@ -202,7 +202,7 @@ class GradientDescent(Algorithm):
 
 
 def check_finite(metrics: Mapping[str, float], update: int, advice: str) -> None:
-    """Raise `RunError`, which names the first metric that is not finite, if there is one. Call it before the step."""
+    """Raise `RunError` if a metric is not finite; it names the first one. Call this before the step."""
     for name, number in metrics.items():
         if not math.isfinite(number):
             raise RunError(
@@ -211,12 +211,12 @@ def check_finite(metrics: Mapping[str, float], update: int, advice: str) -> None
 
 
 def scheduled(first: float, schedule: str, remaining: float) -> float:
-    """The value of a setting when this fraction of the run remains: `linear` is first · remaining, `constant` is first."""
+    """The value of a setting when this fraction of the run remains: first · remaining for `linear`, first for `constant`."""
     return first * (remaining if schedule == "linear" else 1)
 
 
 def clip_norm(flat: Tensor, norm: float, largest: float) -> None:
-    """Scale the gradient of a flat tensor, whose norm this is, to at most the largest norm."""
+    """Scale the gradient of a flat tensor, which has this norm, to at most the largest norm."""
     if norm > largest:
         assert flat.grad is not None
         flat.grad.mul_(largest / norm)

@@ -1,7 +1,7 @@
 """Rows of a batch in the form of the network's input, and the selection of minibatches from them.
 
-Rule: rows that are not valid never enter a loss, and in an epoch each of the others enters one. A recurrent core runs over
-them too, as its columns have them.
+Rule: rows that are not valid never enter a loss, and in an epoch each of the others enters one. A recurrent core still runs
+over the rows that are not valid, because they are part of its columns.
 
 A batch has T rows for each of ΣN env copies (columns). Row numbers count the rows as one flat sequence of T · ΣN rows in
 time order. B is the number of rows of a minibatch, and C the number of its columns if the policy has a recurrent core.
@@ -34,7 +34,7 @@ class NetworkInput(NamedTuple):
 
 
 class Observations(NamedTuple):
-    """The T+1 observations of ΣN env copies, normalized by the statistics that the workers acted under."""
+    """The T+1 observations of ΣN env copies, normalized by the statistics that the workers acted with."""
 
     shape: tuple[int, ...]  # (T+1, ΣN)
     features: Tensor  # [(T+1) · ΣN, D] float32, normalized
@@ -80,13 +80,13 @@ class Minibatch(NamedTuple):
     action: Tensor  # [B, *action] int64, or float32 not clipped
     log_prob: Tensor  # [B] float32, of the action under the policy that acted
     advantage: Tensor  # [B] float32, not standardized
-    target: Tensor  # [B] float32, what the value is fitted to
+    target: Tensor  # [B] float32, target of the value function
     recurrent: RecurrentInput | None = None  # with a core, features and images are [T · C, …], and it selects B of them
     mask: Tensor | None = None  # [B, choices] bool, which actions are allowed; None unless the run uses action masks
 
     @staticmethod
     def of(batch: Batch, observations: Observations, advantage: Floats, target: Floats) -> Minibatch:
-        """All T · ΣN rows of a batch, also those that are not valid. `advantage` and `target` are [T, ΣN]."""
+        """All T · ΣN rows of a batch, including rows that are not valid. `advantage` and `target` are [T, ΣN]."""
         inputs = observations.network_input(len(batch.valid), slice(None), slice(batch.valid.size))
         device = inputs.features.device
         return Minibatch(
@@ -133,7 +133,7 @@ class Minibatch(NamedTuple):
         most as many minibatches as columns. Without a generator, the rows stay in order.
         """
         device = self.features.device
-        # With a core, the columns that have a row: one without would make an empty minibatch.
+        # With a core, only the columns with a used row: a column without one would make an empty minibatch.
         index = torch.from_numpy(np.flatnonzero(used if self.recurrent is None else used.any(0)))
         if generator is not None:
             index = index[torch.randperm(len(index), generator=generator)]
@@ -144,20 +144,20 @@ class Minibatch(NamedTuple):
             yield self.select(chosen) if of_columns is None else self.select_columns(chosen, of_columns)
 
     def epochs(self, used: Bools, count: int, generator: torch.Generator) -> Iterator[Iterable[Minibatch]]:
-        """The minibatches of each epoch, without end. A single minibatch is made once, with its rows in order."""
+        """The minibatches of each epoch, without end. A single minibatch per epoch is made once, with its rows in order."""
         single = tuple(self.shuffled(used, 1, None)) if count == 1 else ()
         while True:
             yield single or self.shuffled(used, count, generator)
 
 
 class LossInput(NamedTuple):
-    """Input of a loss: B rows of a minibatch, and the network's present outputs for them. Every row is valid.
+    """Input of a loss: B rows of a minibatch, and the network's current outputs for them. Every row is valid.
 
-    All are float32, except actions that are choices. Gradients flow through the last three.
+    All are float32, except discrete actions. Gradients flow through the last three.
     """
 
     action: Tensor
-    """[B, *action] what was done: int64 counted from 0, or float32 that is not clipped to the action space (Box)"""
+    """[B, *action] the actions taken: int64 counted from 0, or float32 that is not clipped to the action space (Box)"""
     log_prob: Tensor
     """[B] log-probability of the action under the policy that acted"""
     advantage: Tensor
@@ -165,13 +165,13 @@ class LossInput(NamedTuple):
     raw_advantage: Tensor
     """[B] the advantage as it was estimated"""
     target: Tensor
-    """[B] what the value is fitted to"""
+    """[B] target of the value function"""
     log_prob_now: Tensor
-    """[B] log-probability of the action under the present policy"""
+    """[B] log-probability of the action under the current policy"""
     entropy: Tensor
-    """[B] entropy of the present policy"""
+    """[B] entropy of the current policy"""
     value: Tensor
-    """[B] the critic's present value of the observation"""
+    """[B] the critic's current value of the observation"""
 
 
 def flat_tensor(array: Array, device: torch.device | str) -> Tensor:
@@ -180,12 +180,12 @@ def flat_tensor(array: Array, device: torch.device | str) -> Tensor:
 
 
 def rows_of_columns(steps: int, columns: int, chosen: Tensor) -> Tensor:
-    """The numbers of all rows of the chosen columns, in time order, where there are `steps` times `columns` rows."""
+    """The numbers of all rows of the chosen columns, in time order. There are `steps` × `columns` rows."""
     return (torch.arange(steps, device=chosen.device)[:, None] * columns + chosen).flatten()
 
 
 def log_probs(net: ActorCriticNetwork, observations: Observations, batch: Batch, pulse: Callable[[], None]) -> Floats:
-    """Log π(action) [T, ΣN] under the weights of `net`."""
+    """Log π(action) [T, ΣN] with the weights of `net`."""
     rows = Minibatch.of(batch, observations, batch.reward, batch.reward)
 
     def log_prob(inputs: NetworkInput, at: Index) -> Tensor:

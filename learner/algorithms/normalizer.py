@@ -1,6 +1,6 @@
 """`RolloutService.normalizer`: running mean and standard deviation of observations, and of the discounted return.
 
-They are those of the built-in trainer: the same classes, updated from the same rows. Imports torch, when it is first used.
+The built-in trainer uses the same classes, updated from the same rows. Torch is imported at the first use.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from millrace.protocol.specs import PolicySpec
 class Normalizer:
     """Running mean and standard deviation of each feature of the observations, and of the discounted return.
 
-    They are over all batches that were counted so far; rows that only reset count nowhere. D is the number of features: the
-    entries of all arrays of the observation side by side, with a one-hot vector for a discrete value. Images are no features
+    They are over all batches counted so far, except rows that only reset. D is the number of features: the
+    entries of all arrays of the observation side by side, with a one-hot vector for a discrete value. Images aren't features
     and stay as they are. Numbers are kept in float64 and given out as float32.
 
     >>> import millrace
@@ -41,11 +41,11 @@ class Normalizer:
     >>> isinstance(service.normalizer, millrace.Normalizer)
     True
 
-    `service.save` keeps them, and a service that is restored goes on from them.
+    `service.save` keeps them, and a restored service continues from them.
     """
 
     def __init__(self, policy: PolicySpec) -> None:
-        """For the observations of this policy, also if it does not normalize them itself."""
+        """For the observations of this policy, even if it doesn't normalize them itself."""
         self._policy = msgspec.structs.replace(
             policy, normalize_observations=True, own=None, encoder=None, head="actor_critic"
         )
@@ -74,9 +74,9 @@ class Normalizer:
     def normalized(self, batch: Batch) -> Floats:
         """The features [T+1, N, D] float32 of a batch: (x − mean) / std, clipped to ±10.
 
-        Before `update` these are the ones that the policy saw, if it normalizes and `max_lag` is 0. Arrays of the
-        observation are flattened and side by side; discrete values are one-hot vectors, and bytes of a Box from 0 to 255
-        are divided by 255 before.
+        Before `update` these are the features that the policy saw, if it normalizes and `max_lag` is 0. The observation's
+        arrays are flattened and concatenated; discrete values are one-hot vectors, and bytes of a Box from 0 to 255 are
+        first divided by 255.
         """
         return normalize(self._features(batch), self.mean, self.std)
 
@@ -84,7 +84,7 @@ class Normalizer:
         """Count a batch, and return its rewards [T, N] divided by the standard deviation of the discounted return,
         clipped to ±10.
 
-        Call it once for each batch. `gamma` is the discount, the same each time. Raises `UsageError` for another.
+        Call it once for each batch. `gamma` is the discount. Raises `UsageError` if it isn't the same each time.
         """
         if self._rewards is None:
             self._rewards = gamma, RewardScaler(gamma)
@@ -98,7 +98,7 @@ class Normalizer:
         return features(self._policy, [obs[path] for path in paths] if paths[0] else [obs])
 
     def state(self) -> dict[str, Any]:
-        """Plain data to go on from. The running returns are not in it: a service that is restored has new env copies."""
+        """Plain data to continue from, without the running returns, because a restored service has new env copies."""
         kept: dict[str, Any] = {"observations": _plain(self._observations.state_dict())}
         if self._rewards is not None:
             gamma, scaler = self._rewards
@@ -106,7 +106,7 @@ class Normalizer:
         return kept
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on from a `state`. Raises whatever one leads to that is of another form or not finite."""
+        """Continue from a `state`. Raises an error of any type if it has another form or is not finite."""
         self._observations.load_state_dict(_tensors(state["observations"]))
         if "gamma" in state:
             scaler = RewardScaler(state["gamma"])

@@ -1,4 +1,4 @@
-"""The data that an algorithm can learn from besides the rollouts of its run (`--prior`): what it must offer."""
+"""The interface of the data that an algorithm can learn from besides the rollouts of its run (`--prior`)."""
 
 from __future__ import annotations
 

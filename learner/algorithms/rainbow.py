@@ -3,8 +3,8 @@
 Its other parts are settings of DQN: double, dueling, n-step returns and prioritized replay. Noisy networks are left out:
 workers would have to draw noise for each weight. They explore by ε.
 
-Rule: with batch normalization, observations pass in one minibatch with those that followed. These come from another
-distribution; passed alone, they would be normalized by other means (Bhatt et al. 2024).
+Rule: with batch normalization, observations and next observations pass in one minibatch. They come from different
+distributions; in separate minibatches they would be normalized by different means (Bhatt et al. 2024).
 """
 
 from __future__ import annotations
@@ -52,12 +52,12 @@ class Rainbow(DQN):
         return super().policy_spec(config, observation, action)
 
     def transitions(self, sample: Sample | SequenceSample) -> Transitions:
-        """See `OffPolicy`. Nothing is encoded yet: observations pass the encoder together with those that followed."""
+        """See `OffPolicy`. Nothing is encoded yet: observations and next observations pass the encoder together."""
         return OffPolicy.transitions(self, sample)
 
     @torch.no_grad()
     def targets(self, rows: Transitions) -> Tensor:
-        """The target returns [B, N]: Σ γⁱ r + γᵏ z, for the N quantiles z of Q′(s′, a′), where a′ is that of DQN."""
+        """The target returns [B, N]: Σ γⁱ r + γᵏ z, for the N quantiles z of Q′(s′, a′), where a′ is chosen as in DQN."""
         both = joint(rows)
         following = self.target.of_minibatch(*both)[len(rows.x) :]  # [B, N, n]
         chooses = self.net.of_minibatch(*both)[len(rows.x) :] if self.config.double else following
@@ -76,19 +76,19 @@ class Rainbow(DQN):
         """See `Algorithm.start_from`. Raises `UsageError` if only action values are known: they are means of quantiles."""
         if "statistics" not in start.state:
             raise UsageError(
-                "start_from: expected a run of rainbow with a checkpoint, got action values without the quantiles of which "
-                "they are means"
+                "start_from: expected a run of rainbow with a checkpoint, got action values without the quantiles whose "
+                "means they are"
             )
         super().start_from(start._replace(acting=len(self.net.flat)))
         self.net.statistics.copy_(start.state["statistics"])
 
 
 def joint(rows: Transitions) -> tuple[Tensor, list[Tensor]]:
-    """Features [2 B, D] and images [2 B, *leaf] of the observations, then of those that followed."""
+    """Features [2 B, D] and images [2 B, *leaf] of the observations, then of the next ones."""
     images = [torch.cat(both) for both in zip(rows.images, rows.next_images, strict=True)]
     return torch.cat((rows.x, rows.next_x)), images
 
 
 def of_actions(quantiles: Tensor, action: Tensor) -> Tensor:
-    """Those [B, N] of one action each [B], of the quantiles [B, N, n] of all actions."""
+    """The quantiles [B, N] of one action in each row [B], from those [B, N, n] of all actions."""
     return quantiles.take_along_dim(action[:, None, None], -1)[..., 0]

@@ -1,12 +1,12 @@
-"""Running mean and variance of observation features and of the discounted return: float64, numpy; tensors only in the state.
+"""Running mean and variance of observation features and of the discounted return: float64 in numpy, tensors in the state.
 
-Only valid rows count. The learner alone updates these; workers act with the float32 buffers that it publishes.
+Only valid rows count. Only the learner updates the statistics; workers act with the float32 buffers that it publishes.
 
-Rule: no single observation may hide the others. A value that is more than `FAR` standard deviations from the mean counts as
-one that is `CLIP` from it, which is what the policy sees of it. So failures of a sensor, below one row in a hundred, change
-the standard deviation little. A feature whose scale grows for good soon sets a new one, because its many far values count.
-Values that are not far count as they are, bit for bit. What is far among the first rows is known only when there are enough
-of them: until then they are kept.
+Rule: no single observation may hide the others. A value more than `FAR` standard deviations from the mean (a far value)
+counts as `CLIP` standard deviations from it, which is what the policy sees. So if a sensor fails in less than one row in a
+hundred, the standard deviation changes little. If the scale of a feature grows for good, its many far values soon set a new
+one. Other values count as they are, bit for bit. Which of the first rows are far is known only once there are enough: until
+then they are kept.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from millrace.protocol.specs import PolicySpec
 
 TINY = 1e-12  # a smaller standard deviation is rounding: the value did not vary
 FAR = 100.0  # standard deviations
-FEW = 100  # rows: before there are so many, the scale is not known
-ROUNDING_32 = 1e-6  # of float32: the same, as a fraction of the mean
+FEW = 100  # number of rows from which on the scale is known
+ROUNDING_32 = 1e-6  # of float32, as a fraction of the mean
 ROUNDING_64 = 1e-12  # of float64
 
 
@@ -38,7 +38,7 @@ class RunningMoments:
     """Mean and variance [*shape] of all rows so far, updated batch by batch (Chan, Golub and LeVeque 1979)."""
 
     def __init__(self, shape: tuple[int, ...] = (), rounding: float | Doubles = ROUNDING_32) -> None:
-        """`rounding` [*shape]: that of the dtype of the values."""
+        """`rounding` [*shape]: the relative rounding error of the values' dtype."""
         self.count = 0
         self._rounding = rounding
         self.mean: Doubles = np.zeros(shape)
@@ -59,7 +59,7 @@ class RunningMoments:
     def std(self) -> Doubles:
         """Standard deviation [*shape] of the population; 1 where the value never varied by more than rounding.
 
-        If the mean is so large that this rounding may be more than 1, it stands in place of 1.
+        If the mean is so large that its rounding may exceed 1, this rounding is returned in place of 1.
         """
         variance = self._squares / max(self.count, 1)
         rounding = self._rounding * abs(self.mean)
@@ -94,9 +94,9 @@ class ObservationNormalizer:
         return RunningMoments((len(self._is_wide),), np.where(self._is_wide, ROUNDING_64, ROUNDING_32))
 
     def inputs(self, leaves: Sequence[Array], published: Floats) -> tuple[Array, list[Array]]:
-        """Features [..., D] of leaves [..., *leaf], the same as a network takes them, and the images among the leaves.
+        """Features [..., D] of leaves [..., *leaf], as a network takes them, and the images among the leaves.
 
-        `published`: `buffers` as workers act with them, which may be older than what was counted.
+        `published`: the `buffers` that workers act with, which may be older than the newest statistics.
         """
         raw = self.raw(leaves)
         x = normalize(raw, *np.split(published, 2)) if self._enabled else raw
@@ -124,7 +124,7 @@ class ObservationNormalizer:
             self._update_with_first(rows)
 
     def _update_with_first(self, rows: Floats | Doubles) -> None:
-        """Count the rows [B, D] after which there are no longer few. 99 in 100 of all rows so far set the scale."""
+        """Count the rows [B, D] with which there are enough rows. The smallest 99 of 100 values so far set the scale."""
         so_far = np.concatenate([self._first, rows]) if len(self._first) else rows
         center = np.median(so_far, 0)
         spread = np.quantile(abs(so_far - center), 0.99, axis=0, method="lower")
@@ -139,8 +139,9 @@ class ObservationNormalizer:
     def buffers(self) -> Floats:
         """D means, then D standard deviations, float32, as published; empty if the policy does not normalize.
 
-        A wide feature may vary by less than its mean is rounded by, such as a time in seconds: its standard deviation is
-        that about the rounded mean, so that normalized values have a mean square of 1 and are not at the bounds.
+        A feature with a large mean, such as a time in seconds, may vary by less than the rounding of its mean. Its standard
+        deviation is taken about the rounded mean, so that normalized values have a mean square of 1 and are not at the
+        bounds.
         """
         if not self._enabled:
             return np.empty(0, np.float32)
@@ -168,7 +169,7 @@ def _bounded(rows: Floats | Doubles, center: Floats | Doubles, spread: Floats | 
     """The rows [B, D], with values that are far from the center [D] replaced; the same array if none is."""
     distance = rows - center.astype(rows.dtype)
     if (np.einsum("bd,bd->d", distance, distance) <= (FAR * spread) ** 2).all():
-        return rows  # most batches: the squares of all rows together are less than that of one far value
+        return rows  # most batches: the sum of all squares is smaller than the square of one far value
     far = abs(distance) > FAR * spread
     return np.where(far, center + np.copysign(CLIP * spread, distance), rows) if far.any() else rows
 
@@ -176,8 +177,8 @@ def _bounded(rows: Floats | Doubles, center: Floats | Doubles, spread: Floats | 
 class RewardScaler:
     """Divides rewards by the running standard deviation of the discounted return (Engstrom et al. 2020); no shift.
 
-    The return of each env copy continues from one rollout of its lane to the next. It starts at 0
-    with each episode and when a lane gets new env copies.
+    The return of each env copy continues from one rollout of its lane to the next. It starts at 0 with each episode and
+    whenever a lane gets new env copies.
     """
 
     def __init__(self, gamma: float) -> None:
@@ -197,7 +198,7 @@ class RewardScaler:
         return clipped
 
     def bounded(self, reward: Floats, bound: float) -> Floats:
-        """These rewards divided so that no discounted return so far exceeds the bound, and by `std` at least, float32."""
+        """These rewards divided so that no discounted return so far exceeds the bound, and at least by `std`, float32."""
         divided: Floats = (reward / max(self.std, self._largest / bound)).astype(np.float32)
         return divided
 

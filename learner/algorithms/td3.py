@@ -1,7 +1,7 @@
 """TD3 (Fujimoto et al. 2018): a deterministic actor, two critics, smoothed targets. `Continuous` has what SAC shares.
 
-The actor makes one gradient step for every `policy_delay` steps of the critics; the target networks move then. The update is
-`OffPolicy.update`, which calls `step` for each gradient step that is due.
+The actor makes one gradient step for every `policy_delay` steps of the critics; the target networks move at the same time.
+The update is `OffPolicy.update`, which calls `step` for each gradient step that is due.
 """
 
 from __future__ import annotations

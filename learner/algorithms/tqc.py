@@ -1,7 +1,7 @@
-"""TQC (Kuznetsov et al. 2020): SAC whose critics learn quantiles of the return, and whose targets leave out the highest.
+"""TQC (Kuznetsov et al. 2020): SAC whose critics learn quantiles of the return, and whose targets leave out the top ones.
 
-SAC takes the lower of two values, so that the actor does not exploit their errors. Here the quantiles of all critics
-together are cut off at the top, which can be done in finer steps.
+SAC takes the lower of two values, so that the actor doesn't exploit their errors. TQC pools the quantiles of all critics and
+drops the highest ones, which allows finer steps.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
-"""XQC (Palenicek et al. 2025): SAC whose loss is well conditioned, so that more is learned from each step.
+"""XQC (Palenicek et al. 2025): SAC with a better conditioned loss, so that it learns more from each step.
 
-Three things do that: batch normalization before each activation; weights of norm 1, so that steps of the optimizer turn them
-by the same angle, however large they would have grown; and critics that learn the probabilities of returns by cross-entropy,
-whose gradient is bounded. Rewards are scaled so that returns lie within the categories. `NormalizedSAC` has what CrossQ
-shares.
+It has three parts: batch normalization before each activation; weights of norm 1, so that an optimizer step turns them by an
+angle that doesn't shrink as weights grow; and critics that learn the probabilities of returns by cross-entropy, whose
+gradient is bounded. Rewards are scaled so that returns lie within the categories. `NormalizedSAC` has what CrossQ shares.
 """
 
 from __future__ import annotations
@@ -42,7 +41,7 @@ class XQC(NormalizedSAC):
             self.target_entropy = -0.5 * math.prod(policy.action.shape)
 
     def shapes(self) -> tuple[MLPShape, MLPShape]:
-        """Those of the actor and of the critics."""
+        """The shapes of the actor and of the critics."""
         relu = self.policy.activation == "relu"
         actor, critic = layer_sizes(self.policy, self.config.critic_net, self.config.atoms)
         return (
@@ -55,7 +54,7 @@ class XQC(NormalizedSAC):
         return ActorWithCritics(self.policy, *self.shapes(), self.categories.mean, device, self.seed)
 
     def scaled(self, reward: Floats) -> Floats:
-        """See `GradientDescent`: no discounted return so far is beyond `return_bound` after this."""
+        """See `GradientDescent`: scaled so that no discounted return so far exceeds `return_bound`."""
         if not self.config.normalize_rewards:
             return reward
         return self.rewards.bounded(reward, self.config.return_bound)
@@ -63,7 +62,8 @@ class XQC(NormalizedSAC):
     def target_distribution(self, rows: Transitions, next_logits: Tensor, next_log_prob: Tensor) -> Tensor:
         """The probabilities [B, O] of Σ γⁱ r + γᵏ (Z′ − α log π(a′|s′)) on the categories, without a gradient.
 
-        Z′ are the returns of s′ and a′ as that target critic of `next_logits` [2, B, O] distributes them which expects less.
+        Z′ has the distribution of the target critic with the lower expected return of s′ and a′. `next_logits` [2, B, O] are
+        the logits of both target critics.
         """
         pessimist = self.categories.mean(next_logits).argmin(0)
         probabilities = next_logits[pessimist, torch.arange(len(pessimist), device=pessimist.device)].softmax(-1)
@@ -80,7 +80,7 @@ class XQC(NormalizedSAC):
         return CriticLoss(loss, error, {"q_mean": values.mean(), "scaled_reward": rows.reward.mean()})
 
     def critic_loss(self, rows: Transitions) -> CriticLoss:
-        """See `cross_entropy` and `target_distribution`: critics and targets see s, a and s′, a′ in one minibatch each."""
+        """See `cross_entropy` and `target_distribution`: critics and targets each see s, a and s′, a′ in one minibatch."""
         joint = self.joint(rows)
         size = len(rows.x)
         with torch.no_grad():
@@ -89,5 +89,5 @@ class XQC(NormalizedSAC):
         return self.cross_entropy(rows, self.net.outputs(joint.x, joint.action)[:, :size], target)
 
     def move_target(self) -> None:
-        """See `NormalizedSAC`. Statistics of the targets count nowhere."""
+        """See `NormalizedSAC`. The targets' running statistics are not used."""
         self.target.critics.lerp_(self.net.critics, self.config.tau)

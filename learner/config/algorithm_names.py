@@ -1,8 +1,8 @@
-"""The algorithm that a run names: one of ours by its short name, or `module:Class` for one of the user's own.
+"""The algorithm that a run names: a built-in one by its short name, or your own as `module:Class`.
 
-Rules: a module of the user's is imported when the settings of its algorithm are first needed. What a class lacks is said
-then, in one line, before a worker or a run folder is made. A class that was given in Python and that no import finds again
-(of a notebook, of a function) is found in this process only.
+Rules: your module is imported when the settings of its algorithm are first needed. If the class lacks something, one line
+says so then, before a worker or a run folder is made. A class that you pass in Python and that can't be imported (because it
+is defined in a notebook or a function) is found in this process only.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ ALGORITHMS = {
     "crossq": "millrace.learner.algorithms.crossq:CrossQ",
     "xqc": "millrace.learner.algorithms.xqc:XQC",
 }
-"""`module:Class` of each algorithm of ours, imported when it is used"""
+"""`module:Class` of each built-in algorithm, imported when it is used"""
 
 NEEDED = (
     "__init__", "policy_spec", "update", "weights", "is_finite", "state_dict", "load_state_dict", "remember", "roll_back",
@@ -44,17 +44,17 @@ NEEDED = (
 """The methods of an algorithm, as `millrace.learner.algorithms.Algorithm` describes them"""
 
 FOR_PRIOR = ("add_prior", "learn_from_prior")
-"""The methods that an algorithm needs besides, in a run with prior data"""
+"""The methods that an algorithm needs in addition in a run with prior data"""
 
 NOT_SETTINGS = {"config", "preset", "resume", "log_json", "debug", "progress"}
 """Flags and arguments of `millrace train` and `millrace.train` that are not settings"""
 
 _given: dict[str, type] = {}
-"""The classes that were given in Python and that no import finds again, by name. The newest of a name counts."""
+"""The classes that were passed in Python and can't be imported, by name. The newest one of a name counts."""
 
 
 def is_own(algo: str) -> bool:
-    """Whether this names an algorithm of the user's own."""
+    """Whether this is the name of a user-defined algorithm."""
     return ":" in algo
 
 
@@ -70,12 +70,12 @@ def settings_record(algo: str) -> type[AlgorithmConfig]:
 
 
 def own_class(name: str) -> Any:
-    """The user's class that is called so. Imports its module. Raises `UsageError` if it is not there, or lacks something."""
+    """The user-defined class of this name. Imports its module. Raises `UsageError` if it isn't there, or lacks something."""
     return _checked(name, _given[name] if name in _given else _found(name))
 
 
 def name_of(algorithm: type) -> str:
-    """The name of a class, for `Config.algo`: under it this process finds the class again, and other processes if they can.
+    """The name of a class, for `Config.algo`. This process finds the class by it, and so do others if they can import it.
 
     Raises `UsageError` if the class lacks something.
     """
@@ -98,13 +98,13 @@ def name_of(algorithm: type) -> str:
 
 
 def moved(before: str, now: str) -> bool:
-    """Whether a run of the algorithm `before` may go on as one of `now`: the same class, which an import finds now."""
+    """Whether a run of the algorithm `before` may continue as one of `now`: the same class, which can be imported now."""
     module, _, qualname = before.partition(":")
     return (module == "__main__" or "<locals>" in qualname) and is_own(now) and last_part(before) == last_part(now)
 
 
 def with_algorithm(table: dict[str, Any], algo: str | None) -> dict[str, Any]:
-    """The settings of a config.toml under the name that its algorithm has now, if it is another one."""
+    """The settings of a config.toml, with the algorithm's current name in place of an earlier one."""
     before = str(table.get("algo"))
     if not algo or algo == before or not moved(before, algo):
         return table
@@ -117,7 +117,7 @@ def _found(name: str) -> object:
         named = attribute(sys.modules.get(module_name), qualname)
         if named is None:
             raise UsageError(
-                f"algo {name}: this class was made in a script, a notebook or a function; go on with it there: "
+                f"algo {name}: this class is defined in a script, a notebook or a function; continue there: "
                 f"millrace.train(resume=…, algo={last_part(name)}), or put it into a module: --algo module:{last_part(name)}"
             )
         return named
@@ -177,7 +177,7 @@ def _what_is_wrong_with_settings(record: type[AlgorithmConfig]) -> str:
 
 
 def _why_not_plain(record: type[AlgorithmConfig], setting: str) -> str:
-    """Why the default of a setting cannot stand in config.toml; empty if it can."""
+    """Why config.toml can't hold the default of a setting; empty if it can."""
     default = getattr(record(), setting)
     try:
         plain: Mapping[str, Any] = {} if default is None else {setting: msgspec.to_builtins(default)}

@@ -25,7 +25,7 @@ class RunFlags(Config, frozen=True, kw_only=True):
     environment. auto: the preset of ENV, if there is one. none: no preset.
     """
     resume: Annotated[Path | None, Flag("PATH")] = None
-    """Continue this run folder from its newest checkpoint. auto: continue the newest run in --run-dir with the same ENV,
+    """Continue this run from its newest checkpoint. auto: continue the newest run in --run-dir with the same ENV,
     --algo and --seed, or start a new run if there is none. Some settings cannot change then: see docs/how-to/resume.md.
     """
     log_json: bool = False
@@ -55,9 +55,9 @@ GROUPS = {
         "log_json",
     ),
 }  # fmt: skip
-"""The settings of each group, by its title. Before them come `BASIC` and the settings of the algorithm."""
+"""The settings of each group, by its title. `BASIC` and the settings of the algorithm precede them."""
 LAYERS = ("config", "preset", "resume", "log_json")
-"""Flags that are no settings: they say where settings come from, or how logs look."""
+"""Flags that aren't settings: they say where settings come from, or how logs look."""
 DESCRIPTIONS = {
     "train": "Train a policy on this machine. Flags override --config and presets.",
     "learner": "Listen at --bind and train with the workers that connect. Flags override --config and presets.",
@@ -88,7 +88,7 @@ def read_config(command: str, argv: list[str]) -> tuple[Config, Path | None]:
 
 
 def _read_flags(command: str, argv: list[str], typed: list[Typed], lower: LowerLayers) -> Config:
-    """The settings: the flags above the other layers, which say by their algorithm which flags there are."""
+    """The settings: the flags on top of the other layers. The algorithm that these layers name decides which flags exist."""
     own = fields_of(settings_record(lower.algo))
     fields = fields_of(RunFlags) | own
     given = given_values(fields, typed, command, partial(in_place_of, known=fields, flag=True))

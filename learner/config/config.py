@@ -1,8 +1,8 @@
 """All settings of a run, in one record. The texts under the fields are the help of the command line. Pure.
 
-Here is how a run learns. Its base, `RolloutConfig` (learner/config/rollout_config.py), has the settings of collecting
-rollouts: the environment, workers, env copies, lanes, timeouts and the transport. How the settings of a run are put
-together from presets, files and flags: learner/config/layers.py. The groups that `--help` shows: `GROUPS` in
+This file has the settings of learning. The base, `RolloutConfig` (learner/config/rollout_config.py), has the settings of
+collecting rollouts: the environment, workers, env copies, lanes, timeouts and the transport. How the settings of a run are
+put together from presets, files and flags: learner/config/layers.py. The groups that `--help` shows: `GROUPS` in
 learner/config/command_line.py.
 """
 
@@ -40,13 +40,13 @@ class Config(RolloutConfig, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     """Env steps to train for, summed over all env copies. Training ends before an update that would exceed them."""
     start_from: Annotated[Fixed[str], Flag("PATH", alias="from")] = ""
     """Start from the policy of this run folder in place of random weights, with its statistics of observations and rewards.
-    A folder with policy.json and policy.safetensors alone does as well. All other settings are those of the new run, and
-    schedules start anew. A resumed run does not read the folder again: see docs/how-to/resume.md.
+    A folder with only policy.json and policy.safetensors will do. All other settings are those of the new run, and schedules
+    start anew. A resumed run doesn't read the folder again: see docs/how-to/resume.md.
     """
     from_parts: Fixed[Literal["auto", "policy", "best", "critic", "all"]] = "auto"
     """What `--from` takes. policy: the newest policy and the statistics. best: the policy of the best evaluation. critic:
     also the critic, the target networks and the temperature. all: also the optimizers. A replay buffer is never taken.
-    auto: critic with sac and td3, whose actor follows the critic at once, if the run has a checkpoint; else policy.
+    auto: critic with sac and td3 if the run has a checkpoint, because their actors follow the critic at once; else policy.
     """
     device: Free[Literal["auto", "cpu", "cuda"]] = "auto"
     """Device of the learner. auto: cuda if PyTorch finds a GPU, else cpu."""
@@ -62,18 +62,18 @@ class Config(RolloutConfig, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     eval_every: Free[Natural] = 0
     """Env steps between evaluations during training. 0: evaluate only at the end."""
     eval_workers: Free[Natural] = 0
-    """Number of workers that only evaluate, so that training goes on meanwhile: train starts them, beside workers; a learner
-    waits for none, and takes those that `millrace worker --evaluate` starts. The result counts at the next evaluation, or at
-    the end, where the learner waits for it. If no such worker is left by then, the others play. 0: all workers evaluate,
-    and training waits.
+    """Number of workers that only evaluate, so that training goes on meanwhile: train starts them in addition to workers; a
+    learner doesn't wait for any, and uses those that `millrace worker --evaluate` starts. The result counts at the next
+    evaluation, or at the end, when the learner waits for it. If no such worker is left by then, the others play. 0: all
+    workers evaluate, and training waits.
     """
     eval_copies: Free[Annotated[int, Meta(ge=1, le=MAX_SEEDS)]] = 4
-    """Number of evaluation episodes that a worker plays at the same time, on env copies of their own. The last bits of
-    results may depend on this number. Results do not depend on the number of workers.
+    """Number of evaluation episodes that a worker plays at the same time, each on its own env copy. The last bits of results
+    may depend on this number. Results do not depend on the number of workers.
     """
     eval_max_steps: Free[Count] = 1_000_000
     """Largest number of env steps of one evaluation. Each episode gets an equal share: with 100 episodes, an episode that
-    reaches 10000 steps is cut. It counts with its return up to that step, and the result says how many were cut.
+    reaches 10000 steps is cut. Its return up to that step counts, and the result says how many were cut.
     """
     target_return: Free[float | None] = None
     """Stop as soon as the mean return of an evaluation is at least this. Needs eval_every."""
@@ -83,51 +83,50 @@ class Config(RolloutConfig, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     # ---------------------------------------------------------------------------------------------------------- self-play
 
     self_play: Fixed[Natural] = 0
-    """Self-play: of an environment of several agents, the policy plays one team, and opponents play the others. They are
-    drawn from so many earlier versions of the policy, the newest snapshots. 0: it plays all agents, or meets opponents
-    alone.
+    """Self-play in an environment of several agents: the policy plays one team, and opponents play the others. They are
+    drawn from this many snapshots of the policy, the newest ones. 0: the policy plays all agents, or meets only opponents.
     """
     self_play_save_steps: Free[Count] = 20_000
     """Env steps between two snapshots."""
     self_play_latest: Free[Annotated[float, Meta(ge=0, le=1)]] = 0.5
-    """Share of the rollouts in which the policy meets itself, as it is then, in place of an earlier version."""
+    """Share of the rollouts in which the policy plays against its newest version instead of a snapshot."""
     opponents: Annotated[Fixed[tuple[str, ...]], Flag("MODULE:FACTORY ...")] = ()
-    """Opponents of your own, which are drawn as the snapshots are, and which evaluations are played against. Without
-    self_play the policy meets them alone. docs/how-to/self_play.md shows what the factory returns.
+    """Your own opponents. They are drawn like the snapshots, and evaluations are played against them. Without self_play the
+    policy meets only them. docs/how-to/self_play.md shows what the factory returns.
     """
     teams: Annotated[Fixed[tuple[str, ...]], Flag("PATTERN ...")] = ()
-    """The teams, all of one size: a pattern of the names of the agents of each, as in "red_*" "blue_*". Without any, each
-    agent is a team. In different env copies, the policy plays different teams.
+    """The teams, all of the same size: for each a pattern of its agents' names, as in "red_*" "blue_*". Default: each agent
+    is a team. In different env copies, the policy plays different teams.
     """
 
     # ---------------------------------------------------------------------------------------------- the learner's process
 
     inference: Free[Literal["workers", "learner"]] = "workers"
-    """Where the policy acts. workers: in each worker. learner: in one place beside the learner, for all env copies at once;
-    workers then only step the environments.
+    """Where the policy acts. workers: in each worker. learner: in a thread of the learner's process, for all env copies at
+    once; workers then only step the environments.
     """
     torch_threads: Free[Count | None] = None
-    """Number of PyTorch threads in the learner. none: chosen when the run starts, and kept in its config.toml. The
-    choice is 1; with images, an encoder or a layer of 512 x 512 weights it is one for each 34 million multiply-adds of a
-    pass of a minibatch, at most one for each core. If max_lag is above 0, one core is then left to each local worker, unless
-    this would leave half of the cores or less to the learner. Another number changes the last bits of results.
+    """Number of PyTorch threads in the learner. none: chosen when the run starts, and kept in its config.toml. The choice is
+    1; with images, an encoder or a layer of 512 x 512 weights it is one for each 34 million multiply-adds of a minibatch's
+    forward pass, at most one for each core. If max_lag is above 0, each local worker then keeps one core, unless this would
+    leave half of the cores or less to the learner. Another number changes the last bits of results.
     """
 
     grace_s: Free[NotNegative] = 30.0
     """Seconds from SIGTERM, SIGHUP or Ctrl-C to the end of the process. The current update gets at most half of them; then
-    it is undone, and the state before it is saved. 0: wait until the update has ended.
+    it is undone, and the state before it is saved. 0: wait for the update, however long it takes.
     """
 
     callbacks: Annotated[Free[tuple[str, ...]], Flag("MODULE:FACTORY ...")] = ()
-    """Callbacks of your own, such as my_module:factory. The learner calls them between updates.
+    """Your own callbacks, such as my_module:factory. The learner calls them between updates.
     docs/how-to/callbacks.md describes them.
     """
 
     # -------------------------------------------------------------------------------------------------------------- files
 
     checkpoint_every_s: Free[NotNegative] = 60.0
-    """Seconds between checkpoints. The first one is written after the first update, and one before each evaluation. 0: after
-    each update.
+    """Seconds between checkpoints. There is also one after the first update and one before each evaluation. 0: after each
+    update.
     """
     keep_checkpoints: Free[Count] = 3
     """Number of checkpoints to keep, the newest ones."""

@@ -1,6 +1,6 @@
-"""What will cost a run much time, in lines for the user before it starts. Pure: settings and shapes in, a line out.
+"""Warnings, before a run starts, about what will take much time. Pure: settings and shapes in, a line out.
 
-Rule: a line gives the number and what makes it smaller. It is empty where the cost is usual.
+Rule: a line gives the cost and how to reduce it. It is empty if the cost is usual.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from millrace.protocol.policy.arithmetic import multiply_adds
 from millrace.protocol.specs import PolicySpec
 
 MANY_MULTIPLY_ADDS = 1 << 24  # of one observation; Atari's four frames of 84 x 84 take half of it
-PASSES = 3  # a gradient costs twice as much as the pass forward
+PASSES = 3  # a backward pass costs twice as much as the forward pass
 
 
 def minibatch_rows(config: Config) -> int:
-    """Number of rows of a minibatch, by the settings: all rows of an update if none divides them."""
+    """Number of rows of a minibatch: all rows of an update if no setting divides them into minibatches."""
     batch_size = getattr(config.algorithm, "batch_size", None)
     if isinstance(batch_size, int):
         return batch_size
@@ -37,7 +37,7 @@ def large_observations(config: Config, policy: PolicySpec) -> str:
     smaller = (
         '--wrappers "gymnasium.wrappers:ResizeObservation(shape=(84, 84))"'
         if any(leaf.is_image for leaf in policy.observation)
-        else "a wrapper that keeps the numbers which matter, or a smaller --net"
+        else "a wrapper that drops the numbers that don't matter, or a smaller --net"
     )
     return (
         f"an observation of {config.env} has {numbers:,} numbers, so a minibatch of {rows:,} takes "

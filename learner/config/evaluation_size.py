@@ -8,7 +8,7 @@ from millrace.learner.config.config import Config
 
 MOST_EPISODES = 100  # of an evaluation whose number of episodes is not set
 FEWEST_EPISODES = 10
-LONGEST_EPISODE = 10  # its episodes are cut after so many times the mean length of training, if there is no time limit
+LONGEST_EPISODE = 10  # times the mean episode length of training: there episodes are cut if there is no time limit
 
 
 class EvaluationSize(NamedTuple):
@@ -29,9 +29,9 @@ def final_evaluation_size(
 ) -> EvaluationSize:
     """The size of the evaluation after training.
 
-    `env_steps`: of the training. `episode_length`: mean length of its last episodes, in env steps; None if none has
-    ended. `time_limit`: env steps after which the environment truncates an episode of an evaluation, if it does. The
-    size depends on these counts, and not on seconds, so that the result of a run is always the same.
+    `env_steps`: number of env steps of the training. `episode_length`: mean length of its last episodes, in env steps; None
+    if none has ended. `time_limit`: number of env steps after which the environment truncates an episode of an evaluation,
+    if it does. The size depends on these counts, and not on seconds, so that the result of a run is always the same.
     """
     if config.eval_episodes is not None or config.eval_every:
         return evaluation_size(config)
@@ -43,5 +43,5 @@ def final_evaluation_size(
     episodes = min(max(int(budget / max(length, 1.0)), FEWEST_EPISODES), MOST_EPISODES)
     if time_limit is not None:
         return EvaluationSize(episodes, most)
-    # A greedy policy may last for ever where the policies of training did not.
+    # An episode of a greedy policy may never end, even if those of training did.
     return EvaluationSize(episodes, min(most, max(budget, int(LONGEST_EPISODE * episodes * length))))

@@ -1,7 +1,7 @@
 """The settings (hyperparameters) of each algorithm. The texts under the fields are the help of the command line.
 
-Plain data, apart from the algorithms, so that reading a command line needs no torch. An algorithm of the user's own has its
-record as its attribute `Config` (learner/config/algorithm_names.py).
+Plain data, separate from the algorithms, so that reading a command line needs no torch. Your own algorithm has its record in
+its attribute `Config` (learner/config/algorithm_names.py).
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ Optimizer = Literal["rmsprop", "adam"]
 class AlgorithmConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Settings that every algorithm has. The record of each algorithm derives from this one.
 
-    Every field has a default. Its type says which values are allowed, and what becomes of another value when a run is
-    resumed: `Free[...]`, `Adaptable[...]` or `Fixed[...]` (learner/config/resume_rules.py).
+    Every field has a default. Its type says which values are allowed, and whether a resumed run may change the value:
+    `Free[...]`, `Adaptable[...]` or `Fixed[...]` (learner/config/resume_rules.py).
     """
 
     rollout_steps: Free[Count] = 128
-    """T, the steps of each env copy in a rollout."""
+    """T, the number of steps of each env copy in a rollout."""
     net: Fixed[tuple[Count, ...]] = (64, 64)
-    """Sizes of the hidden layers: of the actor and of the critic each, or of the Q-network."""
+    """Sizes of the hidden layers, of the actor and of the critic alike, or of the Q-network."""
     activation: Fixed[Literal["tanh", "relu"]] = "tanh"
     """Activation function of the hidden layers."""
     encoder: Fixed[str | None] = None
@@ -66,8 +66,8 @@ class PolicyGradientConfig(AlgorithmConfig, frozen=True):
     normalize_rewards: Fixed[bool] = False
     """Divide rewards by the running standard deviation of the discounted return, and clip them to ±10."""
     clone_epochs: Free[Natural] = 0
-    """Number of epochs of cloning on the dataset of --prior, before the first rollouts are collected: the actor learns its
-    actions, the critic its returns. Needs --prior.
+    """Number of epochs of cloning on the dataset of --prior, before the first rollouts are collected: the actor learns the
+    dataset's actions, the critic its returns. Needs --prior.
     """
 
 
@@ -86,7 +86,7 @@ class ActorCriticConfig(RecurrentConfig, frozen=True):
     """Settings of an actor-critic with generalized advantage estimation and several epochs of minibatches."""
 
     batch_size: Free[Count] = 64
-    """Largest number of rows (steps of one env copy) in a minibatch. With core, whole sequences may be more."""
+    """Largest number of rows (steps of one env copy) in a minibatch. With core, whole sequences may exceed it."""
     n_epochs: Free[Count] = 10
     """Number of epochs: how often an update uses each row."""
     gae_lambda: Free[Fraction] = 0.95
@@ -105,7 +105,7 @@ class PPOConfig(ActorCriticConfig, frozen=True):
     normalize_rewards: Fixed[bool] = True
     """Divide rewards by the running standard deviation of the discounted return, and clip them to ±10."""
     clip_range: Free[Positive] = 0.2
-    """ε of the clipped objective: the ratio of new to old action probability is clipped to 1 ± ε."""
+    """ε of the clipped objective: the ratio of the new to the old action probability is clipped to 1 ± ε."""
     clip_range_schedule: Free[Schedule] = "constant"
     """linear: clip_range falls to zero over the run."""
     clip_range_vf: Free[Positive | None] = None
@@ -118,7 +118,7 @@ class A2CConfig(RecurrentConfig, frozen=True):
     """Advantage actor-critic: one gradient step on each batch (Mnih et al. 2016)."""
 
     rollout_steps: Free[Count] = 8
-    """T, the steps of each env copy in a rollout."""
+    """T, the number of steps of each env copy in a rollout."""
     learning_rate: Free[Positive] = 7e-4
     """Learning rate of the optimizer."""
     optimizer: Fixed[Optimizer] = "rmsprop"
@@ -130,10 +130,10 @@ class A2CConfig(RecurrentConfig, frozen=True):
 
 
 class IMPALAConfig(RecurrentConfig, frozen=True):
-    """Actor-critic with V-trace, which corrects for rollouts of older weights, max_lag above 0 (Espeholt et al. 2018)."""
+    """Actor-critic with V-trace, which corrects for rollouts of older weights (max_lag above 0; Espeholt et al. 2018)."""
 
     rollout_steps: Free[Count] = 32
-    """T, the steps of each env copy in a rollout."""
+    """T, the number of steps of each env copy in a rollout."""
     learning_rate: Free[Positive] = 7e-4
     """Learning rate of the optimizer."""
     optimizer: Fixed[Optimizer] = "rmsprop"
@@ -149,7 +149,9 @@ class IMPALAConfig(RecurrentConfig, frozen=True):
     learned values are to those of the newest policy (without clipping: exactly those).
     """
     c_bar: Free[Positive] = 1.0
-    """c̄ of V-trace: importance weights of traces are clipped to this. It decides how far back a TD error has effect."""
+    """c̄ of V-trace: importance weights of traces are clipped to this. It decides how far back the effect of a TD error
+    reaches.
+    """
 
 
 class REINFORCEConfig(PolicyGradientConfig, frozen=True):
@@ -166,19 +168,20 @@ class REINFORCEConfig(PolicyGradientConfig, frozen=True):
     baseline: Free[bool] = True
     """Subtract the value that the critic predicts from the return."""
     normalize_returns: Free[bool] = True
-    """Normalize the returns of each batch (less the baseline) to mean 0 and standard deviation 1."""
+    """Normalize the returns of each batch (minus the baseline) to mean 0 and standard deviation 1."""
 
 
 class OffPolicyConfig(AlgorithmConfig, frozen=True):
     """Settings of every algorithm that learns from a replay buffer."""
 
     rollout_steps: Free[Count] = 32
-    """T, the steps of each env copy in a rollout."""
+    """T, the number of steps of each env copy in a rollout."""
     activation: Fixed[Literal["tanh", "relu"]] = "relu"
     """Activation function of the hidden layers."""
     core: Fixed[Literal["lstm", "gru"] | None] = None
     """Recurrent layer in front of the hidden layers. A gradient step then takes whole sequences: the rollout_steps steps of
-    an env copy, after its rollout before, in which the layer warms up. Actor and critics share it, and critics train it.
+    an env copy, preceded by its previous rollout as burn-in. Actor and critics share the layer, and the critics' loss trains
+    it.
     """
     core_size: Fixed[Count] = 64
     """Number of units of the recurrent layer."""
@@ -187,42 +190,42 @@ class OffPolicyConfig(AlgorithmConfig, frozen=True):
     learning_rate_schedule: Free[Schedule] = "constant"
     """linear: the learning rate falls to zero over the run."""
     batch_size: Free[Count] = 64
-    """Number of transitions in a gradient step. With core, as many sequences as have this number, but at least 16."""
+    """Number of transitions in a gradient step. With core, it takes as many sequences as have this many, but at least 16."""
     learning_starts: Free[Natural] = 1000
     """Number of env steps before the first gradient step."""
     replay_size: Fixed[Count] = 100_000
     """Capacity of the replay buffer in transitions; the newest are kept. The final observation of a truncated episode takes
-    the place of one.
+    the place of a transition.
     """
     priority_alpha: Fixed[Fraction] = 0.0
-    """α of prioritized replay: how far its last TD error decides how often a transition is drawn from the replay buffer.
-    0: not at all. 1: in proportion. Schaul et al. 2016 use 0.6.
+    """α of prioritized replay: how much the probability that a transition is drawn depends on its last TD error. 0: not at
+    all. 1: in proportion. Schaul et al. 2016 use 0.6.
     """
     priority_beta: Free[Fraction] = 0.4
-    """Initial β of prioritized replay: how far importance weights correct the bias. It grows to 1 (fully) over the run."""
+    """Initial β of prioritized replay: how much importance weights correct the bias. It grows to 1 (fully) over the run."""
     prior_share: Free[Fraction] = 0.5
     """Share of each minibatch that is prior data, in a run with --prior (Ball et al. 2023 use 0.5)."""
     prior_steps: Free[Natural] = 0
     """Number of gradient steps on prior data alone, before the first rollouts are collected. Needs --prior."""
     hindsight: Fixed[Fraction] = 0.0
-    """Hindsight experience replay: the share of the transitions of a minibatch whose goal is replaced by one that was
-    achieved later in their episode. 0: off. Andrychowicz et al. 2017 use 0.8. Needs observations with achieved_goal and
+    """Hindsight experience replay: the share of the transitions of a minibatch whose goal is replaced by a goal that was
+    achieved later in the episode. 0: off. Andrychowicz et al. 2017 use 0.8. Needs observations with achieved_goal and
     desired_goal, and goal_reward.
     """
     goal_reward: Annotated[Free[str | None], Flag("NAME")] = None
     """How the environment computes rewards from achieved and desired goals, for hindsight. sparse:0.05: 0 within this
-    distance of the goal, else -1. success:0.45: 1 within this distance, else 0. dense: minus the distance. Or a function of
-    your own, such as my_module:reward, of two arrays [B, G], which returns an array [B].
+    distance of the goal, else -1. success:0.45: 1 within this distance, else 0. dense: minus the distance. Or your own
+    function of two arrays [B, G] that returns an array [B], such as my_module:reward.
     """
     goal_ends: Free[Positive | None] = None
-    """The distance from its goal at which a task ends, for hindsight. none: it does not end at its goal."""
+    """The distance from the goal at which an episode terminates, for hindsight. none: it doesn't terminate at its goal."""
     n_step: Free[Count] = 1
-    """Number of rewards in a target before it bootstraps; those of one agent, in its own time, if there are several."""
+    """Number of rewards in a target before it bootstraps. With several agents, each agent's own steps count."""
     tau: Free[Annotated[float, msgspec.Meta(gt=0, le=1)]] = 0.005
     """τ of the polyak update: the fraction by which the target network moves in each gradient step."""
     normalize_rewards: Fixed[bool] = False
     """Divide rewards by the running standard deviation of the discounted return, when they are drawn from the buffer, and
-    clip them to ±10; with n_step, the sum of n rewards.
+    clip them to ±10; with n_step, this clips the sum of n rewards.
     """
 
 
@@ -240,12 +243,12 @@ class QLearningConfig(OffPolicyConfig, frozen=True):
     double: Free[bool] = True
     """Double Q-learning: the network chooses the next action, and the target network values it."""
     dueling: Fixed[bool] = False
-    """Dueling network: an action value is the state's value plus the action's advantage over the mean."""
+    """Dueling network: an action value is the value of the state plus the action's advantage minus the mean advantage."""
     target_every: Free[Count] = 250
     """Number of gradient steps between two updates of the target network."""
     tau: Free[Annotated[float, msgspec.Meta(gt=0, le=1)]] = 1.0
-    """Fraction by which an update moves the target network. 1: it becomes a copy of the network. With a small one, such as
-    0.005, take target_every 1 (polyak averaging).
+    """Fraction by which an update moves the target network. 1: it becomes a copy of the network. With a small fraction, such
+    as 0.005, take target_every 1 (polyak averaging).
     """
     epsilon_start: Free[Fraction] = 1.0
     """Initial probability ε of a random action."""
@@ -254,8 +257,8 @@ class QLearningConfig(OffPolicyConfig, frozen=True):
     epsilon_schedule: Free[Literal["linear", "exponential"]] = "linear"
     """How ε falls from its initial to its final value."""
     epsilon_steps: Free[Count] = 10_000
-    """Number of env steps, summed over all env copies, over which ε falls. exponential: until its distance to the final
-    value is 1/e of the initial distance.
+    """Number of env steps, summed over all env copies, over which ε falls. With exponential: until the distance to its final
+    value is 1/e of what it was.
     """
     max_grad_norm: Free[Positive | None] = None
     """Clip the norm of the gradient to this. none: no clipping."""
@@ -274,7 +277,7 @@ class RainbowConfig(QLearningConfig, frozen=True):
     """Rainbow (Hessel et al. 2018), which learns quantiles of the return (Dabney et al. 2018), without noisy networks."""
 
     rollout_steps: Free[Count] = 8
-    """T, the steps of each env copy in a rollout."""
+    """T, the number of steps of each env copy in a rollout."""
     net: Fixed[tuple[Count, ...]] = (128, 128)
     """Sizes of the hidden layers of the Q-network."""
     learning_rate: Free[Positive] = 5e-4
@@ -282,17 +285,17 @@ class RainbowConfig(QLearningConfig, frozen=True):
     learning_rate_schedule: Free[Schedule] = "linear"
     """linear: the learning rate falls to zero over the run."""
     priority_alpha: Fixed[Fraction] = 0.5
-    """α of prioritized replay: how far its last TD error decides how often a transition is drawn from the replay buffer.
-    0: not at all. 1: in proportion.
+    """α of prioritized replay: how much the probability that a transition is drawn depends on its last TD error. 0: not at
+    all. 1: in proportion.
     """
     n_step: Free[Count] = 3
-    """Number of rewards in a target before it bootstraps; those of one agent, in its own time, if there are several."""
+    """Number of rewards in a target before it bootstraps. With several agents, each agent's own steps count."""
     quantiles: Fixed[Annotated[int, msgspec.Meta(ge=2)]] = 16
     """Number of quantiles of the return that are learned for each action."""
     batch_norm: Fixed[bool] = True
     """Batch normalization of the inputs and in front of each activation of the hidden layers (Bhatt et al. 2024)."""
     dueling: Fixed[bool] = True
-    """Dueling network: an action value is the state's value plus the action's advantage over the mean."""
+    """Dueling network: an action value is the value of the state plus the action's advantage minus the mean advantage."""
     target_every: Free[Count] = 1
     """Number of gradient steps between two updates of the target network."""
     tau: Free[Annotated[float, msgspec.Meta(gt=0, le=1)]] = 0.005
@@ -307,25 +310,26 @@ class ContinuousConfig(OffPolicyConfig, frozen=True):
     """Settings of SAC and TD3: the defaults of Stable-Baselines3, except for TD3's network and exploration noise."""
 
     rollout_steps: Free[Count] = 8
-    """T, the steps of each env copy in a rollout."""
+    """T, the number of steps of each env copy in a rollout."""
     net: Fixed[tuple[Count, ...]] = (256, 256)
     """Sizes of the hidden layers: of the actor and of each critic."""
     batch_size: Free[Count] = 256
-    """Number of transitions in a gradient step. With core, as many sequences as have this number, but at least 16."""
+    """Number of transitions in a gradient step. With core, it takes as many sequences as have this many, but at least 16."""
     learning_starts: Free[Natural] = 100
     """Number of env steps before the first gradient step. Until then, actions are drawn uniformly."""
     replay_size: Fixed[Count] = 1_000_000
     """Capacity of the replay buffer in transitions; the newest are kept. The final observation of a truncated episode takes
-    the place of one.
+    the place of a transition.
     """
     clone_epochs: Free[Natural] = 0
-    """Number of epochs of cloning on the dataset of --prior, before prior_steps and the first rollouts: the actor learns its
-    actions. Needs --prior.
+    """Number of epochs of cloning on the dataset of --prior, before prior_steps and the first rollouts: the actor learns the
+    dataset's actions. Needs --prior.
     """
     updates_per_step: Free[Annotated[float, msgspec.Meta(gt=0, le=1e6)]] = 1.0
-    """Replay ratio: gradient steps for each env step after learning_starts. It is exact, whatever the rollouts are."""
+    """Replay ratio: gradient steps for each env step after learning_starts. It is exact, whatever the size of the rollouts.
+    """
     random_shift: Free[Annotated[int, msgspec.Meta(ge=0, le=64)]] = 4
-    """Pixels by which images are moved at random, at most, each time a gradient step takes them (DrQ-v2). It doesn't concern
+    """Largest random shift of images, in pixels, each time they are in a minibatch (DrQ-v2). It has no effect on
     observations without images.
     """
 
@@ -336,7 +340,7 @@ class SACConfig(ContinuousConfig, frozen=True):
     ent_coef: Fixed[Positive | None] = None
     """Temperature α: the weight of the entropy. none: learned, so that the entropy stays near target_entropy."""
     target_entropy: Free[float | None] = None
-    """The entropy that a learned temperature aims at. none: minus the number of the action's elements."""
+    """The entropy that a learned temperature aims at. none: minus the dimension of the action."""
 
 
 class TQCConfig(SACConfig, frozen=True):
@@ -347,7 +351,7 @@ class TQCConfig(SACConfig, frozen=True):
     quantiles: Fixed[Count] = 25
     """Number of quantiles that each critic learns."""
     dropped_quantiles: Free[Natural] = 2
-    """Number of quantiles for each critic that targets leave out, the highest, so that values are not overestimated."""
+    """Number of the highest quantiles, for each critic, that targets leave out, so that values are not overestimated."""
 
 
 class NormalizedConfig(SACConfig, frozen=True):
@@ -360,7 +364,7 @@ class NormalizedConfig(SACConfig, frozen=True):
     learning_starts: Free[Natural] = 5000
     """Number of env steps before the first gradient step. Until then, actions are drawn uniformly."""
     policy_delay: Free[Count] = 3
-    """Number of gradient steps of the critics for each one of the actor and of the temperature."""
+    """Number of gradient steps of the critics for each step of the actor and of the temperature."""
 
 
 class CrossQConfig(NormalizedConfig, frozen=True):
@@ -382,7 +386,7 @@ class XQCConfig(NormalizedConfig, frozen=True):
     return_bound: Fixed[Positive] = 5.0
     """Largest return, in units of scaled reward, that a critic can learn."""
     normalize_rewards: Fixed[bool] = True
-    """Divide rewards by the running standard deviation of the discounted return, and by so much that no discounted return so
+    """Divide rewards by the running standard deviation of the discounted return, or by more, so that no discounted return so
     far exceeds return_bound.
     """
 
@@ -395,7 +399,7 @@ class TD3Config(ContinuousConfig, frozen=True):
     exploration_noise: Free[NotNegative] = 0.1
     """Standard deviation of the noise that workers add to actions, which are in [-1, 1]."""
     policy_delay: Free[Count] = 2
-    """Number of gradient steps of the critics for each one of the actor and of the target networks."""
+    """Number of gradient steps of the critics for each step of the actor and of the target networks."""
     target_noise: Free[NotNegative] = 0.2
     """Standard deviation of the noise that is added to the actions of targets."""
     target_noise_clip: Free[NotNegative] = 0.5

@@ -1,11 +1,12 @@
-"""The layers that a run's settings come from, merged and made one record. Pure but for reading TOML files.
+"""The layers that a run's settings come from, merged into one record. Pure except for reading TOML files.
 
 From the weakest to the strongest: the defaults of the records, the preset of (algorithm, environment), a named preset, a
 TOML file, flags or keyword arguments. A setting has one name everywhere: the field `learning_rate` is the TOML key
-`learning_rate` and the flag `--learning-rate`. The settings of the algorithm stand in a TOML table named after it, as [ppo].
+`learning_rate` and the flag `--learning-rate`. The settings of the algorithm are in a TOML table named after it, such as
+[ppo].
 
-Rule: a layer is a dictionary, and says where it is from. Layers are merged as they are, and become a record once, so that
-each value is checked once, and what is wrong is said of the layer that has it.
+Rule: a layer is a dictionary that knows its source. Layers are merged as dictionaries and converted to a record once, so
+that each value is checked once, and an error names the layer that the value comes from.
 """
 
 from __future__ import annotations
@@ -34,18 +35,18 @@ ALL_BUT_TABLES = {*Config.__struct_fields__} - {"algorithm", *TABLES}
 
 
 class SettingsLayer(NamedTuple):
-    """Settings that stand in one place: those of the run and of its algorithm side by side."""
+    """Settings from one source: those of the run and of its algorithm side by side."""
 
     where: str
-    """as an error begins: a file, `preset NAME`, `train`; empty for flags, whose names tell"""
+    """how an error begins: a file, `preset NAME`, `train`; empty for flags, which their names show"""
     settings: Mapping[str, Any]
 
     def origin(self, field: FlagField) -> str:
-        """What an error calls a setting of this layer."""
+        """How an error refers to a setting of this layer."""
         return f"{self.where}: {field.name}" if self.where else field.written
 
     def without_tables(self) -> SettingsLayer:
-        """Without the arguments of the environment."""
+        """The layer without the arguments of the environment."""
         return SettingsLayer(self.where, {name: value for name, value in self.settings.items() if name not in TABLES})
 
 
@@ -53,7 +54,7 @@ NOTHING = SettingsLayer("", {})
 
 
 class LowerLayers(NamedTuple):
-    """What lies below flags and keyword arguments, as it was read, and the algorithm that all layers together name."""
+    """The layers below flags and keyword arguments, as they were read, and the algorithm that all layers together name."""
 
     algo: str
     preset: str
@@ -62,7 +63,7 @@ class LowerLayers(NamedTuple):
     resume: Path | None
 
     def below(self, given: SettingsLayer) -> list[SettingsLayer]:
-        """The layers below those that were given, which may name the environment. Raises `UsageError`."""
+        """The layers below the given one, which may name the environment. Raises `UsageError`."""
         env = str(given.settings.get("env", ""))
         if self.resume is not None and env and not moved(str(self.file.settings.get("env")), env):
             found = self.file.settings.get("env")
@@ -93,9 +94,9 @@ def resolve(
 
     Raises `UsageError`, with a one-line message, if a setting or a file is not valid.
 
-    `file`: a TOML file of settings. `resume`: a run folder; its config.toml takes the place of file and preset.
-    `preset`: "auto" (that of the environment, if there is one), "none", the environment whose preset to take, or a whole run
-    by name. `algo` may be a class (`algorithm_names.name_of`).
+    `file`: a TOML file of settings. `resume`: a run folder; its config.toml replaces file and preset. `preset`: "auto" (the
+    environment's preset, if there is one), "none", the environment whose preset to take, or the name of a whole run. `algo`
+    may be a class (`algorithm_names.name_of`).
     """
     if isinstance(algo := keywords.get("algo", ""), type):
         keywords["algo"] = name_of(algo)
@@ -118,7 +119,7 @@ def config_from_toml(text: str, where: str = "config.toml") -> Config:
 def config_of_run(run: Path, algo: str | None = None) -> Config:
     """The settings of a run folder, from its config.toml. Raises `UsageError`.
 
-    `algo`: the name that its algorithm has now, if it may be another one (`algorithm_names.moved`).
+    `algo`: the current name of its algorithm, if it may have changed (`algorithm_names.moved`).
     """
     table = with_algorithm(read_config(run), algo)
     return settings_of_run(_file_alone(table, str(run / CONFIG_FILE)), NOTHING)
@@ -196,7 +197,7 @@ def merged(algo: str, layers: Sequence[SettingsLayer]) -> Config:
 
 
 def _plain(field: FlagField, value: Any) -> Any:
-    """1e5 and "1_000" become integers where the field is one, "none" becomes None where it may be, and a path text."""
+    """Convert 1e5 and "1_000" to integers in integer fields, "none" to None where None is allowed, and a path to text."""
     if isinstance(value, os.PathLike):
         return os.fspath(value)
     if field.optional and value == "none":
@@ -215,7 +216,7 @@ def _algorithm_of_file(table: Mapping[str, Any], where: str) -> str:
 
 
 def _is_wrong_alone(algo: str, layers: Sequence[SettingsLayer], why: UsageError) -> bool:
-    """Whether settings are wrong for this reason without those that were given."""
+    """Whether the lower layers alone, without the given settings, cause this error."""
     try:
         validate(merged(algo, layers))
     except UsageError as error:
@@ -224,7 +225,10 @@ def _is_wrong_alone(algo: str, layers: Sequence[SettingsLayer], why: UsageError)
 
 
 def _layer_of_file(table: dict[str, Any], algo: str, where: str) -> SettingsLayer:
-    """The settings of a TOML file for this algorithm. Tables of others are left out: one file can hold those of several."""
+    """The settings of a TOML file for this algorithm.
+
+    Tables of other algorithms are left out: one file can hold those of several.
+    """
     of_run = {name: value for name, value in table.items() if name not in HYPERPARAMETERS and not is_own(name)}
     of_algorithm = table.get(algo, {})
     if not isinstance(of_algorithm, dict):
@@ -242,7 +246,7 @@ def _header(algo: str) -> str:
 
 
 def _read_toml(file: Path) -> dict[str, Any]:
-    """Read a TOML file of settings. It may be a link or a pipe, because the user names it, and a device that never ends."""
+    """Read a TOML file of settings. The user names it, so it may be a link, a pipe, or a device that never ends."""
     try:
         with file.open("rb") as opened:
             content = opened.read(MOST_TEXT_BYTES + 1)

@@ -1,6 +1,6 @@
 """The names of other libraries that users most often type here, and our names for them. Pure.
 
-Rule: each takes the same values as our setting. docs/how-to/moving_from.md has the names that are missing here.
+Rule: each takes the same values as our setting. docs/how-to/moving_from.md has the other names.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ OUR_NAME = {
 
 
 def in_place_of(name: str, known: Collection[str], *, flag: bool = False) -> str:
-    """What to write in place of a name that isn't a setting of this run, as the end of a line; empty if that isn't known.
+    """The end of an error about a name that isn't a setting of this run: what to write instead; empty if that isn't known.
 
     `known`: the settings of this run. `flag`: the name was given as a flag, not as a keyword argument.
     """

@@ -29,7 +29,7 @@ class Preset(NamedTuple):
 
 
 def named_presets() -> dict[str, Preset]:
-    """The whole runs that `--preset NAME` takes, by name."""
+    """The whole runs that `--preset NAME` accepts, by name."""
     tables: dict[str, dict[str, Any]] = _tables().get(NAMED, {})
     return {name: Preset(table["about"], {k: v for k, v in table.items() if k != "about"}) for name, table in tables.items()}
 
@@ -41,7 +41,7 @@ def environment_presets(algo: str) -> dict[str, dict[str, Any]]:
 
 
 def algorithms_and_environments() -> list[tuple[str, str]]:
-    """Algorithm and environment of every preset that applies without --preset."""
+    """The algorithm and environment of every preset that applies without --preset."""
     return [(algo, env) for algo, envs in _tables().items() if algo != NAMED for env in envs]
 
 
@@ -52,15 +52,16 @@ def environment_name(env: str, env_kwargs: Mapping[str, Any], algo: str) -> str:
 
 
 def added(table: Mapping[str, object], default: Mapping[str, object]) -> list[str]:
-    """Names and values of the entries of a table that its default does not have, as the words of a flag."""
+    """Names and values of the table's entries that its default doesn't have, as the words of a flag."""
     return [word for key, value in table.items() if default.get(key) != value for word in (key, written(value))]
 
 
 def origin(config: Config) -> str:
     """Where the settings of a new run come from, as one line for the user.
 
-    The preset is in use if a setting has its value, and that is not the default. Without one, the settings of the algorithm
-    that differ from the defaults are named: they were given, or come from a file or the preset of another environment.
+    The preset counts as used if a setting has its value and this isn't the default. Without a preset, the line names the
+    settings of the algorithm that differ from the defaults: they were given, or come from a file or the preset of another
+    environment.
     """
     preset = environment_presets(config.algo).get(config.env)
     mine = _settings(config)

@@ -1,8 +1,8 @@
-"""What may become of a setting when a run is resumed: each one is declared free, adaptable or fixed where it stands. Pure.
+"""Whether a resumed run may change a setting: each field is declared free, adaptable or fixed. Pure.
 
-Rule: a setting that gives the saved weights or the saved state another meaning is fixed. `Config` and the records of
-hyperparameters declare each field as `Free[...]`, `Adaptable[...]` or `Fixed[...]`. A resumed run keeps the settings in its
-config.toml, except those that are given; a fixed one that is given with another value is refused.
+Rule: a setting is fixed if another value would give the saved weights or the saved state another meaning. `Config` and the
+records of hyperparameters declare each field as `Free[...]`, `Adaptable[...]` or `Fixed[...]`. A resumed run keeps the
+settings in its config.toml, except those that you give; another value of a fixed one is refused.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ import msgspec
 
 
 class OnResume(Enum):
-    """How a resumed run takes another value of a setting. The value of a member is its meaning, for the documentation."""
+    """What a resumed run does with another value of a setting. A member's value is its meaning, for the documentation."""
 
     FREE = "Another value takes effect at once."
-    ADAPTABLE = "Another value takes effect at once. Lanes that then have another number of env copies begin new episodes."
+    ADAPTABLE = "Another value takes effect at once. Lanes whose number of env copies changes begin new episodes."
     FIXED = "Another value is refused: the weights or the state of the run would not match the new value."
 
 
@@ -31,7 +31,7 @@ Fixed = Annotated[Setting, OnResume.FIXED]
 
 
 class Change(NamedTuple):
-    """A setting that is given with another value than the run has."""
+    """A setting that is given with a value that differs from the run's."""
 
     name: str
     on_resume: OnResume
@@ -42,11 +42,11 @@ class Change(NamedTuple):
 
 @cache
 def declared(record: type[msgspec.Struct], *, by_type: bool = False) -> dict[str, OnResume]:
-    """How a resumed run takes each setting of a record, in the order of its fields.
+    """What a resumed run does with each setting of a record, in the order of its fields.
 
-    `by_type`: a field of a user's own record need not declare it. Then a float is free, because it is usually a coefficient,
-    and anything else is fixed, because the weights or the saved state may have its form. A field that overrides one of a
-    base keeps the declaration of that one.
+    `by_type`: a field of a user-defined record need not declare it. Then a float is free, because it is usually a
+    coefficient, and anything else is fixed, because the shape of the weights or of the saved state may depend on it. A field
+    that overrides a field of a base class keeps that field's declaration.
 
     Raises TypeError for a field that does not declare it exactly once, and NameError for a type that cannot be found.
     """
@@ -64,7 +64,7 @@ def changes(run: msgspec.Struct, given: msgspec.Struct) -> Iterator[Change]:
 
 
 def refusal(changed: list[Change]) -> str:
-    """Which of these are fixed, and the values, as text in one line; empty if there is none."""
+    """The fixed ones of these settings and their values, as text in one line; empty if there are none."""
     fixed = [change for change in changed if change.on_resume is OnResume.FIXED]
     return "; ".join(
         f"{one.name}: expected {_shown(one.run)} as in its config.toml, got {_shown(one.given)}" for one in fixed

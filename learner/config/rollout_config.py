@@ -1,6 +1,6 @@
 """The settings of collecting rollouts: which environment, how many env copies, which workers, when to give up. Pure.
 
-A training run has these settings and those of `Config`. A `RolloutService` that is used without our training has these.
+A training run has these settings and those of `Config`. A `RolloutService` for your own training loop has only these.
 """
 
 from __future__ import annotations
@@ -36,19 +36,19 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     """Environment id for gymnasium.make, such as CartPole-v1, ALE/Pong-v5 or my_package.envs:MyEnv-v0."""
     env_kwargs: Fixed[dict[str, Scalar]] = {}
     """Keyword arguments for gymnasium.make: NAME VALUE NAME VALUE ... Values are numbers, true, false or text. Texts may use
-    number, slot, lane and copy of each env copy, as in port "{5000 + slot}".
+    each env copy's number, slot, lane and copy, as in port "{5000 + slot}".
     """
     eval_env_kwargs: Fixed[dict[str, Scalar]] = {}
-    """Keyword arguments of evaluation copies, in addition to env_kwargs or in place of those of the same name."""
+    """Keyword arguments for env copies of evaluations, in addition to env_kwargs; they override those of the same name."""
     wrappers: Annotated[Fixed[tuple[str, ...]], Flag("MODULE:CLASS ...")] = ()
-    """Wrappers of every env copy, also in evaluations, such as gymnasium.wrappers:FlattenObservation. Arguments must be
-    literals: "my_module:Scale(by=0.5)". The first one is the innermost.
+    """Wrappers of every env copy, including those of evaluations, such as gymnasium.wrappers:FlattenObservation. Arguments
+    must be literals: "my_module:Scale(by=0.5)". The first one is the innermost.
     """
     seat_id: Fixed[bool] = False
-    """Of an environment of several agents: tell each agent in its observations which one it is."""
+    """In an environment of several agents, tell each agent in its observations which one it is."""
     critic_keys: Annotated[Fixed[tuple[str, ...]], Flag("KEY ...")] = ()
-    """Keys of a Dict observation that only the critic sees: a policy acts without them (ppo, a2c, impala, reinforce). For
-    PettingZoo, state is the environment's state().
+    """Keys of a Dict observation that only the critic sees: the policy acts without them (ppo, a2c, impala, reinforce). For
+    PettingZoo, the key state is the environment's state().
     """
     seed: Fixed[Annotated[int, Meta(ge=0)]] = 1
     """Seed of all random numbers of the run."""
@@ -64,9 +64,9 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     distributed over the workers. Results depend on lanes and envs, not on the number of workers.
     """
     max_lag: Free[Natural] = 0
-    """Lag of the rollouts: their weights are exactly this many versions older than the learner's, after the first updates.
-    0: workers and learner take turns. Above 0: both run at the same time; impala, dqn, sac and td3 are made for that.
-    Results repeat with any lag.
+    """Lag of the rollouts: after the first updates, they are collected with weights that are exactly this many versions
+    older than the learner's. 0: workers and learner take turns. Above 0: both run at the same time; impala, dqn, sac and td3
+    are made for that. Runs are reproducible with any lag.
     """
     vector: Annotated[Free[str], Flag(f"{{{','.join(KINDS)}}}|NAME")] = "loop"
     """How the env copies of a lane are stepped. loop: one after another. native: by the environment's own vector version.
@@ -74,28 +74,29 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     kinds.
     """
     acting_dtype: Free[ActingDtype] = "float32"
-    """Precision in which workers act; the learner always computes in float32. bfloat16 halves the bytes of the weights that
-    are sent. With images it halves the work of acting on CPUs with AMX, and is slower elsewhere.
+    """Precision in which workers act; the learner always computes in float32. bfloat16 halves the size of the weights that
+    are sent. With images it halves the time of acting on CPUs with AMX; on others it is slower.
     """
     info_keys: Free[tuple[str, ...]] = ()
     """Names of numbers that the environment reports in info at the end of an episode, such as is_success distance. Their
     means are logged.
     """
     action_masks: Fixed[Literal["auto", "info", "none"]] = "auto"
-    """Which actions are allowed, as the environment says it for a Discrete or MultiDiscrete action. auto: by the key
-    action_mask of a Dict observation, if it has one with a bit for each choice. info: by info["action_mask"] of each reset
-    and step; the key of a Dict observation comes first. none: all actions are allowed, and the key is an observation.
+    """Where the environment says which Discrete or MultiDiscrete actions are allowed. auto: in the key action_mask of a Dict
+    observation, if it has one with a bit for each choice. info: in info["action_mask"] of each reset and step, unless the
+    Dict observation has the key. none: all actions are allowed, and the key is an observation.
     """
     max_env_copies: Free[Natural] = 0
-    """Most env copies of the run on all machines, as for floating licences: those of its lanes, and those that play
-    evaluations, on as few workers as needed. 0: no limit. For a machine, set the variable MILLRACE_COPIES_PER_MACHINE.
+    """Largest number of env copies of the run on all machines together, for example because of floating licences. It
+    includes those that play evaluations, on as few workers as needed. 0: no limit. To limit one machine, set the variable
+    MILLRACE_COPIES_PER_MACHINE.
     """
     min_workers: Free[Natural] = 0
     """Start training when this many workers have joined. 0: wait for all local workers (train) or one worker
     (learner).
     """
     launched_workers: Free[Natural] = 0
-    """Number of workers that a launcher starts for this learner (learner only; `millrace launch` sets it). If so many
+    """Number of workers that a launcher starts for this learner (learner only; `millrace launch` sets it). If this many
     different workers say that the environment cannot be made, the run ends with their reason. 0: wait for another worker.
     """
 
@@ -110,7 +111,7 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     needs keys.
     """
     advertise: Free[str] = ""
-    """Host name or IP address at which workers on other machines reach this one (learner only). Default: the name of this
+    """Host name or IP address of this machine for workers on other machines (learner only). Default: the name of this
     machine.
     """
     keys: Free[str] = ""
@@ -118,10 +119,11 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     connections on this machine need keys too.
     """
     insecure: Free[bool] = False
-    """Accept workers of other machines without keys. Whoever reaches the port can then read, disturb and stop the run."""
+    """Accept workers on other machines without keys. Anyone who can reach the port can then read, disturb and stop the run.
+    """
     metrics_bind: Free[str] = ""
     """HOST:PORT at which Prometheus can read the metrics, such as 127.0.0.1:9464 (pip install prometheus-client). With
-    0.0.0.0:9464 everybody in the network can read them. Default: no metrics are served.
+    0.0.0.0:9464 anyone in the network can read them. Default: no metrics are served.
     """
     dashboard: Free[bool] = False
     """Show the run in a browser while it trains: its page is served on this machine, and the address is printed."""
@@ -133,13 +135,13 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     is not silent while its supervisor says that its environment, or your policy, is busy, however long that takes.
     """
     lost_lanes: Free[Literal["continue", "restart"]] = "continue"
-    """What becomes of running episodes when their worker is lost, when lanes move to another worker, and when the run is
-    resumed. continue: each is repeated on another env copy from its beginning, with the same seed and actions, and goes on
-    where it was. With environments that repeat themselves, results then do not depend on who was lost. restart: new episodes
-    begin.
+    """What happens to running episodes when their worker is lost, when lanes move to another worker, and when the run is
+    resumed. continue: each is replayed on another env copy from its beginning, with the same seed and actions, and continues
+    from there. If the environment is deterministic given its seed, results then don't depend on which workers were lost.
+    restart: new episodes begin.
     """
     replay_limit: Free[Natural] = 1000
-    """Longest episode, in steps, that is repeated so that it can go on. Where one is longer, a new one begins. To repeat an
+    """Longest episode, in steps, that is replayed so that it can continue. If it is longer, a new one begins. Replaying an
     episode takes as long as its steps took, without the policy.
     """
     no_workers_timeout_s: Free[Positive] = 600.0
@@ -157,13 +159,13 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     max_env_failures: Free[Natural] = 3
     """Two counts of failures end the run. In a row: more than this, or more than 10, in one lane without a rollout in
     between (a failure after env steps counts as a quarter). Within an hour: more failures after env steps than this × (1 +
-    env copies × hours since the learner began, at most 1, + w / 30), where w is the seconds that the failed workers had
-    worked before. A failure is an exception or an unusable result of the environment or of an `OwnPolicy`, or a worker
-    process that ends without being told to: the environment may have ended it.
+    env copies × h + w / 30), where h is the hours since the learner began, at most 1, and w the seconds that the failed
+    workers had worked before. A failure is an exception or an unusable result of the environment or of an `OwnPolicy`, or a
+    worker process that ends unasked: the environment may have ended it.
     """
 
     def all_wrappers(self, given: Sequence[WrapperLike] | None = None) -> list[WrapperLike]:
-        """The wrappers of every env copy, or these in place of `wrappers`, with those that other settings ask for."""
+        """The wrappers of every env copy: `wrappers`, or the given ones instead, and those that other settings need."""
         return [
             *(self.wrappers if given is None else given),
             *([SEAT_ID] if self.seat_id else []),
@@ -175,13 +177,13 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
         return CallTimeouts(self.start_timeout_s, self.step_timeout_s)
 
     def most_repeated_steps(self) -> int:
-        """The longest episode that is repeated; -1: none is."""
+        """The longest episode that is replayed, in steps; -1: none is."""
         return self.replay_limit if self.lost_lanes == "continue" else -1
 
     def stall_timeout_s(self) -> float:
-        """The run ends if no env step, reset or construction has ended for so long, which is longer than each may take."""
+        """The run ends if no env step, reset or construction has ended for this long, which is longer than each may take."""
         return max(STALL_TIMEOUT_S, self.call_timeouts().longest_s())
 
     def heartbeat_s(self) -> float:
-        """Seconds between two heartbeats of a worker: often enough that it is not silent if some of them come late."""
+        """Seconds between two heartbeats of a worker: often enough that it doesn't count as silent if some are late."""
         return min(HEARTBEAT_S, self.worker_timeout_s / 5)

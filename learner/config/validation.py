@@ -22,12 +22,12 @@ from millrace.protocol.envs.wrappers import wrapper_name
 from millrace.protocol.errors import UsageError, safe_repr
 from millrace.protocol.own_module import is_name
 
-MOST_TICKETS = 1 << 15  # that are outstanding: one worker may get them all, in one message
-LARGEST_SEED = 2**64 - 1  # that PyTorch takes
+MOST_TICKETS = 1 << 15  # outstanding ones: one worker may get them all, in one message
+LARGEST_SEED = 2**64 - 1  # that PyTorch accepts
 
 
 def validate(config: Config) -> None:
-    """Raise `UsageError`, which says what is wrong, if no run can be made of these settings, each of which is right."""
+    """Raise `UsageError` if these settings, each valid by itself, don't make a valid run together."""
     if not config.env:
         raise UsageError("which environment? expected one that gymnasium.make takes, as in: millrace train CartPole-v1")
     check_rollout_settings(config)
@@ -47,15 +47,18 @@ def validate(config: Config) -> None:
 
 
 def check_table(value: object, origin: str) -> None:
-    """Raise `UsageError` if this is no table of arguments that a message can carry. `origin`: what an error calls it."""
+    """Raise `UsageError` unless this is a table of arguments that a message can carry.
+
+    `origin`: how an error refers to it.
+    """
     if not isinstance(value, Mapping):
         raise UsageError(f"{origin}: expected table, got {value!r:.60}")
     check_arguments(value, origin)
 
 
 def check_text(name: str, value: object, origin: str) -> None:
-    """Raise `UsageError` for a text that no file and no message can hold: words of a command line may be any bytes."""
-    if name == "run_dir":  # of which the folder's own check says what to do
+    """Raise `UsageError` for a text that files and messages can't hold: a command line may contain any bytes."""
+    if name == "run_dir":  # the check of the folder says what to do
         return
     for text in value if isinstance(value, tuple | list) else (value,):
         if isinstance(text, str) and any("\ud800" <= character <= "\udfff" for character in text):
@@ -65,7 +68,7 @@ def check_text(name: str, value: object, origin: str) -> None:
 def check_numbers(record: msgspec.Struct, origins: Mapping[str, str]) -> None:
     """Raise `UsageError` for NaN, and for a whole number that is too large for a message.
 
-    `origins`: what an error calls a setting that was given.
+    `origins`: how an error refers to a given setting.
     """
     for name, value in msgspec.structs.asdict(record).items():
         most = LARGEST_SEED if name == "seed" else LARGEST
@@ -78,7 +81,7 @@ def check_numbers(record: msgspec.Struct, origins: Mapping[str, str]) -> None:
 
 def check_copies(config: Config, limit: str, most: int) -> None:
     """Raise `UsageError` if `most` env copies (0: any number) are too few for the run. `limit`: what sets this number."""
-    # Each worker that evaluates keeps its copies: one, or those that only evaluate and one that does if they are lost.
+    # Each worker that evaluates keeps its copies. There is one, or the eval_workers and one that evaluates if they are lost.
     evaluate = min(config.eval_copies, evaluation_size(config).episodes) * (config.eval_workers + 1)
     if 0 < most < config.envs + evaluate:
         raise UsageError(
@@ -88,7 +91,7 @@ def check_copies(config: Config, limit: str, most: int) -> None:
 
 
 def idle_workers(config: Config) -> str:
-    """A line for the user if some workers of a run on this machine will have no lane, or nothing."""
+    """A line for the user if some workers of a run on this machine will have no lane; else empty."""
     idle = config.workers - config.lanes
     if idle <= 0:
         return ""
@@ -100,7 +103,7 @@ def idle_workers(config: Config) -> str:
 
 
 def workers_to_wait_for(config: RolloutConfig, local: int | None) -> int:
-    """How many workers must have joined before collection starts. Raises `UsageError` if so many cannot join.
+    """How many workers must have joined before collection starts. Raises `UsageError` if that many can't join.
 
     `local`: number of workers that this machine starts, if no other worker can join; None: workers are started elsewhere.
     """
@@ -115,7 +118,7 @@ def workers_to_wait_for(config: RolloutConfig, local: int | None) -> int:
 
 
 def unused_setting(config: Config) -> str:
-    """A line for the user if a setting of evaluations during training has no effect, because there are none; or nothing."""
+    """A line for the user if a setting of evaluations during training has no effect, because there are none; else empty."""
     if config.eval_every:
         return ""
     if config.eval_workers:
@@ -157,9 +160,9 @@ def check_rollout_settings(config: RolloutConfig) -> None:
     if len(names) > MAX_FACTS or len(set(names)) < len(names):
         raise UsageError(f"info_keys: expected at most {MAX_FACTS} different names, got {len(names)}")
     if wrong := [name for name in names if not name or name != one_line(name, MAX_NAME)]:
-        raise UsageError(f"info_keys: expected names in one line, got {one_line(safe_repr(wrong[0]), MAX_NAME)}")
+        raise UsageError(f"info_keys: expected names without line breaks, got {one_line(safe_repr(wrong[0]), MAX_NAME)}")
     if taken := METRICS_BESIDE_FACTS.union(f"{name}_missing" for name in names).intersection(names):
-        raise UsageError(f"info_keys: expected another name than {min(taken)}, under which something else is logged")
+        raise UsageError(f"info_keys: expected another name than {min(taken)}, which is the name of another logged value")
     if config.wrappers and config.vector != "loop":
         raise UsageError(
             f"vector {config.vector}: wrappers are applied to single env copies; expected loop, which is the default"

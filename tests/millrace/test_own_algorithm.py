@@ -243,7 +243,7 @@ class SavesAnArray(ClippedPlus):
     [
         (LogsText, "LogsText.loss: odd: expected one number to log, got str"),
         (LogsRows, "LogsRows.loss: odd: expected one number to log, got Tensor [3]; log its mean"),
-        (ReturnsRows, "ReturnsRows.loss: expected a tensor of no dimension that depends on"),
+        (ReturnsRows, "ReturnsRows.loss: expected a 0-dimensional tensor that depends on"),
         (ReturnsText, "ReturnsText.update: metrics: expected a name and a number, got str for 'train/odd'"),
         (ReturnsNothing, "ReturnsNothing.update: expected a dict of metrics, got NoneType"),
         (TooFewWeights, "TooFewWeights.weights: parameters: expected float32[58], got float32[57]"),

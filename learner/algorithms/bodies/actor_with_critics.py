@@ -24,7 +24,7 @@ from millrace.protocol.specs import PolicySpec
 
 
 class ActorWithCritics:
-    """A squashed Gaussian actor, and K critics of features and actions, whose outputs stand for values."""
+    """A squashed Gaussian actor, and K critics of features and actions, whose outputs represent values."""
 
     def __init__(
         self,
@@ -65,7 +65,7 @@ class ActorWithCritics:
         self._values_of = values_of
 
     def params(self, x: Tensor, images: Sequence[Tensor] = ()) -> Tensor:
-        """As `actor_params`, for features [B, D] and images [B, *leaf] uint8."""
+        """Like `actor_params`, for features [B, D] and images [B, *leaf] uint8."""
         return self.actor_params(self.encode(x, images))
 
     def actor_params(self, h: Tensor) -> Tensor:
@@ -82,15 +82,15 @@ class ActorWithCritics:
         return squashed_sample(self.actor_params(h), noise)
 
     def outputs(self, h: Tensor, action: Tensor) -> Tensor:
-        """Outputs of the critics [K, B, O] for inputs [B, H] and actions [B, D′], to train the critics by."""
+        """Outputs of the critics [K, B, O] for inputs [B, H] and actions [B, D′], for training the critics."""
         return self.critic_bodies.trained(torch.cat((h, action), -1), renormalizes=self.renormalizes)
 
     def minibatch_outputs(self, h: Tensor, action: Tensor) -> Tensor:
-        """As `outputs`, normalized by the statistics of this minibatch, but nothing is trained or moves: for targets."""
+        """Like `outputs`, with this minibatch's statistics, but without gradient or update of the running ones: targets."""
         return self.critic_bodies.of_minibatch(torch.cat((h, action), -1))
 
     def values(self, h: Tensor, action: Tensor, *, constant: bool = True) -> Tensor:
-        """The values [K, B] of inputs [B, H] and actions [B, D′], by critics that get no gradient; the actions do."""
+        """The values [K, B] of inputs [B, H] and actions [B, D′]. The actions get a gradient, the critics don't."""
         assert constant, "outputs() is what critics are trained by"
         return self._values_of(self.critic_bodies.evaluated(torch.cat((h, action), -1)))
 

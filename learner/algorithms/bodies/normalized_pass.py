@@ -1,11 +1,11 @@
-"""A pass of MLPs with batch normalization through a whole minibatch, as one node of autograd's graph.
+"""A pass of a whole minibatch through MLPs with batch normalization, as one node of autograd's graph.
 
-Rule: a layer's mean and variance are those of the whole minibatch, so all its rows pass a layer before any passes the next.
-That is why this pass isn't cut into chunks of rows, as that of `kernels/mlp.py` is.
+Rule: a layer's mean and variance are those of the whole minibatch, so all rows pass one layer before any row passes the
+next. That is why this pass isn't cut into chunks of rows, unlike the one of `kernels/mlp.py`.
 
-Arrays are [K, n, B]: K networks, n features, B rows. So a sum over the minibatch reads memory in its order, and the features
-of all networks are normalized by one call. With x̂ = (h − μ) / σ, where σ² = variance + ε, and g = ∂L/∂(γ x̂ + β):
-∂L/∂β = Σ g, ∂L/∂γ = Σ g x̂, ∂L/∂h = γ / σ · (g − mean(g) − x̂ mean(g x̂)).
+Arrays are [K, n, B]: K networks, n features, B rows. So a sum over the minibatch reads contiguous memory, and one call
+normalizes the features of all networks. With x̂ = (h − μ) / σ, where σ² = variance + ε, and g = ∂L/∂(γ x̂ + β): ∂L/∂β = Σ g,
+∂L/∂γ = Σ g x̂, ∂L/∂h = γ / σ · (g − mean(g) − x̂ mean(g x̂)).
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from torch import Tensor
 from millrace.protocol.policy.networks import refuse_second_derivatives
 
 EPS = 1e-3
-"""ε beside a variance: that of CrossQ and XQC"""
+"""ε that is added to a variance, as in CrossQ and XQC"""
 MOMENTUM = 0.01
-"""by which running means and variances move towards those of a minibatch"""
+"""fraction by which running means and variances move towards those of a minibatch"""
 
 
 class Layer(NamedTuple):
@@ -65,7 +65,10 @@ class NormalizedPass(torch.autograd.Function):
     def forward(
         ctx: Any, x: Tensor, flat: Tensor, plan: Plan, running: Sequence[RunningStatistics] | None, renormalizes: bool
     ) -> Tensor:
-        """`running` moves towards the statistics of the minibatch; None: nothing does. `renormalizes`: see `_normalized`."""
+        """`running` moves towards the statistics of the minibatch; None: there are none to move.
+
+        `renormalizes`: see `_normalized`.
+        """
         h = x.t().contiguous().unsqueeze(0)
         kept = []
         for i, layer in enumerate(plan.layers_of(flat)):
@@ -122,7 +125,7 @@ class _Normalization(NamedTuple):
     d: Tensor | None
 
     def backward(self, g: Tensor, layer: Layer, by_layer: Layer) -> Tensor:
-        """The gradient [K, n, B] by what was normalized, from `g` by the result, which is overwritten."""
+        """The gradient [K, n, B] with respect to the input, from the gradient `g` of the result, which is overwritten."""
         total = g.sum(-1, keepdim=True)
         product = _row_products(g, self.x_hat.expand_as(g))
         by_layer.shift.copy_(total)
@@ -137,8 +140,8 @@ def _normalized(
 ) -> tuple[Tensor, _Normalization]:
     """γ x̂ + β [K, n, B] of h [K or 1, n, B], and what the backward pass needs.
 
-    With batch renormalization (Ioffe 2017), γ (r x̂ + d) + β, which up to bounds normalizes by the running statistics. The
-    numbers r and d count as constants.
+    With batch renormalization (Ioffe 2017), γ (r x̂ + d) + β, which normalizes by the running statistics as long as r and d
+    are within their bounds. The numbers r and d count as constants.
     """
     mean = h.mean(-1, keepdim=True)
     x_hat = h.sub_(mean) if in_place else h - mean
@@ -172,7 +175,10 @@ def renormalization(mean: Tensor, inverse: Tensor, running: RunningStatistics) -
 
 
 def _row_products(a: Tensor, b: Tensor) -> Tensor:
-    """Σ a b over the last dimension, which is kept. On a CPU numpy adds as it multiplies; torch stores products."""
+    """Σ a b over the last dimension, which is kept.
+
+    On a CPU, numpy adds while it multiplies; torch stores the products first.
+    """
     if a.device.type != "cpu":
         return (a * b).sum(-1, keepdim=True)
     return torch.from_numpy(np.vecdot(a.numpy(), b.numpy())).unsqueeze(-1)
@@ -184,7 +190,7 @@ def _activation(h: Tensor, relu: bool) -> Tensor:
 
 
 def _before_activation(g: Tensor, activated: Tensor, relu: bool) -> Tensor:
-    """The gradient by what was activated, from that by the result φ(h)."""
+    """The gradient with respect to h, from `g`, that with respect to φ(h)."""
     by_pre_activation: Tensor = (
         torch.ops.aten.threshold_backward(g, activated, 0) if relu else torch.ops.aten.tanh_backward(g, activated)
     )

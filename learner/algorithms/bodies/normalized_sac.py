@@ -1,7 +1,8 @@
 """What CrossQ and XQC share: SAC with batch normalization in actor and critics, whose actor learns at every k-th step.
 
-Rule: observations with their actions pass the critics in one minibatch with those that followed. These come from another
-distribution; passed alone, they would be normalized by other means, and values would not fit together (Bhatt et al. 2024).
+Rule: observations and next observations, with their actions, pass the critics in one minibatch. They come from different
+distributions; in separate minibatches they would be normalized by different means, and values would not fit together (Bhatt
+et al. 2024).
 """
 
 from __future__ import annotations
@@ -24,14 +25,14 @@ from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
 
 
 class Joint(NamedTuple):
-    """What the critics are asked for at once."""
+    """The critics' input: observations and next observations in one minibatch."""
 
     x: Tensor
-    """[2 B, D] features of the observations, then of those that followed"""
+    """[2 B, D] features of the observations, then of the next ones"""
     action: Tensor
     """[2 B, D′] the actions, then those that the actor would take next"""
     next_log_prob: Tensor
-    """[B] log π of the latter"""
+    """[B] log π of the next actions"""
 
 
 class NormalizedSAC(SAC):
@@ -64,7 +65,7 @@ class NormalizedSAC(SAC):
         return Joint(torch.cat((rows.x, rows.next_x)), torch.cat((rows.action, action)), log_prob)
 
     def after_step(self, name: str) -> None:
-        """See `Continuous`: weights that are to have norm 1 have it again."""
+        """See `Continuous`: scales weights that must have norm 1 back to it."""
         match name:
             case "actor":
                 self.net.actor_body.project()

@@ -1,7 +1,7 @@
 """Action values by quantiles of the return (QR-DQN, Dabney et al. 2018), with or without dueling and batch normalization.
 
 Rule: workers act with an ordinary Q-network. The value of an action is the mean of its quantiles, so it is linear in the
-last hidden layer, as they are: the rows of the last layer that belong to one action are averaged. Batch normalization is
+last hidden layer, as the quantiles are. Acting networks average the last layer's rows of each action. Batch normalization is
 folded into the layers (`stacked_mlps.py`).
 
 For N quantiles and n actions there are N (n + 1) outputs: for each quantile the value of the state, then n advantages.
@@ -51,15 +51,15 @@ class QuantileQNetwork:
         self.body = StackedMLPs(shape, trainable(layers, of_layers), self.statistics)
 
     def trained(self, x: Tensor, images: Sequence[Tensor]) -> Tensor:
-        """The quantiles [B, N, n] of features [B, D] and images [B, *leaf] uint8, to train the network by."""
+        """The quantiles [B, N, n] of features [B, D] and images [B, *leaf] uint8, for training the network."""
         return self._by_action(self.body.trained(self.encode(x, images)))
 
     def of_minibatch(self, x: Tensor, images: Sequence[Tensor]) -> Tensor:
-        """As `trained`, normalized by the statistics of this minibatch, but nothing is trained or moves: for targets."""
+        """Like `trained`, with this minibatch's statistics, but without gradient or update of the running ones: targets."""
         return self._by_action(self.body.of_minibatch(self.encode(x, images)))
 
     def params(self, x: Tensor, images: Sequence[Tensor] = ()) -> Tensor:
-        """The action values [B, n] of features [B, D] and images [B, *leaf] uint8, by which workers act."""
+        """The action values [B, n] of features [B, D] and images [B, *leaf] uint8, with which workers act."""
         return self.head(self.encode(x, images))
 
     def head(self, h: Tensor) -> Tensor:

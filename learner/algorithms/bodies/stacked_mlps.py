@@ -1,8 +1,8 @@
-"""MLPs of one shape, with or without batch normalization (Ioffe and Szegedy 2015), and what one is when it only acts.
+"""MLPs of one shape, with or without batch normalization (Ioffe and Szegedy 2015), and how they fold into plain MLPs.
 
-Rule: a pass by which parameters are trained normalizes by the mean and variance of its own minibatch, and moves the running
-ones towards them. Any other pass uses the running ones. There, batch normalization is linear, so it is folded into the
-linear layers: workers act with a plain MLP, and need neither statistics nor PyTorch.
+Rule: a training pass normalizes by the mean and variance of its own minibatch, and moves the running ones towards them. Any
+other pass uses the running ones. Then batch normalization is linear, so it is folded into the linear layers: workers act
+with a plain MLP, and need neither statistics nor PyTorch.
 
 With `Normalized.BEFORE` an MLP is BN, then linear, BN, activation for each hidden layer, then linear (XQC, Palenicek et al.
 2025); with `Normalized.AFTER`, a BN in front of every linear layer (CrossQ, Bhatt et al. 2024).
@@ -27,7 +27,7 @@ class Normalized(Enum):
 
     NOWHERE = "none"
     BEFORE = "before activations"
-    """its input, and before each activation; hidden layers have no biases, which the means would take away"""
+    """its input, and before each activation; hidden layers have no biases, because subtracting the mean would cancel them"""
     AFTER = "after activations"
     """its input, and after each activation"""
 
@@ -62,7 +62,7 @@ class MLPShape(NamedTuple):
         return fields
 
     def folded(self) -> MLPShape:
-        """That of the plain MLPs that act alike."""
+        """The shape of the plain MLPs with the same outputs."""
         return self._replace(normalized=Normalized.NOWHERE, unit_rows=False)
 
     def statistics(self) -> list[Field]:
@@ -119,7 +119,7 @@ class StackedMLPs:
         return out
 
     def of_minibatch(self, x: Tensor) -> Tensor:
-        """As `trained` without renormalization, but nothing gets a gradient or moves: for target networks."""
+        """Like `trained`, but no renormalization, gradient or update of running statistics: for target networks."""
         if not self._normalizes:
             return self._plain(x, self._constant)
         out: Tensor = NormalizedPass.apply(x, self._constant, self._plan, None, False)  # type: ignore[no-untyped-call]
@@ -131,7 +131,7 @@ class StackedMLPs:
 
     @torch.no_grad()
     def folded(self) -> Tensor:
-        """The parameters [P′] of plain MLPs with the outputs of `evaluated`: of each layer weight and bias, [K, …] each."""
+        """The parameters [P′] of plain MLPs with the outputs of `evaluated`: weight and bias of each layer, [K, …] each."""
         if not self._normalizes:
             return self._constant
         flat = self._constant.new_zeros(total_size(self._folded_fields))
@@ -167,7 +167,7 @@ class StackedMLPs:
                     view.div_(torch.linalg.vector_norm(view, dim=-1, keepdim=True))
 
     def _plain(self, x: Tensor, flat: Tensor) -> Tensor:
-        """Outputs [K, B, O] of MLPs that normalize nothing, with these parameters [P′]."""
+        """Outputs [K, B, O] of MLPs without normalization, with these parameters [P′]."""
 
         def layers_of(flat: Tensor) -> list[Tensor]:
             views = named_views(flat, self._folded_fields)
@@ -178,6 +178,6 @@ class StackedMLPs:
 
 
 def _linear(layer: Layer, running: RunningStatistics) -> tuple[Tensor, Tensor]:
-    """Scale and shift [K, n, 1] of a normalization by running statistics."""
+    """Scale and shift [K, n, 1] that a normalization by running statistics amounts to."""
     scale = layer.gain * (running.variance + EPS).rsqrt()
     return scale, layer.shift - running.mean * scale

@@ -1,1 +1,1 @@
-"""What makes updates of small networks fast: a pass or a term of a loss is one node, a step of the optimizer one call."""
+"""Fast updates of small networks: a pass or a term of a loss is one node of autograd's graph, an optimizer step one call."""

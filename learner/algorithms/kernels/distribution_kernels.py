@@ -1,8 +1,8 @@
-"""What a small network makes of an actor's output: log-probabilities and entropies of actions, or actions, in numpy.
+"""For small networks, in numpy: log-probabilities and entropies of actions, or sampled actions, from an actor's outputs.
 
 Rule: results and gradients equal those of `millrace.protocol.policy.torch_distributions` and autograd, except for rounding.
-They save 0.1 ms of a minibatch of 64 rows: autograd needs a dozen nodes. Arrays are [P, B], a column for each of B rows.
-`forward` keeps what `backward` needs.
+They save 0.1 ms of a minibatch of 64 rows, for which autograd needs a dozen nodes. Arrays are [P, B], a column for each of B
+rows. `forward` keeps what `backward` needs.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ LOG_2 = math.log(2)
 
 
 class EvaluatedActions:
-    """Of an actor and a critic: log π(action), the entropy of π, V, [B] each."""
+    """Log π(action), the entropy of π, and V, from the outputs of an actor and a critic, [B] each."""
 
     def __init__(self, distribution_kernel: DistributionKernel) -> None:
         self._distribution = distribution_kernel
 
     def forward(self, outputs: Sequence[Array], action: Array, mask: Bools | None) -> tuple[Array, ...]:
-        """Given: actions [B, *action], and [B, choices] which of them are allowed.
+        """`action` [B, *action]; `mask` [B, choices]: which choices are allowed.
 
         A logit that the mask forbids has probability 0, so the factor p makes its gradient 0 in `backward`.
         """
@@ -45,14 +45,14 @@ class EvaluatedActions:
 
 
 class SquashedSample:
-    """Of an actor: actions a = tanh u [B, D] of u = mean + std · noise, and their log-densities [B].
+    """Actions a = tanh u [B, D] with u = mean + std · noise, and their log-densities [B], from the outputs of an actor.
 
     log π(a) = Σ −½ noise² − log std − log √2π − log(1 − a²), where log(1 − a²) = 2 (log 2 − |u| − log(1 + exp(−2|u|)))
     ∂a/∂u = 1 − a²;  ∂log π(a)/∂u = 2 a;  ∂u/∂log std = std · noise
     """
 
     def forward(self, outputs: Sequence[Array], noise: Array) -> tuple[Array, ...]:
-        """Given: normal noise [B, D]."""
+        """`noise` [B, D]: drawn from the standard normal distribution."""
         (params,) = outputs
         mean, log_std = np.split(params, 2)
         low, high = LOG_STD_BOUNDS
@@ -74,7 +74,7 @@ class SquashedSample:
 
 
 class DistributionKernel(Protocol):
-    """A distribution_kernel over actions, with the gradients of its log-probability and entropy."""
+    """A distribution over actions, with the gradients of its log-probability and entropy."""
 
     def forward(self, params: Array, action: Array) -> tuple[Array, Array]:
         """Parameters [P, B] and actions [B, k] -> log π(action) [B], entropy [B]."""
@@ -176,11 +176,14 @@ class _KernelFactor(NamedTuple):
     kernel: DistributionKernel
     params: int
     actions: int
-    """how many rows of parameters [P, B], and of columns of actions [B, k], are its own"""
+    """how many rows of the parameters [P, B], and how many columns of the actions [B, k], belong to it"""
 
 
 def distribution_kernel(spec: ActionSpec, log_std: Array | None, by_log_std: Array | None) -> DistributionKernel:
-    """That of this action space. `log_std`, `by_log_std`: [numbers], where it has some (Box); the latter is written."""
+    """The kernel for this action space.
+
+    For a Box, `log_std` and its gradient `by_log_std`, which is written, are [numbers].
+    """
     factors = [_KernelFactor(_CategoricalKernel(), size, 1) for size in spec.sizes]
     if spec.bits:
         factors.append(_KernelFactor(_BernoulliKernel(), spec.bits, spec.bits))

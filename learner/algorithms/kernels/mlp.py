@@ -4,8 +4,8 @@ Rule: outputs and gradients are those of the formulas below, except for rounding
 only on their number, so the same minibatch gives the same bits.
 
 With a small network, torch spends most of the time of a minibatch on its graph, its dispatcher and its allocator, not on
-arithmetic. Here a pass is a few dozen calls on arrays that are used again. A call owns its arrays until its backward pass,
-so one loss may contain several calls. There is no second backward pass, and no derivative of the gradient.
+arithmetic. Here a pass is a few dozen calls on arrays that are reused. A call owns its arrays until its backward pass, so
+one loss may contain several calls. A second backward pass, and derivatives of the gradient, are not supported.
 
 Arrays are [S, n, B]: S networks, and one column for each of B rows, so that inner loops are long. Each chunk of rows passes
 through all layers forward, or backward, while it is in the cache. With g = ∂L/∂(pre-activation): ∂L/∂W = g hᵀ, ∂L/∂b = Σ g,
@@ -30,7 +30,7 @@ from millrace.protocol.policy.layout import Field, named_views
 MLPPass = Callable[[], object]
 
 CHUNK_ROWS = 512  # rows of a chunk, at most
-THREADED_PRODUCT_SIZE = 64 * 64 * 128  # multiplications of a matrix product that torch's threads make faster
+THREADED_PRODUCT_SIZE = 64 * 64 * 128  # multiplications in a matrix product from which on torch's threads make it faster
 MAX_PLANS = 256  # sizes of minibatches to remember; they vary with the number of valid rows
 
 
@@ -68,14 +68,14 @@ class Trunks(NamedTuple):
 
 
 class Top(Protocol):
-    """What a call makes of the outputs of the networks, and its derivative."""
+    """The function that a call applies to the outputs of the networks, and its derivative."""
 
     def forward(self, outputs: Sequence[Array], *given: Any) -> tuple[Array, ...]:
-        """The outputs [out, B] and what the call was given -> its results. The next call overwrites the outputs."""
+        """The outputs [out, B] and the call's other arguments -> its results. The next call overwrites the outputs."""
         ...
 
     def backward(self, by_results: Sequence[Array]) -> Sequence[Array]:
-        """The gradient [out, B] by each output of the last call, from that by its results."""
+        """The gradient [out, B] with respect to each output of the last call, from that with respect to its results."""
         ...
 
 
@@ -105,7 +105,8 @@ class Values:
 
 
 MakeTop = Callable[[Mapping[str, Array], Mapping[str, Array]], Top]
-"""From the parameters and their gradients, by name; the top writes the gradients of those that it uses itself."""
+"""Makes a top from the parameters and their gradients, by name; it writes the gradients of those that it uses.
+"""
 
 
 class SmallMLP:
@@ -129,7 +130,7 @@ class SmallMLP:
         self._free: list[_Workspace] = []
 
     def __call__(self, x: Tensor, *given: Tensor | None, constant: bool = False) -> tuple[Tensor, ...]:
-        """Features [B, D], and what the top is given -> the results of the top.
+        """Features [B, D], and the other arguments of the top -> the results of the top.
 
         `constant`: the parameters get no gradient; x does.
         """
@@ -143,7 +144,7 @@ class SmallMLP:
         return outputs
 
     def take(self) -> _Workspace:
-        """Arrays that no call uses."""
+        """Take arrays that no call uses."""
         if self._free:
             return self._free.pop()
         return _Workspace(self._constants, self._fields, self._trunks, self._relu, self._top)
@@ -175,7 +176,10 @@ class _Pass(torch.autograd.Function):
 
 
 def taken_once(ctx: Any) -> Any:
-    """What the forward pass kept in `ctx.kept`. Raises `RuntimeError`, in one line, for a second or double backward pass."""
+    """Take what the forward pass kept in `ctx.kept`.
+
+    Raises `RuntimeError`, in one line, for a second or double backward pass.
+    """
     if torch.is_grad_enabled():
         raise RuntimeError(
             "millrace differentiates small networks and distributions in numpy, which has no second derivatives; call "
@@ -192,7 +196,7 @@ def taken_once(ctx: Any) -> Any:
 
 
 class _Workspace:
-    """The arrays of one call at a time, and the plans for minibatches of the sizes that came before.
+    """The arrays of one call at a time, and the plans for the minibatch sizes so far.
 
     Plans of all sizes share their arrays: each takes the same ones in the same order.
     """
@@ -208,9 +212,9 @@ class _Workspace:
         self._arrays: list[Array] = []
         self._taken = 0
 
-    @np.errstate(all="ignore")  # as torch; what is not finite is found and named before a step
+    @np.errstate(all="ignore")  # as torch does; before each step, `check_finite` names what is not finite
     def forward(self, x: Tensor, given: Sequence[Tensor | None]) -> tuple[Tensor, ...]:
-        """The results of the top for features [B, D], in memory of their own."""
+        """The results of the top for features [B, D], in newly allocated memory."""
         plan = self._plans.get(len(x))
         if plan is None:
             if len(self._plans) == MAX_PLANS:
@@ -231,13 +235,13 @@ class _Workspace:
     def backward(
         self, by_results: Sequence[Tensor], wants_x: bool, wants_parameters: bool
     ) -> tuple[Tensor | None, Tensor | None]:
-        """The gradients by x and by all parameters, of those that are wanted, from that by each result."""
+        """The gradients with respect to x and all parameters, where wanted, from that with respect to each result."""
         by_heads = self._top.backward([by_result.numpy() for by_result in by_results])
         by_x = self.by_input(by_heads) if wants_x else None
         return by_x, self.by_parameters(by_heads) if wants_parameters else None
 
     def by_parameters(self, by_heads: Sequence[Array]) -> Tensor:
-        """The gradient [P] by all parameters, from ∂L/∂output [out, B] of each head of the last forward pass."""
+        """The gradient [P] with respect to all parameters, from ∂L/∂output [out, B] of each head in the last pass."""
         self._place(by_heads)
         for chunk in self._plan.chunks:
             for call in chunk.back_from_heads + chunk.back_through_hidden:
@@ -323,7 +327,7 @@ class _Chunk:
         self._workspace = workspace
         self.x = self._h = workspace.take(1, first.weight.shape[2], rows.stop - rows.start)
         self._dh: Array | None = None  # ∂L/∂output of the last hidden layers
-        self._networks_with_gradient: set[int] = set()  # those whose part of `_dh` a head has written
+        self._networks_with_gradient: set[int] = set()  # whose part of `_dh` a head has written
         self._ones = np.ones(rows.stop - rows.start, first.weight.dtype)
         self.forward: list[MLPPass] = []
         self.back_from_heads: list[MLPPass] = []

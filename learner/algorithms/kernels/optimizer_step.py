@@ -7,8 +7,8 @@ For a small network, the overhead of `Optimizer.step` takes longer than the kern
 calling its first `step` import torch's compiler, only to exclude these methods from compilation. This takes 0.8 s and 70 MB,
 which a learner that compiles nothing does not need.
 
-Why denormal numbers are set to zero: if parameters get no gradient any more, for example behind a dead ReLU, their moments
-decay to denormal numbers within 800 steps and stay there. Then a step takes a CPU twelve times as long.
+Denormal numbers are set to zero because they are slow: if parameters get no gradient any more, for example behind a dead
+ReLU, their moments decay to denormal numbers within 800 steps and stay there. Then a step takes a CPU twelve times as long.
 
 This file uses private parts of torch: `torch._fused_adam_`, `torch._fused_adamw_`, `__dynamo_disable`. If this version of
 torch lacks such a function, or its function takes other arguments or does something else, `Optimizer.step` is called.
@@ -35,7 +35,7 @@ def make_optimizer(kind: str, flat: Tensor, **settings: Any) -> Optimizer:
     """Adam, AdamW or RMSprop for one flat tensor that has a gradient. Each update sets its learning rate.
 
     Adam has β 0.9 and 0.999, and ε 1e-8 outside the square root; AdamW also decays weights by 0.01; RMSprop has α 0.99.
-    `settings`: what torch's optimizer gets instead, such as `eps` and `amsgrad`.
+    `settings`: arguments of torch's optimizer that replace these, such as `eps` and `amsgrad`.
     """
     avoid_compiler_import()
     match kind:
@@ -46,7 +46,7 @@ def make_optimizer(kind: str, flat: Tensor, **settings: Any) -> Optimizer:
 
 
 def avoid_compiler_import() -> None:
-    """Let optimizers be made, saved and loaded without importing torch's compiler.
+    """Make it possible to make, save and load optimizers without importing torch's compiler.
 
     torch wraps some methods of `Optimizer`. The wrapper asks the compiler for a version of the method that is excluded from
     compilation, and stores this version in an attribute. This function stores the method itself there, so that the wrapper
@@ -96,7 +96,7 @@ def load_state(optimizer: Optimizer, state: dict[str, Any]) -> None:
         expected, got = (type(each.get(odd[0])).__name__ for each in (own_group, group))
         raise ValueError(f"optimizer: {odd[0]}: expected {expected}, got {got}")
     if optimizer.state.keys() - {flat}:
-        raise ValueError("optimizer: expected the moments of its own numbers, got those of others")
+        raise ValueError("optimizer: expected moments of its own parameters, got those of others")
     if _step_of(optimizer) is not None and (kept := optimizer.state.get(flat)):
         own = _initial_state(optimizer, flat, group)
         if {name: each.shape for name, each in own.items()} != {name: each.shape for name, each in kept.items()}:
@@ -117,7 +117,7 @@ def _step_of(optimizer: Optimizer) -> Callable[[Tensor, dict[str, Any], Optimize
 
 
 def _adam_step(name: str, decayed_parameter: float) -> Callable[[Tensor, dict[str, Any], OptimizerState], None] | None:
-    """The step by a private function of torch, if torch has one of this name and it does what this file expects."""
+    """The step with this private function of torch, if torch has it and it does what this file expects."""
     kernel = getattr(torch, name, None)
     return partial(_adam, kernel) if kernel is not None and _is_adam(kernel, decayed_parameter) else None
 

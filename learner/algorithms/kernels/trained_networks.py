@@ -1,7 +1,7 @@
 """The networks as the learner trains them: a small one on the CPU passes in numpy, as one node of autograd's graph.
 
-Rule: which way a network passes depends on its shape and its device alone. Both ways give the same numbers, except for
-rounding, so a loss need not know which one it is.
+Rule: whether numpy or torch computes a pass depends only on the network's shape and device. Both give the same numbers,
+except for rounding, so a loss need not know which one is used.
 """
 
 from __future__ import annotations
@@ -71,12 +71,12 @@ def q_network(spec: PolicySpec, device: str, seed: int) -> QNetwork:
 
 def actor_and_critics(spec: PolicySpec, device: str, seed: int) -> ActorAndCritics:
     """The networks of an actor and two critics."""
-    small = is_small(spec, device) and len(spec.net) > 0  # the derivative by the action passes a hidden layer
+    small = is_small(spec, device) and len(spec.net) > 0  # the derivative with respect to the action needs a hidden layer
     return (SmallActorAndCritics if small else ActorAndCritics)(spec, device, seed=seed)
 
 
 class SmallActorCritic(ActorCriticNetwork):
-    """A small actor and critic: one pass for both, and for the distribution_kernel on top."""
+    """A small actor and critic: one pass for both, and for the action distribution on top."""
 
     def __init__(self, spec: PolicySpec, device: str = "cpu", *, seed: int = 0) -> None:
         super().__init__(spec, device, seed=seed)

@@ -245,7 +245,7 @@ MISTAKES: list[tuple[type, str]] = [
     (SavesAnArray, "state_dict['more']['array']: expected tensors, numbers, text, and lists and dicts of these"),
     (KeepsTheStateItLoads, "load_state_dict: expected that it copies the state, got one whose next update changes"),
     (Raises, "update: ValueError at test_algorithm_check.py:"),
-    (ReturnsOnlyALoss, "ReturnsOnlyALoss.loss: expected a tensor of no dimension that depends on"),
+    (ReturnsOnlyALoss, "ReturnsOnlyALoss.loss: expected a 0-dimensional tensor that depends on"),
 ]
 
 
