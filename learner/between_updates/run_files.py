@@ -152,7 +152,7 @@ class RunFiles:
         env = self._spec.env
         if env.factory is not None and not found_by_others(env.id):
             return f"{newest}; go on in Python with: millrace.train(ENV, resume={str(folder)!r})"
-        return f"{newest}; go on with: {resume_command(folder, elsewhere=elsewhere)}"
+        return f"{newest}; continue with: {resume_command(folder, elsewhere=elsewhere)}"
 
     def close(self) -> None:
         """Close the metrics. Also for a run that was cut short."""

@@ -1,1 +1,1 @@
-"""The workers that are connected: joining, leaving, keys, and what is logged of them."""
+"""The workers that are connected: joining, leaving, keys, and the log about them."""

@@ -22,7 +22,7 @@ from millrace.protocol.wire.learner_link import LearnerLink
 
 log = logging.getLogger("millrace.learner")
 
-LINGER_S = 0.5  # for what is queued, when the socket is closed
+LINGER_S = 0.5  # how long a closed socket still tries to send queued messages
 LINGER_ELSEWHERE_S = 2.0  # the same, if the learner is on another machine
 
 
@@ -36,7 +36,7 @@ class Bound:
     """None if no key is needed."""
 
     def announce(self, advertise: str) -> None:
-        """Log how a worker is started elsewhere."""
+        """Log how to start a worker on another machine."""
         for line in join_lines(self.link.address, advertise, self.keyring):
             log_notice(log, line)
 
@@ -48,9 +48,9 @@ def listen(where: Listening, resources: ExitStack, code: str = "") -> Bound:
 
 
 def bind(address: str, keyring: Keyring | None, resources: ExitStack, code: str = "", linger_s: float = LINGER_S) -> Bound:
-    """Bind this address for those whose keys are in `keyring`.
+    """Bind this address for peers whose keys are in `keyring`.
 
-    `code`: what travels to the workers as code, for the error; empty if nothing does. Raises `UsageError`.
+    `code`: what is sent to the workers as code, for the error; empty if nothing is. Raises `UsageError`.
     """
     if code and address.startswith("tcp://") and keyring is None:
         instead = REGISTER_IT if code == FACTORY else ""

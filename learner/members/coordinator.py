@@ -1,12 +1,13 @@
-"""The learner's half of every conversation, as far as all are alike. Pure: messages and `now` in, messages out.
+"""The part of the learner's side that all conversations share. Pure: messages and `now` in, messages out.
 
-Rule: who waits for the run when it begins is a member from then on, in the same session. If it describes an environment at
-that time, it is given work once it says that it has begun the run. What is not sent in a member's session is answered by the
-membership (`Membership.hear`), and so is a Failure; the rest goes to the part that knows what it means. A membership ends by
-Goodbye, by Failure, by the end of the process, by silence, by a refusal, or with its key. Then what the member held is taken
-back, and `_deal` gives it to others. What a Heartbeat shows to be lost on the way is sent again, before the reply.
+Rule: a worker that waits for the run when it begins becomes a member, in the same session. If it is describing an
+environment at that time, it gets work once it says that it has begun the run. The membership (`Membership.hear`) answers
+messages that don't belong to a member's session, and Failures; other messages go to the part that knows what they mean. A
+membership ends by Goodbye, by Failure, by the end of the process, by silence, by a refusal, or when its key is revoked. Then
+the member's tickets and lanes are taken back, and `_deal` gives them to others. If a Heartbeat shows that a message was
+lost, the message is sent again, before the reply.
 
-A subclass says what differs: what messages mean, what is dealt, what a loss means, and what becomes of a wrong answer.
+A subclass defines the rest: what messages mean, what is dealt, what a loss means, and what happens after a wrong answer.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ from millrace.protocol.messages import (
 
 
 class Coordinator(ABC, Generic[M]):
-    """The members, and what they are answered."""
+    """The members, and the answers to their messages."""
 
     def __init__(self, membership: Membership[M], worker_timeout_s: float) -> None:
         self.membership = membership
@@ -46,7 +47,7 @@ class Coordinator(ABC, Generic[M]):
 
     @property
     def events(self) -> list[Event]:
-        """Events that were not logged yet."""
+        """Events that have not been logged yet."""
         return self.membership.events
 
     # ---------------------------------------------------------------- in
@@ -60,7 +61,7 @@ class Coordinator(ABC, Generic[M]):
         return heard.out + (self._deal() if heard.changed else [])
 
     def take_over(self, waiting: Membership[Member], now: float) -> list[Outgoing]:
-        """The run begins for the workers that wait for it. Call it first."""
+        """Begin the run for the workers that wait for it. Call this first."""
         return self.membership.take_over(waiting, now) + self._deal()
 
     def reject_message(self, peer: bytes, why: str, now: float) -> list[Outgoing]:
@@ -76,7 +77,7 @@ class Coordinator(ABC, Generic[M]):
         return self.membership.revoke(peer, why) + self._deal()
 
     def process_ended(self, ended: WorkerExit | StartFailed) -> list[Outgoing]:
-        """A process of this program has ended."""
+        """Handle the end of a process that this program started."""
         match ended:
             case StartFailed(worker, reason, last_lines):
                 self.events.append(WorkerStartFailed(worker, reason, last_lines))
@@ -92,7 +93,7 @@ class Coordinator(ABC, Generic[M]):
         return self._deal() if self.membership.remove_silent(now, self.worker_timeout_s) else []
 
     def drain(self, reason: str) -> list[Outgoing]:
-        """Ask every worker to leave; nothing is dealt any more."""
+        """Ask every worker to leave, and deal nothing any more."""
         return self.membership.drain(reason)
 
     # ---------------------------------------------------------------- what differs
@@ -102,28 +103,31 @@ class Coordinator(ABC, Generic[M]):
         """The answer to what a member sent in its session."""
 
     def _not_of_member(self, message: ToLearner, answered: Answered) -> None:
-        """Learn from a message that the membership has answered."""
+        """Take note of a message that the membership has answered."""
 
     def _deal(self) -> list[Outgoing]:
-        """Give out what no worker has. Called after each event that may have changed who can take it."""
+        """Give out what no worker has. Called after each event that may have changed which worker can take it."""
         return []
 
     def _again(self, member: M, heartbeat: Heartbeat, lost: Sequence[int]) -> list[Outgoing]:
-        """What this heartbeat shows to be lost on the way. `lost`: among the tickets that the member holds."""
+        """The messages to send again because this heartbeat shows that they were lost.
+
+        `lost`: the lost ones of the member's tickets.
+        """
         return []
 
     def _received(self, member: M) -> tuple[Received, ...]:
-        """The lanes of this member, and what has come of them."""
+        """The lanes of this member, and which of their rollouts have arrived."""
         return ()
 
     def _unusable(self, member: M, why: str) -> list[Outgoing]:
-        """A member sent what could not be used."""
+        """Handle a message of a member that could not be used."""
         return self.membership.refuse(member, SentUnusable, why)
 
     # ---------------------------------------------------------------- inside
 
     def _heartbeat(self, member: M, heartbeat: Heartbeat) -> list[Outgoing]:
-        """What was lost on the way, then the reply."""
+        """Send lost messages again, then the reply."""
         lost = member.record_heartbeat(heartbeat)
         if member.state is MemberState.DRAINING:
             return [(member.peer, Drain(one_line(self.membership.draining or "")))]  # rule DRAIN_AGAIN

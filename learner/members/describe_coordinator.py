@@ -1,13 +1,13 @@
 """The conversation before a run: workers wait for it, and describe environments. Pure: messages and `now` in, messages out.
 
-Rule: one worker describes, the first that joined; the others wait. A worker that has not answered an order comes last when
-the next environment is described: it may hang. Each time that a worker is lost that was asked, or that
-no answer has come for long, twice as many are asked at once: one bad machine delays the start by one try, and an
-environment that fails everywhere is found out as fast as all workers together can.
+Rule: one worker describes, the first that joined; the others wait. A worker that has not answered an order is asked last for
+the next environment, because it may hang. Each time that a worker is lost after it was asked, or that no answer arrives for
+long, twice as many workers are asked at once. So one bad machine delays the start by one try, and an environment that fails
+everywhere is found out after few tries.
 
-Rule: the first description that can be read and is accepted is that of the run; other workers are compared with it when they
-open their lanes. A worker that declines, or describes what is not accepted, is refused; once `decliners_to_end` different
-workers have been, the start ends with the reason. A worker whose environment fails may come back.
+Rule: the run uses the first description that can be read and is accepted; other workers compare their env copies with it
+when they open lanes. A worker that declines, or describes what is not accepted, is refused; once `decliners_to_end`
+different workers have been refused, the start ends with the reason. A worker whose environment fails may come back.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from millrace.protocol.messages import TOLD_TO_STOP, Describe, Described, Goodby
 from millrace.protocol.progress import RunProgress
 from millrace.protocol.specs import WaitSpec
 
-FIRST_TICKET = 1 << 51  # of descriptions: far from those of a run, which may begin while a worker still describes
+FIRST_TICKET = 1 << 51  # of descriptions, far from a run's tickets: the run may begin while a worker still describes
 
 Accept = Callable[[DescribedEnv], None]
 """Raises `UsageError` if the run cannot be made with this environment."""
@@ -54,17 +54,17 @@ class DescribeCoordinator(Coordinator[Member]):
         """`decliners_to_end`: how many different workers must be unable to describe it until the start ends; 0: never."""
         super().__init__(Membership(wait, Member, self._removed, first_session), worker_timeout_s)
         self.described: DescribedEnv | None = None
-        """What the first usable description of the newest environment says."""
+        """The first usable description of the newest environment."""
         self.unsuitable: UsageError | None = None
-        """Why the start cannot go on: too many workers declined."""
+        """Why the start cannot continue: too many workers declined."""
         self._unknown: Unknown | None = None
-        self._at_once = 1  # how many workers may be describing
+        self._at_once = 1  # how many workers may describe at the same time
         self._tickets = FIRST_TICKET
         self._decliners_to_end = decliners_to_end
         self._decliners: set[str] = set()
 
     def ask(self, unknown: Unknown) -> list[Outgoing]:
-        """Have a worker describe this environment. `described` is what it says, until the next call."""
+        """Have a worker describe this environment. `described` is its answer, until the next call."""
         self.described = None
         self._unknown = unknown
         self._at_once = 1
@@ -72,7 +72,7 @@ class DescribeCoordinator(Coordinator[Member]):
         return self._deal()
 
     def ask_more(self) -> list[Outgoing]:
-        """No description has come for long: other workers describe the environment as well, if there are any."""
+        """No description has come for long: have other workers describe the environment as well, if there are any."""
         self._double()
         return self._deal()
 
@@ -143,18 +143,18 @@ class DescribeCoordinator(Coordinator[Member]):
         return self._unsuitable(member, Goodbye, reason)
 
     def _unsuitable(self, member: Member, event: type, reason: str) -> list[Outgoing]:
-        """The run cannot be made with this worker's environment."""
+        """Refuse a worker with whose environment the run cannot be made."""
         refusal = self.membership.refuse(member, event, reason)
         if self._decliners_to_end:
             self._decliners.add(member.hello.worker)
             if len(self._decliners) >= self._decliners_to_end:
-                self.membership.take_events()  # the reason is the error's text, and need not be logged too
+                self.membership.take_events()  # the error contains the reason, so it need not be logged
                 self.unsuitable = UsageError(reason)
         return refusal
 
 
 def _free_first(member: Member) -> tuple[bool, bool, int]:
-    """Sort key: who is not busy with an earlier order, and of these the one that gets the first lane, for it can use the
-    copy that it describes.
+    """Sort key: first the workers that aren't busy with an earlier order, and of these the one that gets the first lane,
+    because it can use the copy that it describes.
     """
     return bool(member.tickets), member.hello.evaluates, member.join_number

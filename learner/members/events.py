@@ -1,7 +1,7 @@
-"""Events of workers, for the log and for the hub, which decides whether the run can go on. Plain data.
+"""Events of workers, for the log and for the hub, which decides whether the run can continue. Plain data.
 
-`json_name` is the `event` field of a line of `--log-json`. Programs read these names: they must not change. An event without
-such a name is not logged as one.
+`json_name` is the `event` field of a line of `--log-json`. Programs read these names, so they must not change. An event
+without such a name isn't logged as an event.
 """
 
 from __future__ import annotations
@@ -36,7 +36,10 @@ class WorkerLeft:
 
 @dataclass(frozen=True)
 class WorkerRefused:
-    """A worker was refused, and is no member. `tickets`: how many of its tickets are dealt again, if it was one."""
+    """A worker was refused, and isn't a member any more.
+
+    `tickets`: how many of its tickets are dealt again, if it was one.
+    """
 
     json_name: ClassVar[str] = "refused"
     worker: str
@@ -46,7 +49,7 @@ class WorkerRefused:
 
 @dataclass(frozen=True)
 class NamelessHello:
-    """A Hello came over a connection without a routing id, and was refused.
+    """A Hello arrived over a connection without a routing id, and was refused.
 
     Usually it is harmless: a worker that connected again, or its successor of the same name, has taken over the routing id,
     and this is a leftover message of the older connection. A client that sets no routing id learns that by the refusal.
@@ -59,7 +62,7 @@ class NamelessHello:
 
 @dataclass(frozen=True)
 class Failed:
-    """A worker failed in the user's code. It may come back. Each event is one of the three classes below."""
+    """A worker failed in code that the user wrote. It may come back. Each event is one of the three classes below."""
 
     json_name: ClassVar[str]
     raised_as: ClassVar[type[EnvironmentFailed | PolicyFailed]] = EnvironmentFailed
@@ -74,7 +77,7 @@ class Failed:
     worked_s: float | None = None
     """Seconds from its first env step to the failure; None if its process is not known to have made one."""
     spare: bool = False
-    """Whether the run did not need it: every lane had another worker. Such a failure does not count against the run."""
+    """Whether the run didn't need the worker, because every lane had another one. Such a failure doesn't count."""
 
     @property
     def line(self) -> str:
@@ -95,7 +98,7 @@ class EnvironmentRaised(Failed):
 
 @dataclass(frozen=True)
 class PolicyRaised(Failed):
-    """A policy that the user wrote raised in a worker, returned what no rollout can hold, or ended the worker's process: it
+    """A policy that the user wrote raised in a worker, returned an unusable result, or ended the worker's process: it
     crashed, or did not return in time.
     """
 
@@ -105,7 +108,7 @@ class PolicyRaised(Failed):
 
 @dataclass(frozen=True)
 class WorkerProcessFailed(Failed):
-    """A worker's process ended in a way that it did not announce: its environment is to blame, as if it had raised."""
+    """A worker's process ended unannounced. Its environment is to blame, as if it had raised."""
 
     json_name: ClassVar[str] = "process_failed"
 
@@ -118,7 +121,7 @@ class WorkerStartFailed:
     worker: str
     why: str
     last_lines: str = ""
-    """What it wrote last."""
+    """The last lines of its output."""
 
 
 @dataclass(frozen=True)
@@ -145,13 +148,13 @@ class EnvironmentNoted:
 
 @dataclass(frozen=True)
 class LaneContinued:
-    """A lane whose rollouts another worker collected goes on with this one."""
+    """A lane whose rollouts another worker collected continues with this worker."""
 
     json_name: ClassVar[str] = "lane_continued"
     worker: str
     lane: int
     repeated_steps: int
-    """Env steps that are repeated before it goes on."""
+    """Env steps that are replayed before it continues."""
     new_episodes: int
     """How many of its env copies begin new episodes instead."""
     longest: int = 0
@@ -198,8 +201,8 @@ Event = LoggedEvent | RolloutRejected | RolloutArrived | EpisodesArrived
 
 
 def describe(event: LoggedEvent) -> str:
-    """Text for the log: one line, and below it the traceback or the last lines if there are any, indented, so that none of
-    them looks like a line of the log. Whatever a peer has named is shown without control characters.
+    """Text for the log: one line, then the traceback or the last lines of output, if any, indented so that none of them
+    looks like a line of the log. Texts of a peer are shown without control characters.
     """
     line = one_line(_line(event), 4 * MAX_LINE)
     match event:
@@ -219,8 +222,8 @@ def _line(event: LoggedEvent) -> str:
             return f"worker {worker} was refused: {why}{_dealt_again(tickets)}"
         case NamelessHello(worker, why):
             return (
-                f"worker {worker} said Hello over a connection that has no routing id: nothing is wrong if it has connected "
-                f"again; a client that sets none is refused: {why}"
+                f"worker {worker} said Hello over a connection without a routing id: this is harmless if it has connected "
+                f"again; a client that never sets one is refused: {why}"
             )
         case WorkerProcessFailed(spare=False):
             return joined(event.line, "this counts as a failure of the environment")
@@ -234,11 +237,11 @@ def _line(event: LoggedEvent) -> str:
         case EnvironmentNoted(worker, note):
             return f"worker {worker}: {note}"
         case LaneContinued(worker, lane, repeated, new, longest):
-            parts = [f"{repeated:,} env steps are repeated first"] if repeated or not new else []
+            parts = [f"{repeated:,} env steps are replayed first"] if repeated or not new else []
             if new:
                 parts.append(f"{new:,} env {'copies begin new episodes' if new > 1 else 'copy begins a new episode'}")
             why = f"; the longest one has {longest:,} steps, more than --replay-limit allows to repeat" if longest else ""
-            return f"lane {lane} goes on with worker {worker}: {', and '.join(parts)}{why}"
+            return f"lane {lane} continues on worker {worker}: {', and '.join(parts)}{why}"
 
 
 def _dealt_again(tickets: int) -> str:

@@ -3,14 +3,16 @@
 Rule: a failure is counted twice, and either count ends the run.
 
 * In a row: the failures of one lane since its last rollout. `max_env_failures` are allowed, and never more than
-  `MOST_IN_A_ROW`, so that what never works ends the run soon also where many failures are allowed. A failure after env steps
-  counts as `AFTER_STEPS`: by chance, a simulator that often dies fails a few times before a rollout is whole.
+`MOST_IN_A_ROW`, so that an environment that never works ends the run soon even if many failures are allowed. A failure after
+env steps counts as `AFTER_STEPS`, because a simulator that often crashes may by chance fail a few times before a rollout is
+complete.
 * Within an hour: the failures of all lanes that came after env steps. `max_env_failures` are allowed; as many again for each
   env copy and each hour since the learner began; and as many again for each `WORK_S` that the workers which failed had
   worked. So a mistake in an environment's code ends a run that has just begun, and a simulator that crashes now and then
   does not, as long as its workers work for most of the time.
 
-That ends a run late, so a person is told early: of the fourth failure within an hour, and whenever their number has doubled.
+These limits end a run late, so the log warns early: at the fourth failure within an hour, and whenever their number has
+doubled.
 """
 
 from __future__ import annotations
@@ -28,7 +30,7 @@ TOLD_FIRST = 4
 
 
 class FailureCount:
-    """The failures of a run. A lane has a number; a worker without a lane is counted by its name."""
+    """The failures of a run. Lanes are counted by number, and a worker without a lane by name."""
 
     def __init__(self, allowed: int, copies: int = 1, began_s: float = 0.0) -> None:
         """`allowed`: `max_env_failures`. `copies`: the env copies of the run. `began_s`: when the learner began."""
@@ -37,11 +39,11 @@ class FailureCount:
         self._began_s = began_s
         self._in_a_row: dict[int | str, float] = {}
         self._error: EnvironmentFailed | PolicyFailed | None = None
-        self._within_hour: list[tuple[float, float]] = []  # of failures after env steps: when, and the seconds worked before
+        self._within_hour: list[tuple[float, float]] = []  # failures after env steps: time, and seconds worked before
         self._told_at = TOLD_FIRST  # number of failures within an hour
 
     def failed(self, lanes: Collection[int | str], worked_s: float | None, now: float) -> str:
-        """Count one failure, which took these lanes down. Returns why the run ends, or an empty string.
+        """Count one failure, which stopped these lanes. Returns why the run ends, or an empty string.
 
         `worked_s`: for how long the worker had made env steps; None if its process is not known to have made one.
         """
@@ -67,7 +69,7 @@ class FailureCount:
         return f"failure {in_a_row:g} in a row{why}; max_env_failures allows {allowed} in a row"
 
     def count(self, event: Event, now: float) -> str:
-        """Count an event that is a failure, of the environment or of the user's policy: they are counted together.
+        """Count an event that is a failure of the environment or of a policy that the user wrote. They are counted together.
 
         Returns a line for the log, if a person should hear how often the environment fails; else an empty string.
         """
@@ -83,13 +85,13 @@ class FailureCount:
         return int(self._allowed * (1 + copy_hours + self._worked_s() / WORK_S))
 
     def _worked_s(self) -> float:
-        """How long the workers that failed within the hour had worked, all together."""
+        """How many seconds the workers that failed within the hour had worked, in total."""
         return sum(before_s for _, before_s in self._within_hour)
 
     def _how_often(self, now: float) -> str:
         failures = len(self._within_hour)
         if failures < self._told_at:
-            self._told_at = max(TOLD_FIRST, min(self._told_at, 2 * failures))  # they have become fewer
+            self._told_at = max(TOLD_FIRST, min(self._told_at, 2 * failures))  # the number may have fallen
             return ""
         self._told_at = 2 * failures
         seconds = now - self._within_hour[0][0]
@@ -101,7 +103,7 @@ class FailureCount:
         )
 
     def check(self) -> None:
-        """Raise the error that ends the run: the first failure that was one too many, if there was one."""
+        """Raise the error that ends the run, if there was one failure too many: the first such failure."""
         if self._error is not None:
             raise self._error
 
@@ -110,7 +112,10 @@ class FailureCount:
         self._in_a_row.pop(lane, None)
 
     def evaluated(self, worker: str | None = None) -> None:
-        """Episodes of an evaluation were played; they belong to no lane. `worker`: who played them beside training."""
+        """Episodes of an evaluation were played, which belong to no lane.
+
+        `worker`: the one that played them beside training.
+        """
         if worker is None:
             self._in_a_row.clear()
         else:

@@ -1,7 +1,7 @@
-"""What a member does, and what holds it up, in words for people. Pure.
+"""What a member is doing, and what holds it up, in words for people. Pure.
 
-Rule: a member is held up by one call of the user's code, or by its own silence. Many short calls hold it up by their number,
-so its env steps per second are said instead.
+Rule: a member is held up by one call of the user's code, or by its own silence. If it is slow because of many short calls,
+its env steps per second are shown instead.
 """
 
 from __future__ import annotations
@@ -22,26 +22,26 @@ DOING = {
     "evaluating": "in evaluation",
     "closing": "in close",
 }
-"""What a worker does, in words. A worker without a supervisor does not say it."""
-MOST_TOLD = 4  # workers of which one line says what they do
-LONG_S = 2.0  # what takes less time is not worth a word; by default, heartbeats come every second
+"""What a worker is doing, in words. A worker without a supervisor doesn't say it."""
+MOST_TOLD = 4  # workers in one line about what they are doing
+LONG_S = 2.0  # shorter times aren't shown; by default, heartbeats come every second
 
 
 def in_words(doing: str, seconds: float) -> str:
-    """What a worker does, and for how long if that is long."""
+    """What a worker is doing, and for how long if that is long."""
     words = DOING.get(doing, doing or "-")
     return f"{words} for {seconds:.0f} s" if seconds >= LONG_S else words
 
 
 def held_up(member: Member, now: float) -> tuple[float, float, str]:
-    """For how many seconds it is held up, its env steps per second below 0, and who is held up where, in what.
+    """For how many seconds it is held up, minus its env steps per second, and in words: who is held up where, in what.
 
-    The largest is that of the member that is held up longest, or else of the slowest.
+    The largest tuple belongs to the member that is held up longest, or else to the slowest.
     """
     row = member.status(now)
     seconds = 0.0
     silent_s = now - member.alive_s
-    # Its speed is measured between two heartbeats with more steps, so a worker that has made none has no speed.
+    # Its speed is measured between two heartbeats with more steps, so a worker without any has no speed.
     unmeasured = "has begun to step" if row.steps else "no env step yet"
     what = f"{row.steps_per_s:,.1f} steps/s" if row.steps_per_s else unmeasured
     if silent_s >= LONG_S:
@@ -56,8 +56,8 @@ def held_up(member: Member, now: float) -> tuple[float, float, str]:
 def what_they_do(
     members: Iterable[Member], running: Iterable[WorkerActivity], said: Mapping[str, str], now: float
 ) -> tuple[str, list[str]]:
-    """What the members do, those that are held up longest first, and then the worker processes that have not joined; and a
-    line for each worker that wrote something.
+    """What the members are doing, longest held up first, then the worker processes that have not joined; and a line for each
+    worker that wrote something.
 
     `said`: the last line of each worker's log, by its name.
     """

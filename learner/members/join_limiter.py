@@ -1,8 +1,8 @@
-"""Limits how many `Hello` are answered. Pure: `now` is an argument.
+"""Limits how many `Hello` messages are answered. Pure: `now` is an argument.
 
 Rule: the workers of one key may all start at once, and after that join at a steady rate; workers without keys share one
-limit. A `Hello` beyond it is not answered: an honest worker repeats it until it is. So a peer that joins again and again
-costs the learner little, and does not keep the workers of another key out.
+limit. A `Hello` beyond the limit is not answered: an honest worker repeats it until it gets an answer. So a peer that joins
+again and again costs the learner little, and does not keep the workers of another key out.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ PER_S = 100.0  # Hellos of one key
 
 
 class JoinLimiter:
-    """Says which `Hello` is answered."""
+    """Decides which `Hello` messages are answered."""
 
     def __init__(self) -> None:
         self._buckets: dict[str, TokenBucket] = {}  # by the key's name: as many as there are keys

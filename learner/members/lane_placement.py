@@ -1,9 +1,9 @@
 """Assignment of lanes to workers. Pure: no clock, no socket.
 
 Rule: every lane has an owner as long as there are workers, and no worker has two lanes more than another. Workers that only
-evaluate have none, and those that still describe an environment have none yet. A lane moves only between its rollouts.
-Placement is computed again only after an event that can change it: with a thousand workers, to look at all of them at each
-rollout would cost more than the rollout.
+evaluate or still describe an environment have none. A lane moves only between its rollouts. Placement is computed again only
+after an event that can change it: with a thousand workers, checking all of them at each rollout would cost more than the
+rollout.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from millrace.protocol.messages import LaneIncarnation, Release
 
 @dataclass
 class PlacedLane:
-    """A lane as the learner sees it: with which worker it lives, and how often it was started."""
+    """A lane as the learner sees it: which worker has it, and how often it was started."""
 
     number: int
     incarnation: int = 0
@@ -36,7 +36,7 @@ class PlacedLane:
         return 0
 
     def restart(self) -> None:
-        """The lane left its worker: its next owner starts it on new env copies."""
+        """Record that the lane left its worker: its next owner starts it on new env copies."""
         self.owner = None
         self.moving = False
 
@@ -45,7 +45,7 @@ L = TypeVar("L", bound=PlacedLane)
 
 
 def is_spare(member: Member, lanes: Iterable[PlacedLane]) -> bool:
-    """Whether the run needs no environment of this worker: it may have a lane and has none, and every lane has a worker."""
+    """Whether the run doesn't need this worker's environments: it has no lane but may, and every lane has a worker."""
     return not (member.hello.evaluates or member.lanes) and all(lane.owner is not None for lane in lanes)
 
 

@@ -37,16 +37,16 @@ POLL_S = 0.05
 
 @dataclass(frozen=True)
 class LobbySettings:
-    """The settings of a run that matter before it begins, named as there."""
+    """The settings of a run that matter before it begins, with the names that they have in `Config`."""
 
     wait: WaitSpec
-    """What the workers are welcomed by."""
+    """What a Welcome to waiting workers says."""
     worker_timeout_s: float
     no_workers_timeout_s: float
     stall_timeout_s: float
     max_env_failures: int
     progress: RunProgress = field(default_factory=RunProgress)
-    """How far the run is: one that is resumed does not begin with 0."""
+    """How far the run is: a resumed run doesn't begin at 0."""
     launched_workers: int = 0
 
 
@@ -66,7 +66,7 @@ class Lobby:
         self.link = link
         self.processes = processes
         self.first_session = int.from_bytes(os.urandom(6), "little")
-        """also of the run: it counts on"""
+        """also of the run, which continues its counts"""
         self._settings = settings
         self._clock = clock
         coordinator = self._coordinator = DescribeCoordinator(
@@ -79,7 +79,7 @@ class Lobby:
         self._server = MemberServer(link, coordinator, self, processes, ServerSettings(log_joins=False), clock)
 
     def describe(self, unknown: Unknown, check_interrupt: Callable[[], None] = _never) -> DescribedEnv:
-        """The environment as the first worker describes it whose description is accepted.
+        """The environment, from the first description by a worker that is accepted.
 
         `check_interrupt` is called at least every 0.1 s: what it raises ends the wait. Raises `UsageError` if a worker of
         this program, or each of `launched_workers`, says that there is no such environment, or describes one that is not
@@ -97,7 +97,7 @@ class Lobby:
             check_interrupt()
             self._check()
             now = self._clock()
-            # In environment code, a worker is ended by the timeouts of the calls, which name themselves.
+            # In environment code, the timeouts of calls end a worker, and their errors name them.
             busy_s = max((member.in_env_code_s for member in members.values()), default=began_s)
             if now - max(began_s, busy_s) > stall_timeout_s and members:
                 told = server.what_workers_do()
@@ -130,15 +130,15 @@ class Lobby:
         self._failures.count(event, self._clock())
 
     def sent(self, peer: bytes) -> None:
-        """Nothing is to be done when a message was sent."""
+        """Do nothing when a message was sent."""
 
     def listen(self) -> None:
-        """Answer the workers, while the learner prepares the run. Raises as `describe` does if none can take part in it."""
+        """Answer the workers while the learner prepares the run. Raises like `describe` if none can take part in it."""
         self._server.listen(0.0)
         self._check()
 
     def hand_over(self) -> Membership[Member]:
-        """The run begins. Returns the workers that wait for it: its hub takes them over."""
+        """Begin the run. Returns the workers that wait for it: the run's hub takes them over."""
         self._server.listen(0.0)  # so that it takes over nobody whose process has ended, or whose key was revoked meanwhile
         self._server.close()
         return self._coordinator.membership

@@ -1,7 +1,7 @@
-"""A worker as the learner sees it: what it has said of itself, and what it was given. Plain data, and figures made of it.
+"""A worker as the learner sees it: what it has said about itself, and what it was given. Plain data and derived figures.
 
-Rule: a worker may claim anything, so no figure is more than it can be: seconds are bounded by the session, late actions by a
-number that no loop reaches, and of a list of tickets nothing is kept.
+Rule: a worker may claim anything, so each figure is bounded: seconds by the length of the session, late actions by a number
+that no loop reaches. A list of tickets is not kept.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from millrace.protocol.bounds import Stages
 from millrace.protocol.call_timeouts import OUR_CODE
 from millrace.protocol.messages import Heartbeat, Hello, WorkerActivity, WorkerStatus
 
-MEASURE_S = 0.5  # at least, between the two heartbeats that a worker's speed is measured by: several may be read at once
+MEASURE_S = 0.5  # least time between the two heartbeats that measure a worker's speed: several may be read at once
 MAX_LATE_ACTIONS = 1_000_000  # between two heartbeats
-SUPERVISOR_WORD_S = 5.0  # what a supervisor said holds for this long
+SUPERVISOR_WORD_S = 5.0  # for how long a supervisor's statement is valid
 
 
 @dataclass(eq=False)
@@ -27,11 +27,11 @@ class SharingSupervisor:
 
     peer: bytes
     heard_s: float = 0.0
-    """Time of its last word."""
+    """Time of its last message."""
     replies: int = 0
     """Number of heartbeat replies that were sent to it."""
     received: int = 0
-    """Number of the last one that it has received: what was sent before it has arrived, or is lost."""
+    """Number of the last one that it has received: messages sent before that one have arrived, or are lost."""
 
 
 @dataclass(frozen=True)
@@ -42,16 +42,16 @@ class Speed:
     """
 
     steps: int
-    """Env steps in the heartbeat by which it was last measured."""
+    """Env steps in the heartbeat with which it was last measured."""
     at_s: float
-    """Time when that arrived."""
+    """Time when that heartbeat arrived."""
     gained: int = 0
-    """By how many env steps these were more than when it was measured before."""
+    """Env steps since the measurement before."""
     seconds: float = 1.0
-    """Between the two."""
+    """Seconds between the two measurements."""
 
     def after(self, steps: int, now: float) -> Speed:
-        """As measured by a later heartbeat."""
+        """The speed measured with a later heartbeat."""
         return Speed(steps, now, steps - self.steps, now - self.at_s)
 
     def steps_per_s(self, now: float) -> float:
@@ -74,7 +74,7 @@ class Member:
     joined_s: float = 0.0
     """Time when it joined."""
     takeovers: int = 0
-    """How often processes have taken this name from each other, without a time in which nobody had it."""
+    """How often processes have taken this name from each other, one directly after the other."""
     state: MemberState = MemberState.ACTIVE
     lanes: set[int] = field(default_factory=set)
     tickets: dict[int, int] = field(default_factory=dict)
@@ -84,26 +84,29 @@ class Member:
     welcomed: int = 0
     """`replies` when the run was sent to it."""
     describes: bool = False
-    """Whether it may still be busy with a description that it was asked for before the run: it has not begun the run, as
-    far as is known."""
+    """Whether it may still be busy with a description that it was asked for before the run: as far as is known, it has not
+    begun the run.
+    """
     heartbeat: Heartbeat | None = None
     """Newest heartbeat."""
     stages_before: Stages = field(default_factory=dict)
     """Seconds in each stage of the worker's process before this session."""
     speed: Speed | None = None
-    """Measured by its heartbeats; None: there was none."""
+    """Speed measured with its heartbeats; None: there was none."""
     first_step_s: float | None = None
-    """Time since which its process is known to make env steps: it has reported one, or sent a rollout."""
+    """Time at which its process was first known to make env steps: it reported one, or sent a rollout."""
     activity: WorkerActivity | None = None
-    """What the worker does, as its supervisor said last."""
+    """What the worker is doing, as its supervisor last said."""
     activity_s: float = 0.0
     """Time when the supervisor said that."""
     failed_lane: int | None = None
-    """The lane whose environment failed, by which the worker has left."""
+    """The lane whose environment failed, so that the worker left."""
     hung: bool = False
     """Whether its process was ended because a call took too long."""
     in_env_code_s: float = -math.inf
-    """Time when the supervisor said last that the worker is in the user's code: until then the worker was not silent."""
+    """Time when the supervisor last said that the worker is in code of the environment or of a policy that the user wrote:
+    until then the worker doesn't count as silent.
+    """
     supervisor: SharingSupervisor | None = None
     """Its supervisor, if it shares weights."""
 
@@ -115,14 +118,14 @@ class Member:
 
     @property
     def role(self) -> str:
-        """What it is to the run: draining, evaluating (it does only that), active, or spare (it has no lane)."""
+        """Its role in the run: draining, evaluating (it only evaluates), active, or spare (it has no lane)."""
         if self.state is MemberState.DRAINING:
             return "draining"
         return "evaluating" if self.hello.evaluates else "active" if self.lanes else "spare"
 
     @property
     def has_counted(self) -> bool:
-        """Whether what its process counts began before its part in this run, as of the next heartbeat."""
+        """Whether the counts of its process, as of the next heartbeat, began before its part in this run."""
         return not self.hello.is_first_attempt if self.heartbeat is None else self.heartbeat.waits
 
     @property
@@ -136,12 +139,12 @@ class Member:
         return None if self.first_step_s is None else max(0.0, self.alive_s - self.first_step_s)
 
     def has_stepped(self) -> None:
-        """Its process is known to have made an env step."""
+        """Record that its process has made an env step."""
         if self.first_step_s is None:
             self.first_step_s = self.heard_s
 
     def record_activity(self, activity: WorkerActivity, now: float) -> bool:
-        """Keep what the supervisor says. True if calls of the environment have returned since it last did."""
+        """Keep what the supervisor says. True if calls of the environment have returned since its last message."""
         before = self.activity
         self.activity = activity
         self.activity_s = now
@@ -156,7 +159,7 @@ class Member:
         """
         if self.has_counted:
             self.stages_before = heartbeat.stages
-        self.heartbeat = msgspec.structs.replace(heartbeat, tickets=())  # a peer may list many, and it is kept
+        self.heartbeat = msgspec.structs.replace(heartbeat, tickets=())  # a peer may list many, and the heartbeat is kept
         if heartbeat.steps:
             self.has_stepped()
         if self.speed is None:
@@ -186,7 +189,7 @@ class Member:
     def stages(self) -> Stages:
         """Seconds in each stage during this session, by its newest heartbeat; none is longer than the session.
 
-        A member that only evaluates waits for nothing that training could give it, so that is not counted.
+        The waiting of a member that only evaluates is not counted: it doesn't wait for anything from training.
         """
         lasted_s = self.heard_s - self.joined_s
         return {

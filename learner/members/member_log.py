@@ -1,7 +1,7 @@
-"""A rate-limited log of what workers send and of what happens among them.
+"""A rate-limited log of workers' messages and events.
 
 Rule: lines and bytes are limited for each worker, and for all workers of one key together; workers without keys share one
-limit. So a peer that joins under ever new names, or with long texts, cannot fill the log. What was left out is counted.
+limit. So a peer that joins under ever new names, or with long texts, cannot fill the log. Omitted lines are counted.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ log = logging.getLogger("millrace.learner")
 MOST_WORKERS = 1_000  # whose budgets are remembered
 OF_A_WORKER = Allowance(lines=30, lines_per_s=0.2, bytes=MAX_TEXT, bytes_per_s=100)
 OF_A_KEY = Allowance(lines=5_000, lines_per_s=1, bytes=6 * MAX_TEXT, bytes_per_s=100)
-LINE_BYTES = 100  # that a line takes beside its text: time, level, line break
+LINE_BYTES = 100  # of a line besides its text: time, level, line break
 
 
 class MemberLog:
-    """Log lines that workers cause: few for each worker and for each key, however much it sends."""
+    """Log lines caused by workers: few for each worker and for each key, however much it sends."""
 
     def __init__(self, link: LearnerLink, clock: Callable[[], float]) -> None:
         self._link = link
@@ -57,7 +57,7 @@ class MemberLog:
         now = self._clock()
         first, _, more = lines.partition("\n")
         if more and not all(budget.covers(_size(lines), now) for budget in budgets):
-            lines = f"{first} (its traceback is left out: too much was logged of this worker)"
+            lines = f"{first} (its traceback is left out: too much was logged about this worker)"
             event = None  # it carries the traceback
         size = _size(lines)
         if not all(budget.covers(size, now) for budget in budgets):
@@ -81,7 +81,7 @@ class MemberLog:
 
     def _budget_of_worker(self, source: str, worker: str) -> LogBudget:
         budget = self._of_worker.pop((source, worker), None) or LogBudget(OF_A_WORKER)
-        self._of_worker[source, worker] = budget  # last in the table: the worker that was silent for longest stands first
+        self._of_worker[source, worker] = budget  # last in the table: the first is the worker that was silent for longest
         if len(self._of_worker) > MOST_WORKERS:
             del self._of_worker[next(iter(self._of_worker))]
         return budget

@@ -55,18 +55,18 @@ from millrace.protocol.wire.learner_link import LearnerLink
 
 log = logging.getLogger("millrace.learner")
 
-ASK_PROCESSES_S = 0.25  # interval of asking what the workers do that this program started
+ASK_PROCESSES_S = 0.25  # interval of asking what the workers that this program started are doing
 AWAY_S = 0.5  # a learner that has not listened for longer was busy, or its process was stopped
-TURN_S = 0.2  # of reading messages, at most, before the caller may go on
-SHORT_TURN_S = 0.003  # at least so much, also in a short turn
-FAIR_SHARE = 10_000  # messages after which every connection was read, for ZeroMQ takes them in turn
-LAST_MESSAGES_WAIT_S = 0.1  # what a process sent before it ended may still be on its way, after what it sent before that
-LAST_MESSAGES_TURNS = 10  # such waits, at most: other workers go on sending
-STATUS_SHARE = 20  # making answers to Inquire takes at most this part of the time
+TURN_S = 0.2  # most time for reading messages before the caller continues
+SHORT_TURN_S = 0.003  # least time, also in a short turn
+FAIR_SHARE = 10_000  # messages after which every connection was read, because ZeroMQ takes turns
+LAST_MESSAGES_WAIT_S = 0.1  # for the last messages of an ended process, which may still be on their way
+LAST_MESSAGES_TURNS = 10  # most such waits: other workers keep sending
+STATUS_SHARE = 20  # answers to Inquire take at most 1 / STATUS_SHARE of the time
 
 
 class ServedHub(Protocol):
-    """Whom a server serves: what listens to the workers. It waits in the server, and hears from it what has happened."""
+    """The owner of a server: it waits in the server, which tells it what has happened."""
 
     def status(self, now: float) -> Status:
         """The answer to `millrace status`."""
@@ -85,9 +85,9 @@ class ServerSettings:
     grace_s: float = AWAY_S
     """For how long, after the learner was away, no worker is removed as silent."""
     log_tracebacks: bool = True
-    """Whether the traceback of an environment is logged; if not, the hub raises it."""
+    """Whether to log the traceback of an environment; if not, the hub raises it."""
     log_joins: bool = True
-    """Whether it is logged that a worker joined; if not, it joins the run in a moment."""
+    """Whether to log that a worker joined; if not, it will join the run in a moment."""
 
 
 class MemberServer:
@@ -114,22 +114,22 @@ class MemberServer:
         self._clock = clock
         self._keys = KeyRevocation(link)
         self.member_log = MemberLog(link, clock)
-        """lines about members, few for each peer"""
+        """the rate-limited log about members"""
         self._remove_silent_from_s = self.listened_s
         self._ask_processes_s = self.listened_s
         self._no_members_since_s = math.inf
-        self._last_turned_away = ""  # what became of the last worker that did not stay
+        self._last_turned_away = ""  # why the last worker that didn't stay left
         self._encoded: tuple[ToWorker, Sequence[Buffer]] | None = None
         self._joins = JoinLimiter()
         self._read_since_empty = 0  # messages, since the inbox was empty
         self._status: tuple[float, Sequence[Buffer]] = (-math.inf, ())  # until when it is fresh enough, and its frames
         self.unexpected_errors = 0
-        """errors of this program that a peer's message led to; each cost that peer its membership, and nothing else"""
+        """errors of this program that a peer's message caused; each cost only that peer its membership"""
 
     def listen(self, timeout_s: float, short: bool = False) -> None:
         """Wait at most `timeout_s` for messages, answer them, and remove the members that are gone.
 
-        `short`: answer for no longer than the caller has worked since the last time; what is left waits.
+        `short`: answer for no longer than the caller has worked since the last call; other messages wait.
         """
         worked_s = self._clock() - self.listened_s
         self.receive(timeout_s, min(TURN_S, max(SHORT_TURN_S, worked_s)) if short else TURN_S)
@@ -138,7 +138,7 @@ class MemberServer:
         now = self._clock()
         self._record_activities(now)
         if now - self.listened_s > timeout_s + AWAY_S:
-            # Messages of the meantime may still lie in the kernel: if we were stopped, so was ZeroMQ's thread.
+            # Messages sent meanwhile may still be in the kernel: if this process was stopped, so was ZeroMQ's thread.
             self._remove_silent_from_s = now + self._settings.grace_s
         self.listened_s = now
         if now >= self._remove_silent_from_s and (not self._read_since_empty or self._read_since_empty >= FAIR_SHARE):
@@ -160,7 +160,7 @@ class MemberServer:
         self._read_since_empty = 0
 
     def send(self, messages: Sequence[Outgoing], cause: bytes | None = None) -> None:
-        """Send these messages, then log what has happened. `cause`: the peer whose message made it happen, if one did."""
+        """Send these messages, then log what has happened. `cause`: the peer whose message caused it, if any."""
         for peer, message in messages:
             self._link.send(peer, self._frames(message))  # if it fails, the worker is soon removed as silent
             self._hub.sent(peer)
@@ -170,7 +170,7 @@ class MemberServer:
     def wait_for(self, workers: int, timeout_s: float, turn: Callable[[], None]) -> None:
         """Call `turn`, which listens, until this number of `workers` have joined.
 
-        Raises `NoWorkers` after `timeout_s`, or at once if so many cannot join any more. Workers that only evaluate do not
+        Raises `NoWorkers` after `timeout_s`, or at once if that many can't join any more. Workers that only evaluate don't
         count.
         """
         deadline_s = self._clock() + timeout_s
@@ -188,10 +188,10 @@ class MemberServer:
             turn()
 
     def check_members(self, timeout_s: float, *, collecting: bool = False) -> None:
-        """Raise `NoWorkers` if every call for `timeout_s` has found no worker, or at once if none can join any more. Call it
-        after each turn of a wait.
+        """Raise `NoWorkers` if there was no worker in any call for `timeout_s`, or at once if none can join any more. Call
+        it after each turn of a wait.
 
-        `collecting`: workers that only evaluate are no help.
+        `collecting`: workers that only evaluate don't count.
         """
         now = self._clock()
         if any(not (collecting and member.hello.evaluates) for member in self._membership.members.values()):
@@ -220,8 +220,8 @@ class MemberServer:
             self._remove_ended_processes(0.0)
 
     def close(self) -> None:
-        """Forget the hub. The hub refers to this server, so else both would wait for the garbage collector, and so would
-        the file descriptors of what they hold.
+        """Forget the hub. The hub refers to this server, so otherwise both, with their file descriptors, would wait for the
+        garbage collector.
         """
         del self._hub, self._processes
 
@@ -235,14 +235,14 @@ class MemberServer:
         return NoWorkers(f"waited {timeout_s:g} s for {awaited} at {address}, {joined}; start one: {start}")
 
     def what_workers_do(self) -> str:
-        """What the workers do, those that are held up longest first, and what is awaited if there are none."""
+        """What the workers are doing, longest held up first; if there are none, what is awaited."""
         members = self._membership.members.values()
         processes = self._processes
         doing, wrote = what_they_do(members, processes.activities(), processes.last_lines(), self._clock())
         return "; ".join([doing or f"waiting for {self.awaited()}", *wrote])
 
     def awaited(self) -> str:
-        """What is awaited without a worker, with the known reasons why workers may be missing."""
+        """What a run without workers waits for, with the known reasons why workers may be missing."""
         return f"a worker to join at {self._link.address}{self._missing_reason()}"
 
     # ---------------------------------------------------------------- inside
@@ -254,7 +254,7 @@ class MemberServer:
         return f" ({self._link.refused} were not let in; the log says why)" if self._link.refused else ""
 
     def _answer(self, peer: bytes, message: ToLearner | Inquire | BadMessage, now: float) -> Sequence[Outgoing]:
-        """Answer one message. Whatever goes wrong costs its sender its membership, and never ends the run."""
+        """Answer one message. An error costs its sender the membership, and never ends the run."""
         try:
             match message:
                 case BadMessage():
@@ -271,7 +271,10 @@ class MemberServer:
             return self._refuse_after_error(peer, type(message).__name__, error)
 
     def _refuse_after_error(self, peer: bytes, kind: str, error: Exception) -> Sequence[Outgoing]:
-        """The last guard: no message should lead here. Refuse its sender; log the first such error with its traceback."""
+        """The last safeguard: no message should cause this.
+
+        Refuse its sender; log the first such error with its traceback.
+        """
         self.unexpected_errors += 1
         line = f"its {kind} led to an error in the learner: {type(error).__name__}"
         if self.unexpected_errors == 1:
@@ -280,7 +283,7 @@ class MemberServer:
         return [(peer, Refuse(line))] if member is None else self._membership.refuse(member, SentUnusable, line)
 
     def _status_frames(self, now: float) -> Sequence[Buffer]:
-        """Frames of a status. It is made anew after `STATUS_SHARE` times as long as it took to make."""
+        """Frames of a status. It is recomputed only after `STATUS_SHARE` times the time that computing it took."""
         if now >= self._status[0]:
             frames = status_frames(self._hub.status(now))
             took_s = self._clock() - now
@@ -292,7 +295,7 @@ class MemberServer:
             self.send(self._coordinator.revoke(peer, why))
 
     def _remove_ended_processes(self, last_messages_wait_s: float) -> None:
-        """Remove the workers whose processes have ended, after what they sent last: it may say why."""
+        """Remove the workers whose processes have ended, once their last messages are read: these may say why."""
         ended = list(self._processes.ended())
         until_s = self._clock() + LAST_MESSAGES_TURNS * last_messages_wait_s
         while ended and self._link.poll(last_messages_wait_s):
@@ -303,7 +306,7 @@ class MemberServer:
             self.send(self._coordinator.process_ended(worker_exit))
 
     def _record_activities(self, now: float) -> None:
-        """Record what the workers do that this program started."""
+        """Record what the workers that this program started are doing."""
         if now >= self._ask_processes_s:
             self._ask_processes_s = now + ASK_PROCESSES_S
             for activity in self._processes.activities():
@@ -318,7 +321,7 @@ class MemberServer:
         return self._encoded[1]
 
     def _log_events(self, cause: bytes | None) -> None:
-        told = ""  # the worker of whose failure the log has just told
+        told = ""  # the worker whose failure was just logged
         for event in self._membership.take_events():
             match event:
                 case RolloutArrived() | EpisodesArrived():
@@ -330,7 +333,7 @@ class MemberServer:
             self._hub.happened(event)
 
     def _log_event(self, event: LoggedEvent, cause: bytes | None, told: str) -> str:
-        """Log an event. `told`: the worker of whose failure the log has just told. Returns who that is now."""
+        """Log an event. `told`: the worker whose failure was just logged. Returns who that is now."""
         line = describe(event)
         expected = isinstance(event, WorkerJoined | WorkerToldToRejoin | NamelessHello)
         match event:

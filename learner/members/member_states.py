@@ -1,4 +1,4 @@
-"""The states of a worker as the learner sees them, and the table of what each message or event makes of them. Plain data."""
+"""The states of a worker as the learner sees them, and the table of transitions by messages and events. Plain data."""
 
 from __future__ import annotations
 

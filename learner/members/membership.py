@@ -1,6 +1,6 @@
 """Membership of workers: joining, sessions, names, refusals, leaving. Pure: messages and `now` in, messages out.
 
-Rule: what is kept of a worker ends with its session, beside totals and a limited number of refusals. The number of
+Rule: the learner's data about a worker ends with its session, except totals and a limited number of refusals. The number of
 members is limited.
 
 Rule: the workers that have joined before there is a run keep their sessions when it begins (`take_over`). One that was
@@ -62,17 +62,17 @@ MOST_TAKEOVERS = 3  # of one name, by one live process from another
 NAMELESS = "its connection has no routing id: expected the worker's name, set as the socket's routing id before it connects"
 
 Outgoing = tuple[bytes, ToWorker]
-"""A message and the routing id of the worker that it is sent to."""
+"""The routing id of a worker, and a message for it."""
 
 
 @dataclass(frozen=True)
 class Answered:
-    """What became of a message that no member sent in its session, or by which a member failed: it is answered."""
+    """The answer to a message that no member sent in its session, or to a member's Failure."""
 
     out: list[Outgoing]
     """The answer."""
     changed: bool = False
-    """Whether a worker has joined by it, or members were removed."""
+    """Whether a worker joined, or members were removed."""
 
 
 M = TypeVar("M", bound=Member)
@@ -92,26 +92,25 @@ class Membership(Generic[M]):
         is_spare: Callable[[M], bool] = lambda member: False,
     ) -> None:
         """`on_removed` is called with each member that was removed, and why: it takes back what that member held.
-
-        `is_spare`: whether the run needs no environment of a member, so that its failures do not count.
+        `is_spare`: whether the run doesn't need a member's environments, so that its failures don't count.
         """
         self.members: dict[bytes, M] = {}
         self.events: list[Event] = []
         self.draining: str | None = None
-        """why the workers were asked to leave; None while they were not"""
+        """why the workers were asked to leave; None if they were not"""
         self.progress = {False: 0, True: 0}
         """how often a member has reported more env steps, or more calls of the environment that have returned: by whether it
         only evaluates
         """
         self.has_policy_code = isinstance(run, RunSpec) and bool(run.policy_code)
-        """whether a policy of the user's acts in the workers: no worker can blame one that is ours"""
+        """whether a user-defined policy acts in the workers: no worker can blame a built-in one"""
         self._run = run
         self._member_class = member_class
         self._on_removed = on_removed
         self.is_spare = is_spare
         self._first_session = self._next_session = first_session
         self._joins = 0
-        self._none_silent_before_s = -math.inf  # until then no member can have been silent for too long
+        self._none_silent_before_s = -math.inf  # before this time no member can be silent for too long
         self._of_process: dict[tuple[str, int], M] = {}  # by name and process_nonce
         self._removed_for_silence: dict[str, int] = {}  # name -> process_nonce, until they join again; the oldest first
         self._stages_of_left: Stages = {}  # of the members that have left
@@ -143,7 +142,7 @@ class Membership(Generic[M]):
         return events
 
     def hear(self, peer: bytes, message: ToLearner, now: float) -> M | Answered:
-        """The member that sent this message in its session and stays. To any other message, the answer."""
+        """The member, if a member that stays sent this message in its session. Otherwise the answer to the message."""
         match message:
             case Hello():
                 out, joined = self.join(peer, message, now)
@@ -178,7 +177,7 @@ class Membership(Generic[M]):
         return [(peer, Rejoin(message.session))]
 
     def join(self, peer: bytes, hello: Hello, now: float) -> tuple[list[Outgoing], M | None]:
-        """Answer a Hello. Returns the answer, and the member if one has joined by it."""
+        """Answer a Hello. Returns the answer, and the member if one joined."""
         if not worker_name(peer):
             self.events.append(NamelessHello(hello.worker, NAMELESS))
             return [(peer, Refuse(NAMELESS))], None
@@ -224,7 +223,7 @@ class Membership(Generic[M]):
         return [self._welcome(member)], member
 
     def take_over(self, waiting: Membership[Member], now: float) -> list[Outgoing]:
-        """The run begins for the workers that wait for it: their sessions go on, and another Welcome brings the run."""
+        """Begin the run for the workers that wait for it: their sessions continue, and another Welcome brings the run."""
         self._first_session = waiting._first_session
         self._next_session = waiting._next_session
         self._joins = waiting._joins
@@ -241,12 +240,12 @@ class Membership(Generic[M]):
         return [self._welcome(member) for member in self.members.values()]
 
     def welcome_again(self, member: M, heartbeat: Heartbeat) -> list[Outgoing]:
-        """The Welcome that brings the run, if this heartbeat shows that it was lost on the way."""
+        """The Welcome that brings the run, again, if this heartbeat shows that it was lost."""
         lost = heartbeat.waits and not isinstance(self._run, WaitSpec) and heartbeat.replies > member.welcomed
         return [self._welcome(member)] if lost else []
 
     def leave(self, member: M, reason: str) -> None:
-        """A member says Goodbye: remove it."""
+        """Remove a member that said Goodbye."""
         self.remove(member, Goodbye, f"left: {reason}")
 
     def refuse(self, member: M, event: type, why: str) -> list[Outgoing]:
@@ -259,9 +258,9 @@ class Membership(Generic[M]):
         return self._refuse_and_remove(self.members[peer], KeyRevoked, f"was shut out: {why}", why)
 
     def hear_supervisor(self, peer: bytes, alive: Alive, now: float) -> tuple[list[Outgoing], list[WorkerExit]]:
-        """Record what a supervisor says of members that use the same key as it does, and whose nonce it knows.
+        """Record what a supervisor says about members that use its key and whose nonce it knows.
 
-        Returns the answer, and the exits by which members were removed.
+        Returns the answer, and the exits that removed members.
         """
         key = key_of_peer(peer)
         found = [self.record_activity(activity, now, key) for activity in alive.running]
@@ -283,9 +282,9 @@ class Membership(Generic[M]):
         return answer, removed
 
     def record_activity(self, activity: WorkerActivity, now: float, key: bytes | None = None) -> M | None:
-        """Record what a member's process does. Returns the member.
+        """Record what a member's process is doing. Returns the member.
 
-        `key`: that of the supervisor which says so; None: this program is it.
+        `key`: the key of the supervisor that says so; None: this program is the supervisor.
         """
         member = self._of_process.get((activity.worker, activity.process_nonce))
         if member is None or (key is not None and key != key_of_peer(member.peer)):
@@ -295,7 +294,7 @@ class Membership(Generic[M]):
         return member
 
     def record_exit(self, worker_exit: WorkerExit, key: bytes | None = None) -> bool:
-        """A member's process has ended: remove the member. True if it was one. `key`: as for `record_activity`."""
+        """Remove the member whose process has ended. True if there was one. `key`: as for `record_activity`."""
         worker = worker_exit.worker
         reason = worker_exit.reason
         member = self._of_process.get((worker, worker_exit.process_nonce))
@@ -347,7 +346,7 @@ class Membership(Generic[M]):
         return out
 
     def _fail(self, member: M, failure: Failure) -> None:
-        """A member says that code of the user has failed: remove it."""
+        """Remove a member which says that code of the environment or the user's policy has failed."""
         by_policy = failure.of_policy and self.has_policy_code
         kind = PolicyRaised if by_policy else EnvironmentRaised
         self.events.append(self._failed(kind, member, failure.error, failure.traceback, failure.lane))
@@ -355,7 +354,7 @@ class Membership(Generic[M]):
         self.remove(member, Failure, "failed")
 
     def _failed(self, kind: type[Failed], member: M, error: str, traceback: str = "", lane: int | None = None) -> Failed:
-        """The event that says that a member failed, in this lane if it is known to be its lane."""
+        """The event of a member's failure, in this lane if it is known to be the member's lane."""
         return kind(
             worker=member.hello.worker,
             host=member.hello.host,
@@ -379,7 +378,7 @@ class Membership(Generic[M]):
 
 
 def _remember(table: dict[K, V], key: K, value: V) -> None:
-    """Keep it in a table that is limited: the oldest entry goes first."""
+    """Keep the value in a table of limited size: the oldest entry is dropped first."""
     table[key] = value
     if len(table) > REMEMBERED:
         del table[next(iter(table))]

@@ -2,7 +2,7 @@
 
 Rule: an address that other machines can reach needs keys, unless the user says `insecure`. Keys are made automatically at
 first use. On loopback they are needed only if a key folder was named. Between processes that share a file or memory, the
-operating system decides who may connect. Which of them may then join a run, `membership.py` decides.
+operating system decides who may connect. `membership.py` decides which of them may join a run.
 """
 
 from __future__ import annotations
@@ -59,8 +59,8 @@ def keyring_for(config: Listening, now: datetime) -> Keyring | None:
     if config.insecure:
         if not is_local(config.bind):
             log.warning(
-                "%s is open to everybody who can reach it, without keys: they can read this run, feed it false rollouts and "
-                "stop it, and nothing on the way is encrypted; leave --insecure out for keys",
+                "%s is open to anyone who can reach it, without keys: they can read this run, feed it false rollouts and "
+                "stop it, and nothing is encrypted; leave out --insecure to use keys",
                 config.bind,
             )
         return None
@@ -72,7 +72,7 @@ def keyring_for(config: Listening, now: datetime) -> Keyring | None:
 
 
 def generate_run_keys(worker: str, now: datetime) -> tuple[Keyring, Token]:
-    """Keys for one run on this machine. They are in no file."""
+    """Keys for one run on this machine. They are not written to any file."""
     server = Key.new()
     client = Key.new()
     return Keyring(server, ClientList().with_client(worker, client.public, now)), Token(server.public, client)
@@ -91,5 +91,5 @@ def join_lines(address: str, advertise: str, keyring: Keyring | None) -> list[st
         return [f"waiting for workers; start one with: millrace worker {reach} --token {token}"]
     return [
         f"waiting for workers; start one with: millrace worker {reach} --token {token.name}",
-        f"the token is {token}: a secret; copy it to the worker's machine, as with scp, where it must stay 0600",
+        f"the token is {token}: a secret; copy it to the worker's machine, for example with scp, and keep its mode 0600",
     ]

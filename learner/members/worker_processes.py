@@ -1,7 +1,7 @@
-"""The worker processes that this program started, as its learner knows them: how they end, what they do, who is left.
+"""The worker processes that this program started, as its learner knows them: how they end, what they do, how many are left.
 
-Who starts them (`millrace/launch/`) overrides what it knows. The class itself is what a learner has whose workers are all
-started elsewhere.
+The code that starts them (`millrace/launch/`) overrides these methods. The class itself is for a learner whose workers are
+all started elsewhere.
 """
 
 from __future__ import annotations
@@ -15,31 +15,31 @@ from millrace.protocol.alive import StartFailed, WorkerActivity, WorkerExit
 
 
 class WorkerProcesses:
-    """None: others may join from elsewhere."""
+    """No processes of this program: workers may join from elsewhere."""
 
     expected: int = 0
     """Number of processes that the user asked for. 0: any number."""
     most_copies: int = 0
-    """The most env copies that their machine has room for. 0: any number."""
+    """The largest number of env copies that their machine has room for. 0: any number."""
 
     def ended(self) -> Sequence[WorkerExit | StartFailed]:
         """The workers whose processes have ended since the last call. It may raise."""
         return ()
 
     def activities(self) -> Sequence[WorkerActivity]:
-        """What the workers do whose processes run. A stopped process is left out."""
+        """What the workers with running processes are doing. A stopped process is left out."""
         return ()
 
     def last_lines(self) -> Mapping[str, str]:
-        """The last line that each has written to its log, by the worker's name; what has written nothing is left out."""
+        """The last line of each worker's log, by the worker's name, without workers that have written nothing."""
         return {}
 
     def left(self, *, collecting: bool) -> float:
-        """How many run or will be started again; infinity if others may join. `collecting`: of those that collect."""
+        """How many run or will be restarted; infinity if others may join. `collecting`: count only those that collect."""
         return math.inf
 
     def kill(self, worker: str) -> bool:
-        """End the process of this worker at once; False if it is none of these."""
+        """End the process of this worker at once; False if it isn't one of these."""
         return False
 
     def stop(self, timeout_s: float) -> None:

@@ -17,11 +17,11 @@ class CollectingMember(Member):
     strikes: int = 0
     """Number of the worker's rollouts and messages that could not be used."""
     ended_steps: int = 0
-    """Env steps that its process has made before this session, and of its rollouts and evaluations that have come."""
+    """Env steps that its process made before this session, and those of its rollouts and evaluations that have arrived."""
 
     @property
     def steps_under_way(self) -> int:
-        """Env steps of what it works on, as of its newest heartbeat."""
+        """Env steps of its unfinished tickets, as of its newest heartbeat."""
         return 0 if self.heartbeat is None else max(0, self.heartbeat.steps - self.ended_steps)
 
     def record_heartbeat(self, heartbeat: Heartbeat) -> list[int]:

@@ -1,14 +1,14 @@
 """The tickets of one evaluation: which episodes are still to be played, and who plays them. Pure.
 
 Rule: the seeds are cut into tickets of `copies` seeds, whatever the number of workers, so the result does not depend on that
-number. An evaluation beside training is played by the workers that only evaluate; any other, by every active worker, also
-one without a lane. A ticket whose worker is lost goes to another. The numbers of these tickets start at `FIRST_TICKET`, far
+number. The workers that only evaluate play an evaluation beside training; all active workers, also those without a lane,
+play any other. A ticket whose worker is lost goes to another. The numbers of these tickets start at `FIRST_TICKET`, far
 above those of rollouts, and the ledger does not count them.
 
-Rule: a worker that claims to play and never answers must not hold the learner for ever, and nobody can tell it from one that
-is slow. So `share` gives the ticket of one that takes long (`stall_watch.py` says when) to a second worker as well. The
-seeds say what is played, so it does not matter who answers first: that answer counts. Who was late gets tickets only if
-nobody else can play, until it joins again.
+Rule: a worker that claims to play and never answers must not block the learner forever, and can't be told from a slow one.
+So if a worker takes long (`stall_watch.py` says when), `share` gives its ticket to a second worker as well. The seeds
+determine what is played, so it does not matter who answers first: the first answer counts. The late worker gets tickets only
+if nobody else can play, until it joins again.
 
 Rule: rows count only together with the answer of the worker that sent them. What a worker sent before it was lost, or before
 an answer that could not be used, is dropped, and its ticket is played again from the start.
@@ -61,7 +61,7 @@ class EvaluationPlan:
     of_best: bool = False
     """the weights are those of the best policy of the run"""
     opponents: tuple[int, ...] = ()
-    """with teams: who plays the others, as in a `Permit`; they take turns"""
+    """with teams: the opponents, as in a `Permit`, which take turns"""
 
     @staticmethod
     def of(episodes: int, seed: int, copies: int, max_steps: int, purpose: Purpose = Purpose.EPISODES) -> EvaluationPlan:
@@ -74,7 +74,7 @@ class EvaluationPlan:
         return EvaluationPlan(episode_seeds(seed, episodes, purpose), copies, most_steps, of_best=of_best)
 
     def how_far(self, played: int, env_steps: int, bound: str = "at most", before: tuple[int, int] = (0, 0)) -> str:
-        """How far it is, for people: `played` episodes, and `env_steps` of these and of those that are being played.
+        """The evaluation's progress, for people: `played` episodes, and `env_steps` of these and of the running episodes.
 
         `bound`: what limits an episode, such as the name of a flag. `before`: episodes and env steps of earlier plans.
         """
@@ -84,7 +84,7 @@ class EvaluationPlan:
 
 
 def episode_seeds(seed: int, episodes: int, purpose: Purpose = Purpose.EPISODES) -> tuple[int, ...]:
-    """The reset seed of each episode. Fewer episodes have the first of these seeds."""
+    """The reset seed of each episode. A smaller number of episodes gets the first of these seeds."""
     return tuple(env_seed(seed, purpose, episode) for episode in range(episodes))
 
 
@@ -97,7 +97,7 @@ class PlayedEpisode:
 
 
 def evaluation_of(played: Sequence[PlayedEpisode], facts: Sequence[str] = ()) -> Evaluation:
-    """The evaluation that these episodes make. `facts`: the names of their facts."""
+    """The evaluation that consists of these episodes. `facts`: the names of their facts."""
     episodes = [one.episode for one in played]
     cut = sum(one.cut for one in played)
     evaluation = Evaluation.of([episode.reward for episode in episodes], [episode.length for episode in episodes], cut)
@@ -116,13 +116,13 @@ class EvaluationDealer:
         self.held: dict[int, Member] = {}
         """the tickets that workers hold, by number"""
         self.second: dict[int, Member] = {}
-        """of these, those that a second worker plays as well"""
+        """the tickets among these that a second worker plays as well"""
         self.most_copies: int | None = None
-        """most env copies that play, on all workers together, unless one worker has more; None: no limit"""
+        """largest number of env copies that play, on all workers together, unless one worker has more; None: no limit"""
         self._run = run
         self.beside = False
         """whether the pending evaluation is beside training"""
-        self._most_workers = 0  # that play, if there is a limit of copies; 0: as many as it allows
+        self._most_workers = 0  # largest number of workers that play, if copies are limited; 0: as many as the limit allows
         self._plan: EvaluationPlan | None = None
         self.version = -1
         """of the weights that are evaluated"""
@@ -131,12 +131,12 @@ class EvaluationDealer:
         self._seeds: list[tuple[int, ...]] = []  # of each ticket
         self._undealt: list[int] = []  # heap: indices of tickets that no worker has
         self._played: dict[int, Evaluated] = {}  # by index of the ticket
-        self._rows: dict[tuple[int, bytes], dict[int, list[EpisodeRows]]] = {}  # by index of a ticket and worker; by episode
-        self._late: set[int] = set()  # the sessions of workers in whose place a second one has answered
+        self._rows: dict[tuple[int, bytes], dict[int, list[EpisodeRows]]] = {}  # by ticket index and worker, then by episode
+        self._late: set[int] = set()  # the sessions of workers whose ticket a second worker has answered
 
     @property
     def pending(self) -> bool:
-        """Whether an evaluation was begun and not ended."""
+        """Whether an evaluation has begun and not ended."""
         return self._plan is not None
 
     @property
@@ -174,12 +174,18 @@ class EvaluationDealer:
         self._rows = {}
 
     def all_play(self) -> None:
-        """The pending evaluation is beside training no more. With a limit of copies, one other worker plays."""
+        """Let all workers play the pending evaluation, which was beside training.
+
+        If copies are limited, one other worker plays.
+        """
         self.beside = False
         self._most_workers = 1
 
     def end(self) -> list[PlayedEpisode]:
-        """End the evaluation. Returns its episodes in the order of the seeds; of one that is not done, only those played."""
+        """End the evaluation.
+
+        Returns its episodes in the order of the seeds; if it isn't done, only those that were played.
+        """
         for number, member in [*self.held.items(), *self.second.items()]:
             del member.tickets[number]
         self._plan = None
@@ -190,10 +196,10 @@ class EvaluationDealer:
         return [PlayedEpisode(*both) for answer in answers for both in zip(answer.episodes, answer.cut, strict=True)]
 
     def deal(self, active: Sequence[Member]) -> list[Outgoing]:
-        """Give tickets to those of these workers that play: one to each, then a second while there are plenty.
+        """Give tickets to the workers among these that play: one to each, then a second while there are plenty.
 
-        They are in the order of joining, those that only evaluate first. With a limit of copies, the first of them play,
-        because a worker keeps its copies.
+        They are in the order of joining, those that only evaluate first. If copies are limited, the first ones play, because
+        a worker keeps its copies.
         """
         plan = self._plan
         out = list[Outgoing]()
@@ -211,7 +217,7 @@ class EvaluationDealer:
         return out
 
     def share(self, active: Sequence[Member]) -> list[Outgoing]:
-        """Give the oldest ticket that one worker plays to a second one, of those that play nothing."""
+        """Give the oldest ticket that only one worker plays to a second worker that plays nothing."""
         plan = self._plan
         assert plan is not None
         who = [member for member in active if member.hello.evaluates or not self.beside or self.most_copies is None]
@@ -224,13 +230,16 @@ class EvaluationDealer:
         return self.send(idle[0], alone[:1])
 
     def send(self, member: Member, tickets: Iterable[int]) -> list[Outgoing]:
-        """The orders for these tickets, those of an evaluation among them."""
+        """The orders for these tickets, as far as they belong to an evaluation."""
         return [(member.peer, self._order(member, number)) for number in tickets if number in self.held]
 
     def take_in(self, member: Member, answer: Evaluated) -> str:
-        """Take an answer. Returns what is wrong with it, or nothing; a wrong answer's ticket goes to another worker."""
+        """Accept an answer.
+
+        Returns what is wrong with it, or an empty string; a wrong answer's ticket goes to another worker.
+        """
         if not self._plays(member, answer.ticket):
-            return ""  # it came twice, or after the end, or after that of another worker
+            return ""  # it arrived twice, after the end, or after another worker's answer
         index = answer.ticket - self._first
         if why := self._wrong(answer, len(self._seeds[index])):
             self.lose(member, answer.ticket)
@@ -251,7 +260,10 @@ class EvaluationDealer:
         return ""
 
     def take_rows(self, member: Member, rows: EpisodeRows) -> str:
-        """Keep rows until their answer comes. Returns what is wrong with them, or nothing. Those that came are ignored."""
+        """Keep rows until their answer arrives.
+
+        Returns what is wrong with them, or an empty string. Repeated rows are ignored.
+        """
         if not self._plays(member, rows.ticket) or self._on_rows is None:
             return ""
         index = rows.ticket - self._first
@@ -267,7 +279,7 @@ class EvaluationDealer:
         return ""
 
     def lose(self, member: Member, number: int) -> None:
-        """A member that plays the ticket does so no more: if nobody else plays it, it is to be dealt again."""
+        """A member doesn't play this ticket any more: if nobody else plays it, it will be dealt again."""
         other = self.held[number] if self.second.get(number) is member else self.second.get(number)
         if other is None:
             heapq.heappush(self._undealt, self._end(number))
@@ -286,9 +298,8 @@ class EvaluationDealer:
         return Counter(member.peer for member in [*self.held.values(), *self.second.values()])
 
     def _who_may_play(self, members: Sequence[Member], plan: EvaluationPlan) -> list[Member]:
-        """Those of these workers that may play: those that only evaluate first, and no late one if there is another.
-
-        With a limit of copies, the first of them, because a worker keeps its copies.
+        """The workers among these that may play: first those that only evaluate, and late ones only if there is no other. If
+        copies are limited, the first ones play, because a worker keeps its copies.
         """
         players = sorted(members, key=lambda member: not member.hello.evaluates)
         players = [member for member in players if member.session not in self._late] or players
@@ -297,14 +308,14 @@ class EvaluationDealer:
         return players[: self._most_workers or max(1, self.most_copies // plan.copies)]
 
     def _end(self, number: int) -> int:
-        """The ticket is with nobody, and its rows are dropped. Returns its index."""
+        """Take the ticket from all workers, and drop its rows. Returns its index."""
         for member in (self.held.pop(number), self.second.pop(number, None)):
             if member is not None:
                 self._forget(member, number)
         return number - self._first
 
     def _forget(self, member: Member, number: int) -> None:
-        """The member plays the ticket no more, and its rows are dropped."""
+        """Take the ticket from this member, and drop its rows."""
         del member.tickets[number]
         self._rows.pop((number - self._first, member.peer), None)
 
@@ -327,7 +338,7 @@ class EvaluationDealer:
         )
 
     def _matches(self, number: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
-        """The opponent of each episode of a ticket, and the team that is evaluated: each opponent meets all teams."""
+        """For each episode of a ticket, the opponent and the evaluated team: each opponent meets all teams."""
         plan = self._plan
         count = len(self._run.teams)
         if plan is None or not count:
@@ -351,5 +362,5 @@ class EvaluationDealer:
 
 
 def _end(rows: Sequence[EpisodeRows]) -> int:
-    """The first step of an episode that these rows do not hold."""
+    """The first step of an episode that isn't in these rows."""
     return rows[-1].first_step + len(rows[-1].reward) if rows else 0

@@ -1,6 +1,6 @@
 """The hub: link, ticket coordinator and clock together. A training loop waits only in `gather` and in `evaluate`.
 
-It is all that `millrace.learner.train` knows of the rest, and what `millrace.RolloutService` gives to a user's own loop.
+It is all that `millrace.learner.train` knows of the rest, and what `millrace.RolloutService` gives to your own loop.
 Rule: every wait has a deadline and says what it waits for.
 """
 
@@ -46,7 +46,7 @@ log = logging.getLogger("millrace.learner")
 T = TypeVar("T")
 POLL_S = 0.1
 GOODBYE_WITHIN_S = 5.0  # at the end of a run: late rollouts are still counted
-GOODBYE_IF_CUT_SHORT_S = 2.0  # of what is cut short, or of episodes of which none is missing
+GOODBYE_IF_CUT_SHORT_S = 2.0  # if the work is cut short, or if no episode is missing
 # Least interval between two pulses. A minibatch may take only a tenth of it, and one pulse takes as long as a minibatch.
 PULSE_S = 0.003
 
@@ -64,7 +64,7 @@ class HubSettings:
 
 
 class HubSnapshot(NamedTuple):
-    """State of the hub at one moment, for metrics and checkpoints. Cheap to make, and nothing of it changes later."""
+    """State of the hub at one moment, for metrics and checkpoints. Cheap to make, and never changed later."""
 
     ledger: Ledger
     """Copy of the hub's ledger."""
@@ -73,13 +73,13 @@ class HubSnapshot(NamedTuple):
     lags: list[int]
     """Lag of each rollout of the last `gather`."""
     taken_s: float = 0.0
-    """That moment, by the hub's clock."""
+    """Time of the snapshot, by the hub's clock."""
     progress: Progress = Progress()
-    """Progress as it was reported last."""
+    """The progress that was last reported."""
     version: int = -1
     """Version of the newest weights; -1 before the first."""
     collected: int = 0
-    """Env steps of the next update's rollouts that are made, as workers report them."""
+    """Env steps already made for the next update, as workers report them."""
     lag_counts: Mapping[int, int] = {}
     """Number of rollouts used since this learner started, by lag."""
     wait_s: float = 0.0
@@ -87,7 +87,7 @@ class HubSnapshot(NamedTuple):
     evaluate_s: float = 0.0
     """Seconds spent in evaluations since this learner started."""
     learn_s: float = 0.0
-    """Seconds in which it did neither, since it first waited for rollouts."""
+    """Seconds spent on neither, since it first waited for rollouts."""
     waiting: str = ""
     """Who waits for whom, in one line for people; empty if nobody waits long."""
     roles: Mapping[str, str] = {}
@@ -99,7 +99,7 @@ class HubSnapshot(NamedTuple):
     sent: tuple[int, int] = (0, 0)
     """Number of messages and of bytes."""
     refused_messages: int = 0
-    """Number of messages under revoked keys."""
+    """Number of messages with revoked keys."""
     refused_handshakes: int = 0
     """Number of handshakes that failed."""
 
@@ -140,7 +140,7 @@ class Hub:
         self._time = LearnerTime(coordinator, clock(), self._server.awaited, self._processes)
 
     def take_over(self, waiting: Membership[Member]) -> None:
-        """The run begins for the workers that wait for it."""
+        """Begin the run for the workers that wait for it."""
         self._server.send(self.coordinator.take_over(waiting, self._clock()))
 
     # ---------------------------------------------------------------- what the loop calls
@@ -162,7 +162,7 @@ class Hub:
         """Set the newest weights. The arrays must not change afterwards.
 
         `deal`: deal the tickets of the next update now; otherwise `gather` does, because these weights are evaluated first.
-        `env_steps`: of training, after which they were made; None: they never become an opponent.
+        `env_steps`: number of env steps of training so far; None: the weights never become an opponent.
         Raises `RunError` if a parameter is too large for `acting_dtype`.
         """
         sent = to_wire_dtype(parameters, self.settings.acting_dtype)
@@ -173,7 +173,7 @@ class Hub:
             self._server.send(self.coordinator.begin_update())
 
     def keep_opponents(self, parameters: Array, buffers: Array) -> None:
-        """Keep the weights [n, P] and buffers [n, B] of the snapshots of a run that goes on."""
+        """Keep the weights [n, P] and buffers [n, B] of the snapshots of a resumed run."""
         pool = self.coordinator.rollouts.opponents
         versions = [] if pool is None else pool.versions
         for version, of_version, its_buffers in zip(versions, parameters, buffers, strict=True):
@@ -181,7 +181,7 @@ class Hub:
             self.coordinator.weights.kept[version] = Weights(version, sent, its_buffers)
 
     def opponent_policies(self) -> tuple[Floats, Floats] | None:
-        """Those of all snapshots, float32, if there are any."""
+        """The weights and buffers of all snapshots, float32, if there are any."""
         kept = self.coordinator.weights.kept
         pool = self.coordinator.rollouts.opponents
         if pool is None or not pool.versions:
@@ -190,7 +190,7 @@ class Hub:
         return np.stack([to_float32(each.parameters) for each in found]), np.stack([each.buffers for each in found])
 
     def past(self) -> PastRollouts:
-        """With which a resumed run goes on after the update that was made last."""
+        """The state from which a resumed run continues after the last update."""
         return self.coordinator.past()
 
     def gather(self, watch: Callable[[], None] = lambda: None) -> list[AcceptedRollout]:
@@ -224,19 +224,19 @@ class Hub:
         return taken
 
     def not_used(self, taken: list[AcceptedRollout]) -> None:
-        """The update of the rollouts that `gather` returned last failed: they are counted as lost."""
+        """Count the rollouts that `gather` last returned as lost, because their update failed."""
         self.coordinator.rollouts.not_used(taken)
         self.lag_statistics.not_used(self._lags)
 
     def begin_evaluation(self, plan: EvaluationPlan, on_rows: OnRows | None = None, *, beside: bool = False) -> None:
-        """Let the workers play these episodes under the newest weights; `beside` training, those that only evaluate."""
+        """Let the workers play these episodes with the newest weights; if `beside` training, those that only evaluate."""
         self._server.send(self.coordinator.begin_evaluation(plan, on_rows, beside=beside))
 
     def end_evaluation(self, watch: Callable[[int, int], None]) -> list[PlayedEpisode]:
         """Wait for the evaluation that was begun. Returns its episodes in the order of their seeds.
 
-        `watch` is called with the numbers of episodes played and of env steps, at least every `POLL_S`. Raises as `gather`
-        does.
+        `watch` is called with the numbers of episodes played and of env steps, at least every `POLL_S`. Raises like
+        `gather`.
         """
         evaluation = self.coordinator.evaluation
         steps_before = self._worker_steps()
@@ -252,7 +252,7 @@ class Hub:
                 steps = steps_now
             elif wait.due(now):
                 log.warning("no env steps for %.0f s: %s", wait.seconds(now), self._server.what_workers_do())
-            watch(evaluation.episodes_played, max(0, steps_now - steps_before))  # they fall if a worker is lost
+            watch(evaluation.episodes_played, max(0, steps_now - steps_before))  # the number falls if a worker is lost
 
         def done() -> bool | None:
             if not evaluation.done and evaluation.beside:
@@ -270,7 +270,7 @@ class Hub:
         finally:
             played = evaluation.end()
             self._time.turn("learning", self._clock())
-        self.lag_statistics.published(self.coordinator.version, self._clock())  # they are used for rollouts from now on
+        self.lag_statistics.published(self.coordinator.version, self._clock())  # from now on rollouts use these weights
         return played
 
     def pulse(self) -> None:
@@ -293,14 +293,14 @@ class Hub:
         """Who waits for whom, in one line for people; empty if nobody waits long."""
         return self._time.line(now)
 
-    # ---------------------------------------------------------------- what others ask and tell
+    # ---------------------------------------------------------------- progress and state
 
     def report_progress(self, progress: Progress) -> None:
-        """Store the progress of the run for those who ask how far it is."""
+        """Store the progress of the run, for requests of the status."""
         self._progress = progress
 
     def progress(self) -> RunProgress:
-        """How far the run is: as it was reported last, with what the hub knows better now."""
+        """How far the run is: the progress that was last reported, updated with what the hub knows now."""
         return progress_now(self.coordinator, self._progress, self.waiting(self._clock()), self._time.phase)
 
     def status(self, now: float) -> Status:
@@ -358,16 +358,17 @@ class Hub:
                 self._count_failure(event)
 
     def sent(self, peer: bytes) -> None:
-        """Nothing is to be done when a message was sent."""
+        """Do nothing when a message was sent."""
 
     # ---------------------------------------------------------------- inside
 
     def _wait(
         self, done: Callable[[], T | None], progress: Callable[[], int], watch: Callable[[], None], nothing_came: str
     ) -> T:
-        """Listen until `done` returns something. Refuses workers that only hold tickets; raises `Stalled` if all do.
+        """Listen until `done` returns something. Refuses workers that hold tickets idly; raises `Stalled` if all do.
 
-        `progress` changes when what is awaited makes progress. `watch` is called after each turn. `nothing_came`: the error.
+        `progress` changes with each progress of the awaited work. `watch` is called after each turn. `nothing_came`: the
+        error.
         """
         self._stall_watch.begin(self._clock())
         self._turn(0.0)
@@ -387,7 +388,7 @@ class Hub:
         return result
 
     def _share_evaluation(self, now: float) -> None:
-        """A second worker plays what one has played for too long, if a worker is free."""
+        """Let a free worker, if there is one, also play the ticket that another one has played for too long."""
         if out := self.coordinator.share_evaluation():
             seconds = self.settings.stall_timeout_s
             line = self.waiting(now)

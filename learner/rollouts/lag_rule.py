@@ -1,8 +1,8 @@
-"""The lag rule: how far behind the newest weights the acting ones may be, and so which weights act in which round. Pure.
+"""The lag rule: how far the acting weights may be behind the newest ones, and so which weights act in which round. Pure.
 
-Rule: update u takes round u, which is one rollout of every lane. All of them act under one version: the newest one when
-update u - L began, or when the first update began if u < L, where L is `max_lag`. So nobody's speed decides what a run
-computes. Once update u has begun, the rounds up to u + L may be collected.
+Rule: update u takes round u, which is one rollout of every lane. All of them are collected with one version of the weights:
+the newest one when update u - L began, or when the first update began if u < L, where L is `max_lag`. So results don't
+depend on anybody's speed. Once update u has begun, the rounds up to u + L may be collected.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ class Rounds:
     """The rounds of one run, counted from 0."""
 
     def __init__(self, max_lag: int, next_round: int = 0, versions: Mapping[int, int] = MappingProxyType({})) -> None:
-        """`next_round`, `versions`: of a run that goes on, the round of its next update, and what acts in open rounds."""
+        """`next_round`, `versions`: a resumed run's next round, and the versions that act in its open rounds."""
         self.max_lag = max_lag
         """L"""
         self.next = next_round
@@ -26,18 +26,18 @@ class Rounds:
         # of each round that may be collected and was not taken
 
     def begin(self, newest: int) -> range:
-        """The next update begins, while this version is the newest. Returns the rounds that it opens, once."""
+        """Begin the next update, with this version as the newest. Returns the rounds that it opens, once."""
         opened = range(self.next + len(self._versions), self.next + 1 + self.max_lag)
         self._versions |= {number: self._saved.pop(number, newest) for number in opened}
         return opened
 
     def end(self) -> None:
-        """The next update has taken its round."""
+        """Close the round of the next update, which has taken its rollouts."""
         del self._versions[self.next]
         self.next += 1
 
     def version(self, number: int) -> int:
-        """The version that acts in this round, which is open."""
+        """The version that acts in this open round."""
         return self._versions[number]
 
     @property

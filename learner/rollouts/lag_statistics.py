@@ -1,7 +1,7 @@
 """Measures the lag of rollouts, and how long new weights take to reach the environments. Pure.
 
 The lag of a rollout is the learner's version minus the rollout's version, when the rollout is used. The first-use time of a
-worker runs from publishing weights to the arrival of its first rollout under them. It contains the time on the network, the
+worker runs from publishing weights to the arrival of its first rollout with them. It includes the time on the network, the
 time in the worker and the time that one rollout takes.
 """
 
@@ -13,7 +13,7 @@ from statistics import median
 
 MOST_VERSIONS = 1_000  # the oldest is forgotten
 MOST_MEASUREMENTS = 1_000  # of each worker; the oldest is forgotten
-MOST_WORKERS = 1_000  # the one that was heard least recently is forgotten
+MOST_WORKERS = 1_000  # the one that was not heard for longest is forgotten
 
 
 class LagStatistics:
@@ -23,38 +23,38 @@ class LagStatistics:
         self.lags: Counter[int] = Counter()
         """rollouts that were used, by their lag"""
         self._published_s: dict[int, float] = {}
-        self._newest_used: dict[str, int] = {}  # by worker: the newest version that a rollout of it was acted under
+        self._newest_used: dict[str, int] = {}  # by worker: the newest version in its rollouts
         self._first_use_s: dict[str, deque[float]] = defaultdict(lambda: deque(maxlen=MOST_MEASUREMENTS))
 
     def published(self, version: int, now: float) -> None:
-        """From now on, rollouts may be acted under these weights."""
+        """From now on, rollouts may be collected with these weights."""
         self._published_s[version] = now
         self._published_s.pop(version - MOST_VERSIONS, None)
 
     def arrived(self, worker: str, version: int, now: float) -> None:
-        """A rollout of this worker arrived. It was acted under this version."""
+        """A rollout of this worker, collected with this version, arrived."""
         newest = self._newest_used.pop(worker, -1)
         if version > newest and version in self._published_s:
             self._first_use_s[worker].append(now - self._published_s[version])
-        self._newest_used[worker] = max(version, newest)  # at the end, so that the first was heard least recently
+        self._newest_used[worker] = max(version, newest)  # at the end: the first is the one that was not heard for longest
         if len(self._newest_used) > MOST_WORKERS:
             forgotten = next(iter(self._newest_used))
             del self._newest_used[forgotten]
             self._first_use_s.pop(forgotten, None)
 
     def used(self, lags: Iterable[int]) -> None:
-        """Rollouts with these lags went into an update."""
+        """Count the lags of rollouts that an update used."""
         self.lags.update(lags)
 
     def not_used(self, lags: Iterable[int]) -> None:
-        """Rollouts with these lags were to go into an update, which failed."""
+        """Take back the lags of rollouts whose update failed."""
         self.lags.subtract(lags)
         self.lags = +self.lags  # without those that are 0 now
 
     def histogram(self) -> dict[str, int]:
-        """Number of rollouts that were used, by lag, from the smallest; a JSON object has strings for keys."""
+        """Number of rollouts that were used, by lag, in ascending order. Keys are strings, as in JSON."""
         return {str(lag): self.lags[lag] for lag in sorted(self.lags)}
 
     def first_use_s(self) -> dict[str, float]:
-        """For each worker, the median number of seconds from publishing weights to its first rollout under them."""
+        """For each worker, the median number of seconds from publishing weights to its first rollout with them."""
         return {worker: median(seconds) for worker, seconds in sorted(self._first_use_s.items())}

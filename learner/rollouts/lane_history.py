@@ -1,9 +1,9 @@
-"""What the learner knows of a lane's past: the sum of the rollouts that have come of it. Pure.
+"""What the learner knows about a lane's past, accumulated from its rollouts. Pure.
 
 Rule: a history is a fold over the rollouts of a lane in the order of their rounds, whoever collected them, and whether or
-not they are used. It keeps no more than what a worker needs to go on where they end (`protocol/lane_past.py`): of each copy,
-how its newest episode began, and the actions since. An episode that is longer than the limit, or began in a way that nobody
-knows, cannot be repeated: when the lane is lost, the copy starts anew.
+not they are used. It keeps only what a worker needs to continue where they end (`protocol/lane_past.py`): how the newest
+episode of each copy began, and the actions since. An episode cannot be replayed if it is longer than the limit, or if it
+isn't known how it began: if the lane is lost, the copy starts anew.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ class _OfRound:
     """The rows of one rollout."""
 
     first: int
-    """number of the first one, counted since the history began"""
+    """number of the first row, counted since the history began"""
     action: Array
     """[T, N · A, *action]"""
     attributes: bytes
-    """packed, those that the copies had"""
+    """the attributes that the copies had, packed"""
 
 
 @dataclass
@@ -38,27 +38,27 @@ class LaneHistory:
     copies: list[LastEpisode]
     """[N]; their rows are counted since the history began"""
     most_steps: int
-    """of an episode that is repeated"""
+    """largest number of steps of an episode that is replayed"""
     rows: deque[_OfRound] = field(default_factory=deque)
-    """since the earliest of the episodes that can be repeated"""
+    """since the earliest of the episodes that can be replayed"""
     count: int = 0
     """number of rows since the history began"""
     obs: tuple[Array, ...] = ()
     """[N · A, *leaf] each, then the mask if there are masks, after the last row"""
     memory: tuple[Array, ...] = ()
     too_long: dict[int, int] = field(default_factory=dict)
-    """by copy whose running episode has become too long to be repeated: the number of its first row"""
+    """for each copy whose running episode has become too long to be replayed: the number of its first row"""
     no_rows: Array = field(default_factory=lambda: np.zeros(0, np.float32))
     """[0, N · A, *action]"""
 
     def copy(self) -> LaneHistory:
-        """The same, which the other one does not change."""
+        """An independent copy."""
         return replace(self, copies=list(self.copies), rows=self.rows.copy(), too_long=dict(self.too_long))
 
     def add(self, rollout: Rollout, attributes: bytes) -> Bools:
-        """The next rollout of the lane has come. Returns [N] which copies had started anew when it began.
+        """Add the next rollout of the lane. Returns [N] which copies had started anew when it began.
 
-        `attributes`: those of its env copies, packed.
+        `attributes`: the attributes of its env copies, packed.
         """
         T = len(rollout.action)
         began = {each.copy: each for each in rollout.begun}
@@ -78,21 +78,21 @@ class LaneHistory:
         return np.array([new.start != old.start for new, old in zip(self.copies, before, strict=True)])
 
     def forget(self) -> None:
-        """Nobody knows what the copies do after the last row: none of their episodes can be repeated."""
+        """Mark all running episodes as not replayable: it isn't known what the copies did after the last row."""
         self.copies = [LastEpisode(last.start, None, self.count, False) for last in self.copies]
         self.rows.clear()
 
     def start_anew(self, attempts: int, *, from_past: bool = True) -> None:
-        """All copies are to start anew, although so many attempts to go on have failed: none uses a number again.
+        """Let all copies start anew after this many failed attempts to continue, without reusing the number of a start.
 
-        `from_past`: whether the first of them began from this history, so that some copies had started anew there.
+        `from_past`: whether the first attempt began from this history, so that some copies started anew in it.
         """
         tried = [last.start + (from_past and not last.goes_on) for last in self.copies]  # in the first attempt
         self.copies = [LastEpisode(number + attempts - 1, None, self.count, False) for number in tried]
         self.rows.clear()
 
     def past(self, lane: int) -> LanePast:
-        """What a worker needs to go on."""
+        """What a worker needs to continue the lane."""
         action = np.concatenate([self.no_rows, *(rows.action for rows in self.rows)])
         start = self.rows[0].first if self.rows else self.count
         return LanePast(
@@ -106,7 +106,7 @@ class LaneHistory:
 
     @classmethod
     def of(cls, past: LanePast, most_steps: int) -> LaneHistory:
-        """The history that a checkpoint has as the past of a lane, by the limit of the run that goes on."""
+        """The history from a lane's past in a checkpoint, with the limit of the resumed run."""
         found = cls(
             list(past.copies),
             most_steps,
@@ -126,12 +126,12 @@ class LaneHistory:
 
     @classmethod
     def of_nothing(cls, copies: int, most_steps: int) -> LaneHistory:
-        """Nothing has come of the lane yet. Its copies have not started."""
+        """The history of a lane without rollouts, whose copies have not started."""
         return cls([LastEpisode(0, b"", 0, False)] * copies, most_steps)
 
     def _after(self, last: LastEpisode, began: EpisodeBegin | None, resets: Bools, T: int) -> LastEpisode:
-        """The newest episode of copy n, after T more rows. `resets` [T+1]: which of them only reset it."""
-        start = last.start if began is None else max(last.start, began.start)  # no number is used again
+        """The newest episode of copy n, after T more rows. `resets` [T+1]: which rows only reset it."""
+        start = last.start if began is None else max(last.start, began.start)  # never reuse a number
         random = None if began is None else began.random
         if resets[T]:
             return LastEpisode(start, random, self.count + T, True)
@@ -140,17 +140,20 @@ class LaneHistory:
         return last if began is None else LastEpisode(start, random, self.count, False)
 
     def _saved(self, n: int) -> None:
-        """The state of copy n after the last row is in the memory: no row is needed any more."""
+        """Drop the rows of copy n, because `memory` has its state after the last row."""
         last = self.copies[n]
         self.copies[n] = LastEpisode(last.start, last.random, self.count, last.over, saved=True)
 
     @property
     def longest_given_up(self) -> int:
-        """Steps of the longest episode that has become too long to be repeated; 0 if there is none."""
+        """Steps of the longest episode that has become too long to be replayed; 0 if there is none."""
         return max((self.count - first for first in self.too_long.values()), default=0)
 
     def _forget_long_ones(self, *, known: bool) -> None:
-        """Mark what is not repeated, and keep only the rows of the rest. `known`: whether the worker can go on at all."""
+        """Mark episodes that are not replayed, and keep only the rows of the others.
+
+        `known`: whether the worker can continue at all.
+        """
         for n, last in enumerate(self.copies):
             if last.goes_on:
                 self.too_long.pop(n, None)
@@ -168,7 +171,7 @@ class LaneHistory:
 
 
 def _needed_from(last: LastEpisode) -> int:
-    """The first row that is needed to repeat an episode: the one that reset the copy, whose attributes it began with."""
+    """The first row that is needed to replay an episode: the one that reset the copy, for the attributes at that time."""
     return last.first - 1 if last.random and last.is_repeated else last.first
 
 
@@ -191,19 +194,18 @@ def _changes(kept: Iterable[_OfRound], start: int) -> Iterable[AttributesFrom]:
 
 @dataclass(frozen=True)
 class LaneHistories:
-    """How histories are kept, and those with which a run goes on."""
+    """How histories are kept, and those that a resumed run begins with."""
 
     copies: int = 1
     """N"""
     most_steps: int = -1
-    """of an episode that is repeated; -1: none is"""
+    """largest number of steps of an episode that is replayed; -1: none is"""
     pasts: Sequence[LanePast] = ()
-    """of lanes, from a checkpoint"""
+    """the pasts of lanes, from a checkpoint"""
 
     def of(self, lane: int) -> LaneHistory | None:
-        """The history of a lane when the run goes on; None if nothing has come of it.
-
-        If the lane had another number of copies, none of them continues.
+        """The history of a lane when the run is resumed; None if it has no rollouts yet. If the number of copies has
+        changed, none of them continues.
         """
         past = next((past for past in self.pasts if past.lane == lane), None)
         if past is None:
@@ -214,5 +216,5 @@ class LaneHistories:
         return LaneHistory([LastEpisode(newest, None, 0, False)] * self.copies, self.most_steps)
 
     def begin(self) -> LaneHistory:
-        """The history of a lane of which nothing has come."""
+        """The history of a lane without rollouts."""
         return LaneHistory.of_nothing(self.copies, self.most_steps)

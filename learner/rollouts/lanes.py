@@ -1,8 +1,8 @@
 """The coordinator's records of lanes and tickets. Pure.
 
-Rule: a lane has one owner at a time. A new owner has it on new env copies: its incarnation rises, and its rollouts are
-counted from 0 again. It continues the lane's past, unless the environment has failed there, or every attempt to continue it
-was lost: then the copies start anew, so that they do not run into the same end for ever.
+Rule: a lane has one owner at a time. A new owner has new env copies for it: the incarnation rises, and rollouts are counted
+from 0 again. The new owner continues the lane's past, unless the environment has failed there, or every attempt to continue
+it was lost: then the copies start anew, so that they don't fail in the same way forever.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from millrace.protocol.arrays import Bools
 from millrace.protocol.messages import Hello, LanePast, Permit
 from millrace.protocol.rollout import Rollout
 
-MOST_ATTEMPTS = 3  # to continue a lane, each of which ended with the loss of its worker
+MOST_ATTEMPTS = 3  # attempts to continue a lane, each of which ended with the loss of its worker
 
 
 @dataclass
@@ -38,13 +38,13 @@ class TicketedLane(PlacedLane):
     newest_taken: tuple[int, int] | None = None
     """Incarnation and sequence number of the rollout that was taken last; None: none since the learner began."""
     history: LaneHistory | None = None
-    """Of the rollouts that were taken; None: none since the run began."""
+    """History of the rollouts that were taken; None: none since the run began."""
     failures: int = 0
-    """How often its environment has failed since a rollout of it came."""
+    """How often its environment has failed since its last rollout arrived."""
     failed_at_once: bool = True
-    """Whether the first of these failures and losses came before any rollout of its incarnation."""
+    """Whether the first of these failures and losses happened before any rollout of its incarnation."""
     losses: int = 0
-    """How often its worker was lost while it collected, since a rollout of it came."""
+    """How often its worker was lost while collecting, since its last rollout arrived."""
 
     @property
     def busy(self) -> int:
@@ -52,7 +52,7 @@ class TicketedLane(PlacedLane):
         return len(self.outstanding)
 
     def restart(self) -> None:
-        """The lane left its worker. Its incarnation rises only if a ticket of this one was dealt."""
+        """Record that the lane left its worker. The incarnation rises only if it was dealt a ticket."""
         super().restart()
         if self.dealt:
             self.incarnation += 1
@@ -63,7 +63,7 @@ class TicketedLane(PlacedLane):
     def deal(
         self, number: int, round_number: int, version: int, opponent: int | None, past: LanePast | None = None
     ) -> Ticket:
-        """A ticket for the next rollout, for the lane's owner. `past`: for the first one of this incarnation."""
+        """A ticket for the next rollout, for the lane's owner. `past`: for the first ticket of this incarnation."""
         assert self.owner is not None
         ticket = Ticket(number, self.number, self.incarnation, self.dealt, round_number, version, self.owner, opponent, past)
         self.outstanding.add(number)
@@ -71,10 +71,10 @@ class TicketedLane(PlacedLane):
         return ticket
 
     def past(self, histories: LaneHistories, waiting: Iterable[tuple[int, Rollout, bytes]]) -> LanePast | None:
-        """What a new owner is to continue; None if the lane is to begin.
+        """The past that a new owner continues; None if the lane begins.
 
-        `waiting`: the rollouts that have come since the history, in order, each after its incarnation, and with the
-        attributes of its env copies.
+        `waiting`: the rollouts since the history, in order, each with its incarnation before it and the attributes of its
+        env copies after it.
         """
         history = None if self.history is None else self.history.copy()
         newest = self.newest_taken
@@ -92,9 +92,9 @@ class TicketedLane(PlacedLane):
     def take(
         self, incarnation: int, rollout: Rollout, attributes: bytes, histories: LaneHistories, *, from_past: bool
     ) -> Bools:
-        """The rollout of the next round is taken. Returns [N] for which env copies it does not continue the one before it.
+        """Take the rollout of the next round. Returns [N] for which env copies it doesn't continue the previous one.
 
-        `from_past`: whether its worker was told to continue the lane.
+        `from_past`: whether its worker was told to continue the lane's past.
         """
         sequence = rollout.sequence
         continues = self.newest_taken == (incarnation, sequence - 1)
@@ -108,19 +108,19 @@ class TicketedLane(PlacedLane):
         return anew if (continues or sequence == 0) and not begins else np.ones_like(anew)
 
     def lost(self, *, failed: bool) -> None:
-        """Its worker was lost while it collected, or because its environment `failed`."""
+        """Record that its worker was lost while collecting, or because the environment `failed`."""
         if not self.failures and not self.losses:
             self.failed_at_once = not self.next_sequence
         self.losses += not failed
         self.failures += failed
 
     def went_on(self) -> None:
-        """A rollout was accepted: failures and losses are counted anew."""
+        """Start counting failures and losses anew, because a rollout was accepted."""
         self.failures = 0
         self.losses = 0
 
     def arrived(self, sequence: int) -> None:
-        """The rollout with this sequence number has arrived."""
+        """Record that the rollout with this sequence number has arrived."""
         self.out_of_order.add(sequence)
         while self.next_sequence in self.out_of_order:
             self.out_of_order.remove(self.next_sequence)
@@ -134,7 +134,7 @@ def _misses_one(newest: tuple[int, int] | None, incarnation: int, rollout: Rollo
 
 @dataclass(frozen=True)
 class Ticket:
-    """A ticket that is with a worker."""
+    """A ticket that a worker holds."""
 
     number: int
     lane: int
@@ -147,9 +147,9 @@ class Ticket:
     peer: bytes
     opponent: int | None = None
     past: LanePast | None = None
-    """As in a `Permit`, these two."""
+    """`opponent` and `past`: as in a `Permit`."""
 
     def permit(self, worker: Hello) -> Permit:
-        """The ticket as it travels to this worker."""
+        """The ticket in the form that is sent to this worker."""
         past = self.past if worker.continues else None
         return Permit(self.number, self.lane, self.incarnation, self.sequence, self.round, self.opponent, past)

@@ -16,7 +16,7 @@ from msgspec import Meta
 from millrace.protocol.bounds import LARGEST
 
 Past = Annotated[int, Meta(ge=0, le=LARGEST >> 2)]
-"""A count from a file, from which a run goes on: what it counts then still fits into messages."""
+"""A count from a file that a run continues from: small enough that it still fits into messages later."""
 
 
 class Ledger(msgspec.Struct, kw_only=True):
@@ -40,7 +40,7 @@ class Ledger(msgspec.Struct, kw_only=True):
     messages_bad: Past = 0
     """messages that could not be read"""
     late_actions: Past = 0
-    """actions that came too late for a program that owns its loop, which then took one of its own"""
+    """actions that arrived too late at a program that owns its loop, so that it chose its own action"""
 
     @property
     def outstanding(self) -> int:
@@ -54,20 +54,19 @@ class Ledger(msgspec.Struct, kw_only=True):
         return self.transitions_received - self.transitions_used - dropped
 
     def end_outstanding(self) -> None:
-        """The learner that dealt the outstanding tickets is gone. So are they, and the rollouts that were not yet used.
-
-        Raises `ValueError` for counts from a file that no run can have.
+        """The learner that dealt the outstanding tickets is gone: count them, and rollouts not yet used, as lost. Raises
+        `ValueError` for counts from a file that no run can have.
         """
         if min(self.outstanding, self.transitions_waiting) < 0:
-            raise ValueError("ledger: expected as many tickets and transitions as became of them, got fewer")
+            raise ValueError("ledger: expected at least as many tickets and transitions as were used or lost, got fewer")
         self.lost += self.outstanding
         self.transitions_late += self.transitions_waiting
 
     def copy(self) -> Ledger:
-        """The same counts, which do not change any more."""
+        """A copy that doesn't change with the original."""
         return msgspec.structs.replace(self)
 
     def counts(self) -> dict[str, int]:
-        """All counts by name, the two derived ones included."""
+        """All counts by name, including the two derived ones."""
         stored = {name: int(getattr(self, name)) for name in self.__struct_fields__}
         return stored | {"outstanding": self.outstanding, "transitions_waiting": self.transitions_waiting}

@@ -1,11 +1,12 @@
 """Self-play: which opponents there are, who meets whom, and how strong they are. Pure.
 
 Rule: the opponent of a rollout is a pure function of the seed, the lane, its incarnation, the number of the rollout, and the
-pool as it was when the weights that act were made. So it depends on nobody's speed, and on no number of workers. Opponents
-are snapshots of the policy, of which the newest play, and programs of the user's.
+pool as it was when the weights that act were made. So it depends neither on speed nor on the number of workers. Opponents
+are the newest snapshots of the policy, and programs that the user wrote.
 
 Rule: ratings follow from the episodes that updates used, in their order (Elo 1978; ML-Agents' self-play). An opponent's
-rating changes as the policy's does, by the opposite amount. Episodes against a version that is no snapshot change none.
+rating changes as the policy's does, by the opposite amount. Episodes against a version that isn't a snapshot change no
+rating.
 """
 
 from __future__ import annotations
@@ -24,13 +25,13 @@ from millrace.protocol.rollout import Episode
 FIRST_RATING = 1200.0
 ELO_KEY = "self_play/elo"
 K = 8.0
-"""Largest change of a rating by one episode is K."""
+"""K: the largest change of a rating by one episode."""
 SCALE = 400.0
-"""An opponent whose rating is lower by so much loses ten times as often as it wins."""
+"""An opponent whose rating is lower by this much loses ten times as often as it wins."""
 
 
 class Snapshot(msgspec.Struct):
-    """A version of the policy that is an opponent."""
+    """A version of the policy that serves as an opponent."""
 
     version: Natural
     env_steps: Natural
@@ -41,7 +42,7 @@ class PoolState(msgspec.Struct, kw_only=True):
     """What a checkpoint keeps, besides the weights of the snapshots."""
 
     rating: Real = FIRST_RATING
-    """of the policy"""
+    """rating of the policy"""
     snapshots: list[Snapshot] = []
     """The first one, and the newest, in order."""
     scripted: list[Real] = []
@@ -49,7 +50,10 @@ class PoolState(msgspec.Struct, kw_only=True):
 
 
 def teams_of(seats: tuple[str, ...], patterns: Sequence[str] = ()) -> tuple[tuple[int, ...], ...]:
-    """The seats of each team, by these patterns of their names; without any, each seat is a team. Raises `UsageError`."""
+    """The seats of each team, from these patterns of their names; without patterns, each seat is a team.
+
+    Raises `UsageError`.
+    """
     if not patterns:
         return tuple((seat,) for seat in range(len(seats)))
     teams = [tuple(n for n, seat in enumerate(seats) if fnmatchcase(seat, pattern)) for pattern in patterns]
@@ -70,11 +74,11 @@ class PoolSettings(NamedTuple):
 
     seed: int
     window: int
-    """How many snapshots play, the newest ones."""
+    """How many snapshots, the newest ones, play."""
     save_steps: Count
     """Env steps between two snapshots."""
     latest: float
-    """The share of rollouts in which the policy meets itself."""
+    """The share of rollouts in which the policy plays against itself."""
     max_lag: int
     scripted: int = 0
     """How many programs there are."""
@@ -93,7 +97,7 @@ class OpponentPool:
 
     @property
     def versions(self) -> list[int]:
-        """Those of the snapshots."""
+        """The versions of the snapshots."""
         return [snapshot.version for snapshot in self.state.snapshots]
 
     @property
@@ -103,7 +107,7 @@ class OpponentPool:
         return tuple(-1 - k for k in range(programs)) or tuple(self.versions[:1])
 
     def made(self, version: int, env_steps: int) -> bool:
-        """New weights were made. Returns whether they are a snapshot."""
+        """Take note of new weights. Returns whether they become a snapshot."""
         snapshots = self.state.snapshots
         settings = self._settings
         if not settings.window:
@@ -111,12 +115,12 @@ class OpponentPool:
         if snapshots and (version <= snapshots[-1].version or env_steps < snapshots[-1].env_steps + settings.save_steps):
             return False
         snapshots.append(Snapshot(version, env_steps, self.state.rating))
-        # Weights that acted before the newest snapshots were made may still meet as many as those.
+        # Older weights, within max_lag, may still meet the snapshots that were in the window when they were made.
         del snapshots[1 : max(1, len(snapshots) - settings.window - settings.max_lag)]
         return True
 
     def of(self, lane: int, round_number: int, version: int) -> int:
-        """The opponent in the episodes that begin in this rollout, in which this version acts."""
+        """The opponent in the episodes that begin in this rollout, which this version of the weights collects."""
         settings = self._settings
         window = [each for each in self.versions if each <= version][-settings.window :] if settings.window else []
         drawn = generator(settings.seed, Purpose.MATCHES, lane, round_number)
@@ -126,11 +130,11 @@ class OpponentPool:
         return others[int(drawn.integers(len(others)))]
 
     def metrics(self) -> dict[str, float]:
-        """What a row of the metrics has of it."""
+        """The pool's entries in a row of the metrics."""
         return {ELO_KEY: self.state.rating, "self_play/snapshots": float(len(self.versions))}
 
     def played(self, episodes: Iterable[Episode]) -> None:
-        """An update used these episodes."""
+        """Change the ratings by episodes that an update used."""
         state = self.state
         by_version = {snapshot.version: snapshot for snapshot in state.snapshots}
         for episode in episodes:

@@ -1,7 +1,7 @@
-"""What a run that goes on knows of the rollouts so far: numbers, the past of each lane, and the weights of open rounds.
+"""The state of rollouts that a resumed run needs: numbers, the past of each lane, and the weights of open rounds.
 
-Rule: with it, the next learner deals what the last one would have dealt: the same rounds, under the same versions, on lanes
-that go on where their last rollout ended.
+Rule: with it, the next learner deals what the last one would have dealt: the same rounds, with the same versions, on lanes
+that continue where their last rollout ended.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ class PastRollouts(NamedTuple):
     """the next incarnation of each lane"""
     rounds: RoundsState = RoundsState()
     lanes: Sequence[LanePast] = ()
-    """those of which rollouts were taken"""
+    """the pasts of lanes whose rollouts were taken"""
     acting: Sequence[Weights] = ()
-    """those that act in open rounds, without the newest"""
+    """the weights that act in open rounds, except the newest"""
 
 
 def packed(records: Sequence[msgspec.Struct]) -> Bytes:

@@ -1,9 +1,9 @@
-"""The tickets for rollouts: which rounds are open, which worker collects what, and what has come. Pure.
+"""The tickets for rollouts: which rounds are open, which worker collects what, and what has arrived. Pure.
 
-Rule: a ticket is the permission for one rollout: of this lane, in this round, under this version. `lag_rule.py` says which
-rounds are open, and each lane gets a ticket for every one of them. When a ticket is lost, its round is dealt again, under
-the same version, and whoever gets it continues the lane where its last rollout ended. Every ticket and every transition is
-counted in the ledger.
+Rule: a ticket is the permission for one rollout: of this lane, in this round, with this version of the weights.
+`lag_rule.py` says which rounds are open, and each lane gets a ticket for each of them. If a ticket is lost, its round is
+dealt again, with the same version, and the worker that gets it continues the lane where its last rollout ended. Every ticket
+and every transition is counted in the ledger.
 """
 
 from __future__ import annotations
@@ -26,17 +26,18 @@ from millrace.protocol.messages import Collect, LanePast, Received, Rollout
 
 @dataclass(frozen=True, slots=True)
 class AcceptedRollout:
-    """A rollout that was accepted, with what the learner knows about it and its message does not carry."""
+    """A rollout that was accepted, with data about it that its message doesn't have."""
 
     rollout: Rollout
     incarnation: int
     """Incarnation of the lane when its ticket was dealt. Each incarnation has new env copies."""
     fresh: Bools | bool = True
-    """[N] for each env copy, whether nothing carries over to it from an earlier rollout: it does not continue the one of its
-    lane that was taken last, because the copy has started anew, or the rollout between the two was rejected. One value
-    stands for all."""
+    """[N] for each env copy, whether nothing carries over from earlier rollouts: it doesn't continue the last one that was
+    taken of its lane, because the copy has started anew, or a rollout in between was rejected. A single value applies to
+    all.
+    """
     from_past: bool = False
-    """Whether its worker was told to continue the lane with it."""
+    """Whether its worker was told to continue the lane's past with it."""
 
 
 class RolloutDealer:
@@ -51,8 +52,8 @@ class RolloutDealer:
         opponents: OpponentPool | None = None,
         histories: LaneHistories | None = None,
     ) -> None:
-        """`ledger` and `incarnations` come from a checkpoint: the incarnations are the first of each lane, and there may be
-        more or fewer of them than lanes. `opponents`: those of a run with teams. `histories`: None: no lane continues.
+        """`ledger` and `incarnations` come from a checkpoint: the first incarnation of each lane, which may be more or fewer
+        than there are lanes. `opponents`: the pool of a run with teams. `histories`: None: no lane continues.
         """
         self.opponents = opponents
         self.histories = histories or LaneHistories()
@@ -68,18 +69,20 @@ class RolloutDealer:
         self.held: dict[int, Ticket] = {}
         """the tickets that workers hold, by number"""
         self.ready: dict[int, dict[int, AcceptedRollout]] = {}
-        """the rollouts that have come and were not taken, by round and by lane"""
+        """the rollouts that have arrived and were not taken, by round and by lane"""
         self.rounds = rounds
         self.attributes: dict[int, bytes] = {}
-        """those of env copies, packed, by the version that acts with them; of versions without any there may be none"""
-        self._absent = list(incarnations[lanes:])  # incarnations of lanes that the run had, and may have again
+        """attributes of env copies, packed, by the version of the weights that they belong to; versions without any may be
+        missing
+        """
+        self._absent = list(incarnations[lanes:])  # incarnations of lanes that the run had earlier, and may have again
         self._absent_pasts = [past for past in self.histories.pasts if past.lane >= lanes]
-        self._to_deal = set[int]()  # lanes with rounds that are to be dealt
+        self._to_deal = set[int]()  # lanes with rounds to deal
 
     # ---------------------------------------------------------------- the learner's side
 
     def begin_update(self, version: int) -> None:
-        """The next update begins, unless it has begun, while this version is the newest: its rounds are to be dealt."""
+        """Begin the next update, unless it has begun, with this version as the newest, and mark its rounds to be dealt."""
         for number in self.rounds.begin(version):
             for lane in self.lanes:
                 lane.due.append(number)
@@ -98,7 +101,7 @@ class RolloutDealer:
         return [self._marked(arrived) for arrived in taken]
 
     def not_used(self, taken: list[AcceptedRollout]) -> None:
-        """Count rollouts that `take` returned as lost: no update was made of them."""
+        """Count rollouts that `take` returned as lost, because no update used them."""
         self.ledger.used -= len(taken)
         self.ledger.lost += len(taken)
         env_steps = sum(arrived.rollout.env_steps for arrived in taken)
@@ -110,19 +113,19 @@ class RolloutDealer:
         return [ticket for ticket in self.held.values() if ticket.round == self.rounds.next]
 
     def collected(self) -> int:
-        """Env steps of the next update's rollouts that have come."""
+        """Env steps of the next update's rollouts that have arrived."""
         return sum(arrived.rollout.env_steps for arrived in self.ready.get(self.rounds.next, {}).values())
 
     def waiting(self) -> int:
-        """Number of rollouts that have come and were not taken."""
+        """Number of rollouts that have arrived and were not taken."""
         return sum(map(len, self.ready.values()))
 
     def incarnations(self) -> list[int]:
-        """The next incarnation of each lane, for a checkpoint. One that was dealt a ticket is not used again."""
+        """The next incarnation of each lane, for a checkpoint. An incarnation that was dealt a ticket is not used again."""
         return [*(lane.incarnation + (lane.dealt > 0) for lane in self.lanes), *self._absent]
 
     def pasts(self) -> list[LanePast]:
-        """What each lane is to continue after the last round that was taken, for a checkpoint."""
+        """The past that each lane continues after the last round that was taken, for a checkpoint."""
         here = [lane.history.past(lane.number) for lane in self.lanes if lane.history is not None]
         return [*here, *self._absent_pasts]
 
@@ -149,7 +152,7 @@ class RolloutDealer:
         return [order for peer, numbers in dealt.items() for order in self.send(members[peer], numbers)]
 
     def send(self, member: Member, tickets: Iterable[int]) -> list[Outgoing]:
-        """The orders for these tickets, those of a rollout among them: one for each version that they name.
+        """The orders for these tickets, as far as they are for rollouts: one for each version that they name.
 
         A ticket that brings the past of a lane has an order of its own, because a past is long.
         """
@@ -166,16 +169,16 @@ class RolloutDealer:
         return out
 
     def received(self, member: Member) -> tuple[Received, ...]:
-        """The lanes of this worker, and what has come of them."""
+        """The lanes of this worker, and which of their rollouts have arrived."""
         mine = [self.lanes[number] for number in member.lanes]
         return tuple(Received(lane.number, lane.incarnation, lane.next_sequence, tuple(lane.out_of_order)) for lane in mine)
 
     # ---------------------------------------------------------------- in
 
     def take_in(self, member: Member, rollout: Rollout) -> bool:
-        """Accept a rollout that has come. False if it came before.
+        """Accept a rollout that has arrived. False if it arrived before.
 
-        Raises `BadRollout` if its ticket is not for it. That is not counted: see `reject`.
+        Raises `BadRollout` if it doesn't fit its ticket. `reject` then counts it.
         """
         ticket = self.held.get(rollout.ticket)
         if ticket is None:
@@ -197,12 +200,12 @@ class RolloutDealer:
         return True
 
     def rounds_by(self, number: int) -> int:
-        """How many rounds an episode can have lasted by the end of the rollout of this ticket."""
+        """The largest number of rounds that an episode can have lasted at the end of this ticket's rollout."""
         ticket = self.held.get(number)
         return self.rounds.next + self.rounds.max_lag + 1 if ticket is None else ticket.round + 1
 
     def worker_lost(self, member: Member) -> None:
-        """A member is gone with its tickets. What led to a failure of the environment is not repeated."""
+        """Take the tickets of a member that is gone. Steps that led to a failure of the environment are not replayed."""
         for number in member.lanes:
             lane = self.lanes[number]
             failed = number == member.failed_lane or (member.hung and bool(lane.outstanding))
@@ -210,12 +213,12 @@ class RolloutDealer:
                 lane.lost(failed=failed)
 
     def late(self, rollout: Rollout) -> None:
-        """Count a rollout of a session that has ended. Nobody has checked it."""
+        """Count a rollout of a session that has ended. It is not checked."""
         self.ledger.transitions_received += rollout.env_steps
         self.ledger.transitions_late += rollout.env_steps
 
     def reject(self, member: Member, rollout: Rollout) -> None:
-        """Count a rollout that cannot be used. Its ticket, if this member holds it, is lost."""
+        """Count a rollout that can't be used. If this member holds its ticket, the ticket is lost."""
         number = rollout.ticket
         steps = rollout.env_steps if rollout.valid.dtype == bool else 0
         self.ledger.transitions_received += steps
@@ -226,7 +229,7 @@ class RolloutDealer:
             self.lose(member, number)
 
     def lose(self, member: Member, number: int) -> None:
-        """The ticket, which this member holds, is lost: its round is to be dealt again."""
+        """Record that this ticket of this member is lost, so that its round is dealt again."""
         ticket = self.held[number]
         insort(self._end(member, ticket).due, ticket.round)
         self._to_deal.add(ticket.lane)
@@ -235,20 +238,20 @@ class RolloutDealer:
     # ---------------------------------------------------------------- inside
 
     def _end(self, member: Member, ticket: Ticket) -> TicketedLane:
-        """The ticket is outstanding no more. Returns its lane."""
+        """Remove the ticket from the outstanding ones. Returns its lane."""
         del self.held[ticket.number], member.tickets[ticket.number]
         lane = self.lanes[ticket.lane]
         lane.outstanding.remove(ticket.number)
         return lane
 
     def _past(self, lane: TicketedLane, first: int) -> LanePast | None:
-        """What the lane's new owner is to continue. The first round that it collects is `first`."""
+        """The past that the lane's new owner continues. The first round that it collects is `first`."""
         come = [self.ready[number][lane.number] for number in range(self.rounds.next, first)]
         waiting = [(each.incarnation, each.rollout, self._attributes_of(each.rollout)) for each in come]
         return lane.past(self.histories, waiting)
 
     def _drop_after(self, lane: TicketedLane, first: int) -> None:
-        """Drop the lane's rollouts of later rounds than this one, which was lost: they did not follow what is to come."""
+        """Drop the lane's rollouts after round `first`, which was lost: they don't continue its replacement."""
         for number in [number for number in self.ready if number > first and lane.number in self.ready[number]]:
             dropped = self.ready[number].pop(lane.number)
             self.ledger.lost += 1
@@ -256,11 +259,11 @@ class RolloutDealer:
             insort(lane.due, number)
 
     def _attributes_of(self, rollout: Rollout) -> bytes:
-        """Those that its env copies had."""
+        """The attributes that the rollout's env copies had."""
         return self.attributes.get(rollout.version, b"")
 
     def _marked(self, arrived: AcceptedRollout) -> AcceptedRollout:
-        """The rollout, which an update uses next, marked as fresh or not."""
+        """The rollout, which the next update uses, marked as fresh or not."""
         rollout = arrived.rollout
         fresh = self.lanes[rollout.lane].take(
             arrived.incarnation,

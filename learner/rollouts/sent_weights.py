@@ -1,13 +1,14 @@
-"""The weights that orders name, and who holds which of them. Pure.
+"""The weights that orders name, and which worker holds which of them. Pure.
 
 Rule: weights are kept while they are the newest, act in a round that is open, are evaluated, or are an opponent. They are
-sent to a worker after the first order that names them, and again if its Heartbeat shows that they were lost on the way. A
-worker drops none by itself: every order lists those that it is to keep, which are those that its outstanding tickets name.
-So the learner knows which the worker holds, whatever is on its way between them.
+sent to a worker after the first order that names them, and again if its Heartbeat shows that they were lost. A worker drops
+weights only when told to: every order lists the versions to keep, which are those that its outstanding tickets name. So the
+learner knows which weights the worker holds, whatever messages are on their way.
 
-Where a supervisor shares weights among its workers, it gets them once, in place of the first of its workers that needs
-them. For all of these they are on the way until the supervisor's word shows that they have reached it, or are lost. From
-then on a worker has as long to take them as if they had just been sent to it; what it lacks later is sent to it directly.
+A supervisor that shares weights among its workers gets them once, in place of the first worker that needs them. For all
+these workers the weights count as on the way until a message of the supervisor shows that they have arrived or are lost.
+From then on, a worker has as much time to load them as if they had just been sent to it; weights that it lacks later are
+sent to it directly.
 """
 
 from __future__ import annotations
@@ -27,7 +28,10 @@ from millrace.protocol.messages import Collect, Evaluate, Heartbeat, Weights, ve
 
 @dataclass(frozen=True)
 class SentAfter:
-    """They were sent, after so many heartbeat replies. Who has received a later reply has them, or they are lost."""
+    """They were sent after this many heartbeat replies.
+
+    If the receiver has got a later reply, it has them, or they are lost.
+    """
 
     replies: int
 
@@ -43,26 +47,32 @@ class Confirmed:
 
 
 Standing = SentAfter | FromSupervisor | Confirmed
-"""What the learner knows of some weights and a worker. It knows nothing of those that the worker lacks."""
+"""What the learner knows about some weights at a worker. For weights that the worker lacks there is no entry."""
 
 
 class WeightsHeld:
-    """Which weights each worker and each supervisor holds or is about to get, and which it needs. The only record of it."""
+    """Which weights each worker and each supervisor holds or is about to get, and which it needs.
+
+    This is the only record.
+    """
 
     def __init__(self) -> None:
         self.by_worker: dict[bytes, dict[int, Standing]] = {}
         """by routing id and version"""
         self.named: dict[bytes, dict[int, set[int]]] = {}
-        """by routing id and ticket, the versions that the ticket names; tickets that have ended may be among them"""
+        """by routing id and ticket, the versions that the ticket names; may include tickets that have ended"""
         self.by_supervisor = WeakKeyDictionary[SharingSupervisor, dict[int, SentAfter]]()
-        """by version, the newest last; it ends with the last member that has this supervisor"""
+        """by version, the newest last; dropped with the last member that has this supervisor"""
 
     def versions(self, peer: bytes) -> Set[int]:
         """The versions that this worker holds or is about to get."""
         return self.by_worker.get(peer, {}).keys()
 
     def give(self, member: CollectingMember, version: int, supervisor: SharingSupervisor | None) -> bytes | None:
-        """The worker gets these weights, from this supervisor if there is one. Returns whom to send them; None: nobody."""
+        """Record that the worker gets these weights, through this supervisor if given.
+
+        Returns to whom to send them; None: to nobody.
+        """
         mine = self.by_worker.setdefault(member.peer, {})
         if supervisor is None:
             mine[version] = SentAfter(member.replies)
@@ -77,7 +87,7 @@ class WeightsHeld:
         return supervisor.peer
 
     def needs(self, member: CollectingMember, tickets: Collection[int]) -> set[int]:
-        """The versions that these tickets name, those of the worker that have not ended among them."""
+        """The versions that these tickets name, as far as they are the worker's and have not ended."""
         named = self.named.get(member.peer, {})
         return {version for ticket in member.tickets.keys() & tickets for version in named[ticket]}
 
@@ -88,12 +98,15 @@ class WeightsHeld:
         self.named[member.peer] = outstanding | _by_ticket(order)
 
     def keep_only(self, peer: bytes, versions: Collection[int]) -> None:
-        """The worker is told to drop all others."""
+        """Record that the worker was told to drop all other versions."""
         mine = self.by_worker.get(peer, {})
         self.by_worker[peer] = {version: standing for version, standing in mine.items() if version in versions}
 
     def hear(self, member: CollectingMember, heartbeat: Heartbeat) -> None:
-        """The worker lists what it holds. It lacks the rest, unless that may still be on its way."""
+        """Take in the worker's list of the weights that it holds.
+
+        It lacks all others, unless they may still be on their way.
+        """
         mine = self.by_worker.get(member.peer, {})
         after: dict[int, Standing] = {}
         for version, standing in mine.items():
@@ -113,7 +126,7 @@ class WeightsHeld:
         self.named.pop(peer, None)
 
     def _may_be_under_way(self, version: int, supervisor: SharingSupervisor | None) -> bool:
-        """Whether these weights may not have reached the supervisor yet. False if it shares no more."""
+        """Whether these weights may not have reached the supervisor yet. False if it doesn't share weights any more."""
         if supervisor is None:
             return False
         sent = self.by_supervisor.get(supervisor, {}).get(version)
@@ -125,16 +138,16 @@ class SentWeights:
 
     def __init__(self) -> None:
         self.kept: dict[int, Weights] = {}
-        """by version"""
+        """the weights, by version"""
         self.held = WeightsHeld()
 
     def keep(self, newest: Weights, needed: Collection[int]) -> None:
-        """Keep the newest weights and, of those before them, the versions that are still needed."""
+        """Keep the newest weights and the older versions that are still needed."""
         self.kept = {version: weights for version, weights in self.kept.items() if version in needed}
         self.kept[newest.version] = newest
 
     def after(self, orders: Sequence[Outgoing], members: Mapping[bytes, CollectingMember]) -> list[Outgoing]:
-        """These orders, which list what their workers are to keep. After all of them, the weights that the workers lack."""
+        """These orders, with the versions that their workers keep, then all the weights that the workers lack."""
         out = list[Outgoing]()
         weights = list[Outgoing]()
         for peer, order in orders:

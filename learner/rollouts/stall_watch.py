@@ -1,13 +1,13 @@
-"""Judges whether a run stands still, and through which workers. Pure.
+"""Decides whether a run has stalled, and which workers cause it. Pure.
 
-Rule: env steps, constructions and resets are progress, as are rollouts. Those of workers that only evaluate do not count
-while rollouts are awaited. While a call of the environment is under way within its timeout, the run does not stand still:
-the call ends, or its worker is ended. If nothing happens for `stall_timeout_s`, the workers that hold tickets are refused,
-and others get the tickets. The run ends only if no worker would remain. A worker that holds its tickets, of rollouts or of
-an evaluation, for longer than all calls of the environment may take together is refused, whatever it claims.
+Rule: env steps, constructions and resets are progress, as are rollouts. Those of workers that only evaluate don't count
+while rollouts are awaited. While a call of the environment runs within its timeout, the run has not stalled: either the call
+ends, or its worker is ended. If nothing happens for `stall_timeout_s`, the workers that hold tickets are refused, and others
+get the tickets. The run ends only if no worker would remain. A worker that holds its tickets, of rollouts or of an
+evaluation, for longer than all calls of the environment may take together is refused, whatever it claims.
 
-That may be days for an evaluation. So if none of its episodes has come for `stall_timeout_s` while the learner waits for it,
-a second worker is to play the oldest ones as well, whatever the first one claims.
+That limit may be days for an evaluation. So if none of its episodes has arrived for `stall_timeout_s` while the learner
+waits for it, a second worker plays the oldest ones as well, whatever the first one claims.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from millrace.learner.rollouts.collecting_member import CollectingMember
 from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
 from millrace.protocol.call_timeouts import CallTimeouts
 
-ENDED_WITHIN_S = 5.0  # after its timeout, until the learner hears that a worker was ended
+ENDED_WITHIN_S = 5.0  # time after a timeout in which the learner hears that a worker was ended
 CHECK_BUDGETS_EVERY_S = 1.0
 
 
 @dataclass(frozen=True)
 class Standstill:
-    """A verdict: these members are to be refused; if there are none, the run ends."""
+    """A verdict: refuse these members; if there are none, end the run."""
 
     refuse: tuple[CollectingMember, ...]
     why: str
@@ -34,7 +34,7 @@ class Standstill:
 
 @dataclass(frozen=True)
 class Overdue:
-    """A verdict: a second worker is to play the oldest ticket of the evaluation as well."""
+    """A verdict: let a second worker play the oldest ticket of the evaluation as well."""
 
 
 class StallWatch:
@@ -55,7 +55,7 @@ class StallWatch:
         self._progress_s = self._answered_s = now
 
     def check(self, now: float, progress: object, *, evaluating: bool = False) -> Standstill | Overdue | None:
-        """None: the run goes on. `progress`: anything that changes when what the learner waits for makes progress.
+        """None: the run continues. `progress`: anything that changes when what the learner waits for makes progress.
 
         `evaluating`: whether the learner waits for an evaluation, and not for rollouts.
         """
@@ -82,7 +82,7 @@ class StallWatch:
         return Standstill(idle, f"it holds tickets and has made no progress for {self._stall_timeout_s:.0f} s")
 
     def _takes_too_long(self, now: float) -> bool:
-        """Notes how many episodes of the evaluation have come. True if none has for too long; then the time begins again."""
+        """Count the evaluation's episodes that have arrived. True if none has for too long; then the time starts again."""
         answered = self._coordinator.evaluation.episodes_played
         overdue = answered == self._answered and now - self._answered_s > self._stall_timeout_s
         if overdue or answered != self._answered:
@@ -116,7 +116,7 @@ class StallWatch:
         return tuple(coordinator.members[peer] for peer in oldest_s if now - oldest_s[peer] > allowed_s[peer])
 
     def _rollout_s(self, number: int) -> float:
-        """How long the rollout of this ticket may take, with the steps that are repeated before it."""
+        """How long the rollout of this ticket may take, including the steps that are replayed before it."""
         run = self._coordinator.run
         past = self._coordinator.rollouts.held[number].past
         rollout_s = self._longest_s(run.copies, run.rollout_steps)

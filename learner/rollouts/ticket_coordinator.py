@@ -1,10 +1,10 @@
 """The learner's half of the conversation of a run. Pure: messages and `now` in, messages out; no socket, clock or torch.
 
-Rule: whatever a worker is asked for has a ticket. Two dealers decide what is asked and what an answer means:
-`rollout_dealer.py` and `evaluation_dealer.py`. Here they meet the workers. A lane has one owner at a time and moves only
-between rollouts; its new owner has it on new env copies, so its incarnation rises. When a worker is lost, its lanes go to
-other workers, which continue them, and its tickets are dealt again. There is no other failure handling. If a Heartbeat shows
-that a message was lost on the way, the message is sent again.
+Rule: every task of a worker has a ticket. Two dealers decide what to ask for and what an answer means: `rollout_dealer.py`
+and `evaluation_dealer.py`. This file connects them to the workers. A lane has one owner at a time and moves only between
+rollouts; its new owner has new env copies for it, so its incarnation rises. When a worker is lost, its lanes go to other
+workers, which continue them, and its tickets are dealt again. There is no other failure handling. If a Heartbeat shows that
+a message was lost, the message is sent again.
 
 While an evaluation is pending, no ticket for a rollout is dealt, unless the evaluation is beside training: then workers that
 only evaluate play it, whatever the others do.
@@ -47,7 +47,7 @@ CheckRows = Callable[[Rollout, RunSpec, int], None]
 """Raises `BadRollout` if the rows of a rollout break the row format, or are not those of the run, or if an episode is longer
 than this number of steps."""
 
-MOST_NOTES = 10  # of all workers together
+MOST_NOTES = 10  # notes of all workers together
 STRIKES = 3  # rollouts or messages that could not be used, after which a worker is refused
 
 
@@ -63,7 +63,7 @@ class TicketCoordinator(Coordinator[CollectingMember]):
         first_session: int,
         check_rows: CheckRows = validate,
     ) -> None:
-        """`check_rows`: of each rollout, before it is accepted."""
+        """`check_rows` checks each rollout before it is accepted."""
         self.rollouts = rollouts
         self.evaluation = EvaluationDealer(run)
         lanes = self.rollouts.lanes
@@ -73,7 +73,7 @@ class TicketCoordinator(Coordinator[CollectingMember]):
         self.version = -1  # until `publish`
         self._placement = LanePlacement(lanes, _by_joining)
         self.weights = SentWeights()
-        self._notes = set[str]()  # of workers; all that step one environment see the same
+        self._notes = set[str]()  # workers' notes; those that step the same environment send the same ones
         self._check_rows = check_rows
 
     # ---------------------------------------------------------------- in
@@ -84,7 +84,7 @@ class TicketCoordinator(Coordinator[CollectingMember]):
         return super().reject_message(peer, why, now)
 
     def refuse(self, member: CollectingMember, why: str) -> list[Outgoing]:
-        """Refuse a worker that holds tickets and does nothing with them: they are dealt again."""
+        """Refuse a worker that holds tickets without working on them, and deal them again."""
         return self.membership.refuse(member, SentUnusable, why) + self._deal()
 
     # ---------------------------------------------------------------- the learner's side
@@ -100,7 +100,7 @@ class TicketCoordinator(Coordinator[CollectingMember]):
     ) -> None:
         """Set the newest weights. Orders name them from now on: call `begin_update`, or `begin_evaluation`.
 
-        `env_steps`: of training, after which they were made; None: they never become an opponent.
+        `env_steps`: number of env steps of training so far; None: the weights never become an opponent.
         """
         if self.rollouts.opponents is not None and env_steps is not None:
             self.rollouts.opponents.made(version, env_steps)
@@ -110,17 +110,17 @@ class TicketCoordinator(Coordinator[CollectingMember]):
         self._note_attributes(weights)
 
     def keep(self, weights: Weights) -> None:
-        """Keep weights that act in an open round of a run that goes on."""
+        """Keep weights that act in an open round of a resumed run."""
         self.weights.kept[weights.version] = weights
         self._note_attributes(weights)
 
     def _note_attributes(self, weights: Weights) -> None:
-        """The rollouts under these weights are made with these attributes of the env copies."""
+        """Record the attributes of the env copies in rollouts with these weights."""
         if weights.env_attributes is not None:
             self.rollouts.attributes[weights.version] = weights.env_attributes.tobytes()
 
     def past(self) -> PastRollouts:
-        """With which another learner goes on after the last round that was taken."""
+        """The state from which another learner continues after the last round that was taken."""
         rounds = self.rollouts.rounds
         older = sorted(rounds.acting() - {self.version})
         return PastRollouts(
@@ -132,7 +132,7 @@ class TicketCoordinator(Coordinator[CollectingMember]):
         )
 
     def begin_update(self) -> list[Outgoing]:
-        """The next update begins, unless it has begun, with the newest weights: deal the rounds that it opens."""
+        """Begin the next update with the newest weights, unless it has begun, and deal the rounds that it opens."""
         self.rollouts.begin_update(self.version)
         return self._deal()
 
@@ -144,18 +144,18 @@ class TicketCoordinator(Coordinator[CollectingMember]):
         return self._deal()
 
     def await_evaluation(self) -> list[Outgoing]:
-        """The learner waits for the evaluation beside training: if no worker only evaluates any more, all play it."""
+        """The learner waits for the evaluation beside training: if no evaluating worker is left, let all workers play it."""
         if any(member.hello.evaluates for member in self.membership.active()):
             return []
         self.evaluation.all_play()
         return self._deal()
 
     def share_evaluation(self) -> list[Outgoing]:
-        """No answer of the evaluation has come for long: a second worker plays the oldest ticket as well, if one is free."""
+        """No answer of the evaluation has come for long: let a second worker, if one is free, play the oldest ticket too."""
         return self.weights.after(self.evaluation.share(self.membership.active()), self.members)
 
     def collected(self) -> int:
-        """Env steps of the next update's rollouts: of those that have come, and of those under way, as workers report."""
+        """Env steps of the next update's rollouts, complete ones and running ones, as workers report."""
         rollouts = self.rollouts
         of_one = self.run.rollout_steps * self.run.copies
         awaited = Counter(ticket.peer for ticket in rollouts.awaited())
@@ -169,7 +169,7 @@ class TicketCoordinator(Coordinator[CollectingMember]):
     # ---------------------------------------------------------------- inside
 
     def _deal(self) -> list[Outgoing]:
-        """Give lanes without an owner to workers, balance the lanes, and deal what is to be dealt."""
+        """Give lanes without an owner to workers, balance the lanes, and deal tickets."""
         if self.version < 0 or self.membership.draining is not None or not self.members:
             return []
         out = self._placement.place(self.members.values())
@@ -183,7 +183,7 @@ class TicketCoordinator(Coordinator[CollectingMember]):
         dealt = self.rollouts.deal(self.members)
         for peer, order in dealt:
             for permit in order.permits if isinstance(order, Collect) else ():
-                if (past := permit.past) is not None and past.memory:  # rollouts of it have come
+                if (past := permit.past) is not None and past.memory:  # the lane has had rollouts
                     worker = self.members[peer].hello.worker
                     history = self.rollouts.lanes[permit.lane].history
                     longest = 0 if history is None else history.longest_given_up
@@ -192,7 +192,7 @@ class TicketCoordinator(Coordinator[CollectingMember]):
         return dealt
 
     def _needed(self) -> set[int]:
-        """The versions that orders may name, beside the newest."""
+        """The versions that orders may name, besides the newest."""
         opponents = self.rollouts.opponents
         needed = self.rollouts.rounds.acting()
         if self.evaluation.pending:
@@ -221,10 +221,10 @@ class TicketCoordinator(Coordinator[CollectingMember]):
                 return self._unusable(member, why) if why else []
             case Goodbye(_, reason):
                 self.membership.leave(member, reason)
-        return []  # also to answers to orders that a run does not give
+        return []  # also for answers to orders that a run doesn't give
 
     def _take_rollout(self, member: CollectingMember, rollout: Rollout) -> list[Outgoing]:
-        """Accept a rollout, unless it came before. One that cannot be used is counted, and its ticket is lost."""
+        """Accept a rollout, unless it arrived before. If it can't be used, it is counted and its ticket is lost."""
         try:
             most_steps = self.rollouts.rounds_by(rollout.ticket) * self.run.rollout_steps
             self._check_rows(rollout, self.run, most_steps)
@@ -245,7 +245,7 @@ class TicketCoordinator(Coordinator[CollectingMember]):
         return out
 
     def _take_evaluated(self, member: CollectingMember, answer: Evaluated) -> list[Outgoing]:
-        """Accept episodes of an evaluation, unless they came before."""
+        """Accept episodes of an evaluation, unless they arrived before."""
         held = len(member.tickets)
         played = self.evaluation.episodes_played
         why = self.evaluation.take_in(member, answer)
@@ -276,7 +276,10 @@ class TicketCoordinator(Coordinator[CollectingMember]):
         return self.rollouts.received(member)
 
     def _removed(self, member: CollectingMember, why: str) -> None:
-        """The worker is gone: its tickets are lost, its lanes have no owner. `_deal` gives both to other workers."""
+        """Count the tickets of a worker that is gone as lost, and its lanes as without owner.
+
+        `_deal` gives both to other workers.
+        """
         self.rollouts.worker_lost(member)
         for number in list(member.tickets):
             dealer = self.rollouts if number in self.rollouts.held else self.evaluation
@@ -285,7 +288,7 @@ class TicketCoordinator(Coordinator[CollectingMember]):
         self.weights.held.forget(member.peer)
 
     def _unusable(self, member: CollectingMember, why: str) -> list[Outgoing]:
-        """Count what could not be used; after too much of it the worker is refused."""
+        """Count a message that could not be used; refuse the worker after too many."""
         member.strikes += 1
         return super()._unusable(member, why) if member.strikes >= STRIKES else []
 

@@ -1,9 +1,10 @@
 """Who waits for whom in a run, and for what share of the time: one line. Pure: the state and `now` in, a sentence out.
 
-Rule: what takes less than `LONG_S` is not said. Between two long waits for rollouts, the line tells of the last one, so that
-it does not come and go. While the learner waits, the line names the lanes whose rollouts the next update lacks, and says how
-many of its env steps are made: with a slow simulator, the first update may be far away. While it learns, the workers that
-hold no ticket wait for weights. The shares are those of training since the learner started: evaluations do not count.
+Rule: waits shorter than `LONG_S` aren't mentioned. Between two long waits for rollouts, the line mentions the last one, so
+that it does not come and go. While the learner waits, the line names the lanes whose rollouts the next update lacks, and
+says how many of its env steps have been made: with a slow simulator, the first update may be far away. While the learner
+learns, the workers without a ticket wait for weights. The shares are those of training since the learner started:
+evaluations do not count.
 """
 
 from __future__ import annotations
@@ -20,20 +21,20 @@ from millrace.protocol.bounds import one_line
 
 Phase = Literal["starting", "gathering", "learning", "evaluating"]
 SHARES_AFTER_S = 30.0
-SHORT_S = 180.0  # a longer time is told in minutes
-MOST_LANES = 4  # that are named by their numbers
+SHORT_S = 180.0  # longer times are given in minutes
+MOST_LANES = 4  # lanes that are named by their numbers
 
 
 class LearnerTime:
-    """What the learner does, since when, and how it has spent its time."""
+    """What the learner is doing, since when, and how it has spent its time."""
 
     def __init__(
         self, coordinator: TicketCoordinator, now: float, no_worker: Callable[[], str], processes: WorkerProcesses
     ) -> None:
-        """`no_worker` returns what is awaited if there is no member."""
+        """`no_worker` returns a text about what is awaited if there is no member."""
         self.phase: Phase = "starting"
         self.since_s = now
-        self._last = ""  # who waited last; empty if the last wait for rollouts was short
+        self._last = ""  # the last wait, in words; empty if the last wait for rollouts was short
         self.spent_s: dict[Phase, float] = dict.fromkeys(get_args(Phase), 0.0)
         """seconds of the phases that have ended"""
         self._coordinator = coordinator
@@ -46,7 +47,7 @@ class LearnerTime:
         return self.phase == "evaluating"
 
     def turn(self, phase: Phase, now: float) -> None:
-        """From now on the learner does this."""
+        """The learner enters this phase."""
         if self.phase == "gathering":
             waited_s = now - self.since_s
             self._last = f"waited {waited_s:.0f} s for rollouts" if waited_s >= LONG_S else ""
@@ -108,7 +109,7 @@ class LearnerTime:
         return f"lane{'s' * (len(mine) > 1)} {named} ({who})" + (f" and {more} more" if more else "")
 
     def _collected(self, now: float) -> str:
-        """How much of the next update's rollouts is made, and how long the rest takes; empty before their first env step."""
+        """How many env steps of the next update have been made, and how long the rest takes; empty before the first one."""
         coordinator = self._coordinator
         made = coordinator.collected()
         of = coordinator.steps_of_update()
@@ -120,14 +121,14 @@ class LearnerTime:
         return f"; {which} rollouts: {made:,} of {of:,} env steps{left}"
 
     def _played(self, plan: EvaluationPlan, now: float) -> str:
-        """How far an evaluation is, and who is held up longest of those that play it."""
+        """How far an evaluation is, and which of its players is held up longest."""
         evaluation = self._coordinator.evaluation
         who = self._held_up_longest(evaluation.players, now)
         done = f"{evaluation.episodes_played} of {len(plan.seeds)} episodes"
         return f"{done} (at most {plan.most_steps:,} env steps each); {who}"
 
     def _held_up_longest(self, members: list[Member], now: float) -> str:
-        """Who that is of the workers that step for these members, or of the members."""
+        """The worker that is held up longest, among those that step for these members, or among the members."""
         return max((held_up(member, now) for member in self._processes.stepping() or members), default=("nobody plays",))[-1]
 
 

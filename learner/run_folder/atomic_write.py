@@ -1,9 +1,9 @@
-"""Writes files that are there whole or not at all, and again what a disk refused.
+"""Writes files atomically, and retries writes that the disk refused.
 
 Rule: a file is written beside the target under a name that ends with `.tmp`, flushed to the disk, and then renamed to the
-target; the folder is flushed too. If anything fails, the target stays as it was and the temporary file is removed. Only what
-nobody needs after a power failure is not flushed. What the disk of a run refuses costs a warning while the run trains, and
-the run if it is still refused at the end.
+target; the folder is flushed too. If anything fails, the target stays as it was and the temporary file is removed. Only
+files that nobody needs after a power failure are not flushed. If the disk refuses a write, there is a warning while the run
+trains, and the run fails if it is still refused at the end.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from millrace.protocol.errors import RunError
 log = logging.getLogger("millrace.learner")
 
 TEMPORARY = ".tmp"
-SAY_AGAIN_S = 60.0  # that something is refused for the same reason
+SAY_AGAIN_S = 60.0  # seconds between warnings about the same reason
 TRY_FOR_S = 10.0  # at the end of a run: somebody may make space
 TRY_EVERY_S = 0.5
 
 Write = Callable[[], object]
-"""Writes the present state of something. Raises `RunError` if the disk refuses it."""
+"""Writes the current state of something. Raises `RunError` if the disk refuses it."""
 
 
 def write_atomically(target: Path, write: Callable[[BinaryIO], object], *, flush: bool = True) -> None:
@@ -53,10 +53,10 @@ def write_atomically(target: Path, write: Callable[[BinaryIO], object], *, flush
 
 
 def write_file(target: Path, write: Callable[[BinaryIO], object]) -> None:
-    """As `write_atomically`. Raises `RunError`, in one line, for what the file system refuses."""
+    """Like `write_atomically`, but raises `RunError`, in one line, if the file system refuses."""
     try:
         write_atomically(target, write)
-    except (OSError, ValueError) as error:  # ValueError: no name of a file
+    except (OSError, ValueError) as error:  # ValueError: not a valid file name
         raise RunError(f"{target} not written: {reason(error)}") from error
 
 
@@ -70,7 +70,7 @@ def _flush_folder(folder: Path) -> None:
 
 
 class Writes:
-    """What a run writes, by name, and what of it the disk has refused."""
+    """The writes of a run, by name, and those that the disk has refused."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic, sleep: Callable[[float], None] = time.sleep) -> None:
         self._clock = clock
@@ -78,7 +78,7 @@ class Writes:
         self._refused: dict[str, tuple[Write, RunError]] = {}
         self._said: dict[str, tuple[str, float]] = {}
         self.at_most: Callable[[float], float] = lambda seconds: seconds
-        """How long `confirm` may try, of so many seconds: less once a signal ends the run."""
+        """Maps the seconds that `confirm` would try to those that it may: fewer once a signal ends the run."""
 
     def write(self, name: str, write: Write) -> None:
         """Call `write`. If the disk refuses it, a warning says so, and `confirm` calls it again."""
@@ -92,7 +92,7 @@ class Writes:
             log.warning("%s", line)
 
     def confirm(self) -> None:
-        """Return once the disk has everything. Tries for a while, and ends that at Ctrl-C. Raises `RunError`."""
+        """Return once everything is written. Retries for a while, but not after Ctrl-C. Raises `RunError`."""
         if not self._refused:
             return
         for_s = self.at_most(TRY_FOR_S)

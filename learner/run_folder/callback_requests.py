@@ -1,6 +1,6 @@
-"""What callbacks ask of a run, until the run takes it: numbers to log, and attributes of env copies.
+"""Callbacks' requests until the run takes them: numbers to log, and attributes of env copies.
 
-Rule: everything is checked when it is asked for, so that an error names the user's line.
+Rule: everything is checked at the call, so that a traceback shows the user's line.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ LONGEST_NAME = 200  # characters
 
 
 class Requests:
-    """The requests that were not taken yet."""
+    """The requests that have not been taken yet."""
 
     def __init__(self, attributes: EnvAttributes | None = None) -> None:
         self.attributes = attributes or EnvAttributes()

@@ -1,10 +1,10 @@
 """Checkpoints of a run: `checkpoints/<env steps>.pt`. `CheckpointSchedule` says when to write one.
 
-Rule: a checkpoint is there whole or not at all; the newest whole one is used; and reading one executes no code
+Rule: a checkpoint is written atomically; the newest undamaged one is used; and reading one executes no code
 (`weights_only`). A state therefore consists of tensors and plain data; a numpy generator is stored as its
 `bit_generator.state`. torch's loader does not detect damaged data, so the checksums of the file (a zip archive) are verified
-first. Each element of a tensor must be in the file: one with a stride of 0 is a few bytes there, but any number once copied.
-And what the loader would call is rehearsed, because it could fill the memory (`learner/rehearsed_pickle.py`).
+first. The file must contain each element of a tensor: a tensor with a stride of 0 has a few bytes there, but any number once
+copied. And the loader's calls are rehearsed, because they could fill the memory (`learner/rehearsed_pickle.py`).
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ if TYPE_CHECKING:
 FORMAT = 1
 FOLDER = "checkpoints"
 SUFFIX = ".pt"
-ZIP_BEGINS = b"PK\x03\x04"  # where a file begins otherwise, torch reads a pickle before the archive
+ZIP_BEGINS = b"PK\x03\x04"  # if a file begins with anything else, torch reads a pickle before the archive
 PICKLE = "data.pkl"  # how the name of an archive's pickle ends; torch finds it in capital letters, too
-MOST_VIEWS = 16  # of the same numbers: an algorithm may save parts of a tensor besides the whole
+MOST_VIEWS = 16  # views of the same numbers: an algorithm may save parts of a tensor besides the whole
 
 
 class Checkpoint(NamedTuple):
@@ -47,23 +47,22 @@ class CheckpointSchedule:
         self._began_s = now
 
     def is_due(self, updates: int, now: float) -> bool:
-        """Whether one is due after this number of `updates`."""
+        """Whether a checkpoint is due after this number of `updates`."""
         return updates == 1 or now - self._began_s >= self._every_s
 
     def saved(self, began_s: float) -> None:
-        """One was begun at this time, and is written, or refused by the disk. -inf: all are gone, so one is due."""
+        """Record that one was begun at this time, and written or refused by the disk. -inf: all are gone, so one is due."""
         self._began_s = began_s
 
 
 class _Unreadable(Exception):
-    """The file is damaged; an older one may be whole."""
+    """The file is damaged; an older one may be intact."""
 
 
 def save(folder: Path, state: dict[str, Any], env_steps: int, keep: int) -> Path:
-    """Write a checkpoint into the run folder. Of those up to it, remove all but the newest `keep`.
-
-    A later one stays: a resumed run passed over it because it is damaged. Raises `CheckpointError` if it cannot be written;
-    older checkpoints then stay untouched. Raises `UsageError` if the state contains something that could not be read back.
+    """Write a checkpoint into the run folder. Of it and earlier ones, keep the newest `keep`. A later one stays: a resumed
+    run skipped it because it is damaged. Raises `CheckpointError` if it cannot be written; older checkpoints then stay
+    untouched. Raises `UsageError` if the state contains something that could not be read back.
     """
     import torch
 
@@ -78,16 +77,16 @@ def save(folder: Path, state: dict[str, Any], env_steps: int, keep: int) -> Path
         for old in [each for each in _files(folder) if each <= path][:-keep]:
             old.unlink()
     except (OSError, RuntimeError) as error:
-        refused = error.__context__  # torch raises a RuntimeError of its own over what the file raised
+        refused = error.__context__  # torch raises its own RuntimeError during the file's error
         why = reason(refused if isinstance(refused, OSError) and not isinstance(error, OSError) else error)
         raise CheckpointError(f"checkpoint {path} not written: {why}; older checkpoints are untouched") from error
     return path
 
 
 def newest(folder: Path) -> tuple[Checkpoint, list[str]]:
-    """Read the newest whole checkpoint of a run folder. Also returns a warning for each newer one that is damaged.
+    """Read the newest undamaged checkpoint of a run folder. Also returns a warning for each newer, damaged one.
 
-    Raises `CheckpointError` if there is none, or if the newest whole one is of another format.
+    Raises `CheckpointError` if there is none, or if the newest undamaged one has another format.
     """
     paths = _files(folder)[::-1]
     if not paths:
@@ -102,7 +101,7 @@ def newest(folder: Path) -> tuple[Checkpoint, list[str]]:
 
 
 def has_any(folder: Path) -> bool:
-    """Whether a folder has checkpoints, whole or not."""
+    """Whether a folder has checkpoints, damaged or not."""
     return bool(_files(folder))
 
 
@@ -130,10 +129,10 @@ def _read(path: Path) -> Checkpoint:
     try:
         with os.fdopen(open_regular(path), "rb") as file:
             if file.read(len(ZIP_BEGINS)) != ZIP_BEGINS:
-                raise _Unreadable("it is no archive that torch.save wrote")
+                raise _Unreadable("it isn't an archive that torch.save wrote")
             with zipfile.ZipFile(file) as archive:
                 if any(entry.compress_type != zipfile.ZIP_STORED for entry in archive.infolist()):
-                    raise _Unreadable("it is compressed, and torch writes none that is")  # a few bytes could fill the memory
+                    raise _Unreadable("it is compressed, which torch never does")  # a few bytes could fill the memory
                 if (damaged := archive.testzip()) is not None:
                     raise _Unreadable(f"checksum of {damaged} does not match")
                 for entry in archive.infolist():
@@ -170,7 +169,7 @@ def _check_memory(record: object, size: int) -> None:
 
 
 def _tensors(record: object) -> Iterator[Tensor]:
-    """Each tensor once. A stranger's lists may have themselves as an entry, or the same one many times."""
+    """Each tensor once. Lists in a stranger's file may contain themselves, or one entry many times."""
     import torch
 
     seen: set[int] = set()
@@ -190,7 +189,7 @@ def _tensors(record: object) -> Iterator[Tensor]:
 
 
 def _is_whole(tensor: Tensor) -> bool:
-    """Whether each element has memory of its own."""
+    """Whether each element has its own memory."""
     import torch
 
     return tensor.layout == torch.strided and tensor.nbytes <= tensor.untyped_storage().nbytes()
@@ -211,15 +210,15 @@ def _check_plain(value: object, where: str) -> None:
             if type(value) not in (torch.Tensor, torch.nn.Parameter) or vars(value):
                 raise UsageError(
                     f"checkpoint: {where}: expected a tensor without attributes, got a {type(value).__name__} with more; "
-                    "mend state_dict, as by detach()"
+                    "fix state_dict, for example with detach()"
                 )
             if not _is_whole(value):
                 raise UsageError(
                     f"checkpoint: {where}: expected a tensor with memory for each of its elements, got a sparse or an "
-                    "expanded one; mend state_dict, as by clone()"
+                    "expanded one; fix state_dict, for example with clone()"
                 )
         case bytes() if not value:
-            raise UsageError(f"checkpoint: {where}: expected bytes, got none, which torch cannot read back; mend state_dict")
+            raise UsageError(f"checkpoint: {where}: expected bytes, got none, which torch cannot read back; fix state_dict")
         case _ if type(value) not in (bool, int, float, str, bytes, type(None)):
             got = f"{type(value).__module__}.{type(value).__name__}"
-            raise UsageError(f"checkpoint: {where}: expected tensors and plain data, got {got}; mend state_dict")
+            raise UsageError(f"checkpoint: {where}: expected tensors and plain data, got {got}; fix state_dict")

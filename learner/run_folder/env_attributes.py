@@ -1,7 +1,7 @@
-"""Attributes of env copies that callbacks set: what the next weights carry, and what a resumed run must send. Pure.
+"""Attributes of env copies that callbacks set: those of the next weights, and those that a resumed run must send. Pure.
 
-Rule: an attribute takes effect with the next version of the weights, so each rollout is made under the attributes of its
-version, whatever the number of workers. A checkpoint of version v has those of v, and those that wait for v + 1.
+Rule: an attribute takes effect with the next version of the weights, so each rollout is collected with the attributes of its
+version, whatever the number of workers. A checkpoint of version v has the attributes of v, and those that wait for v + 1.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from millrace.protocol.bounds import MAX_NAME, one_line
 from millrace.protocol.errors import UsageError, safe_repr
 from millrace.protocol.wire.plain_values import pack, unpack
 
-MOST_BYTES = 1 << 20  # of all attributes together: they travel with all weights
+MOST_BYTES = 1 << 20  # size of all attributes together: they are sent with all weights
 
 
 class AttributesState(msgspec.Struct, kw_only=True):
@@ -25,25 +25,25 @@ class AttributesState(msgspec.Struct, kw_only=True):
     sent: bytes = b""
     """packed attributes of the version of the checkpoint; empty if there are none"""
     waiting: bytes = b""
-    """those of the next version"""
+    """packed attributes of the next version"""
 
 
 class EnvAttributes:
     """The attributes of one run, by name."""
 
     def __init__(self, state: AttributesState | None = None, refusal: str = "") -> None:
-        """`state`: that of a resumed run. `refusal`: why this run's env copies have no attributes, if so."""
+        """`state`: from the checkpoint of a resumed run. `refusal`: why this run's env copies have no attributes, if so."""
         state = state or AttributesState()
         self._refusal = refusal
-        self._next = _unpacked(state.sent)  # what the next weights carry
-        self._after: dict[str, Any] | None = _unpacked(state.waiting)  # what the weights after those carry; None: the same
+        self._next = _unpacked(state.sent)  # attributes that the next weights carry
+        self._after: dict[str, Any] | None = _unpacked(state.waiting)  # those of the weights after that; None: the same
         self._sent = state.sent
         self._version = -1
         self.changes = 0
-        """how often an attribute was set, in this process"""
+        """how often an attribute was set in this process"""
 
     def now(self) -> dict[str, Any]:
-        """The attributes as they were set last, by name."""
+        """The newest attributes, by name."""
         return dict(self._next if self._after is None else self._after)
 
     def set(self, name: str, value: Any) -> None:
@@ -53,7 +53,7 @@ class EnvAttributes:
         if not (isinstance(name, str) and name.isidentifier() and len(name) <= MAX_NAME) or name.startswith("_"):
             raise UsageError(f"set_env_attr: expected the name of a public attribute, got {one_line(safe_repr(name), 80)}")
         try:
-            value = unpack(pack(value))  # a copy, which the caller cannot change any more
+            value = unpack(pack(value))  # a copy that the caller can't change
             size = len(pack({**self.now(), name: value}))
         except TypeError as error:
             raise UsageError(f"set_env_attr {name}: {one_line(str(error))}") from None
@@ -65,7 +65,7 @@ class EnvAttributes:
         self.changes += 1
 
     def table(self, version: int) -> Array | None:
-        """What the weights of this version carry, however often it is asked; None if there are no attributes."""
+        """The packed attributes of this version's weights, however often you ask; None if there are no attributes."""
         if version != self._version:
             self._sent = pack(self._next) if self._next else b""
             self._version = version
@@ -75,14 +75,14 @@ class EnvAttributes:
         return np.frombuffer(self._sent, np.uint8) if self._sent else None
 
     def state(self, version: int) -> AttributesState:
-        """What a checkpoint of this version keeps."""
+        """The state for a checkpoint of this version."""
         waiting = pack(self.now()) if self.now() else b""
         first = self._version == -1  # nothing was published in this process
         return AttributesState(sent=self._sent if first or version == self._version else waiting, waiting=waiting)
 
 
 def _unpacked(packed: bytes) -> dict[str, Any]:
-    """Raises `BadMessage` or `ValueError` for what was not packed here."""
+    """The attributes by name. Raises `BadMessage` or `ValueError` unless `table` packed them."""
     attributes = unpack(packed) if packed else {}
     if not isinstance(attributes, dict):
         raise ValueError(f"attributes: expected a dict, got {type(attributes).__name__}")

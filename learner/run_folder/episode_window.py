@@ -19,9 +19,9 @@ class EpisodeWindow:
     """The last 100 episodes."""
 
     def __init__(self, episodes: Sequence[Episode] = (), facts: Sequence[str] = ()) -> None:
-        """`facts`: the names of the facts of episodes."""
+        """`facts`: the names of the episodes' facts."""
         self.facts: dict[str, FactMean] = fact_means(facts, ())
-        """The means of their facts, by name."""
+        """The means of the episodes' facts, by name."""
         self._names = facts
         self.return_mean: float | None = None
         """Mean return, or None before the first episode has ended."""
@@ -32,7 +32,7 @@ class EpisodeWindow:
 
     @staticmethod
     def from_state(episodes: list[Episode], had: Sequence[str] = (), facts: Sequence[str] = ()) -> EpisodeWindow:
-        """The window that had these episodes. `had`: the names of the facts in them; `facts`: those of new episodes."""
+        """The window with these episodes. `had`: the names of their facts; `facts`: the names of new episodes' facts."""
         if tuple(had) != tuple(facts):
             by_name = (dict(zip(had, one.facts, strict=False)) for one in episodes)
             renamed = (tuple(of_one.get(name, math.nan) for name in facts) for of_one in by_name)
@@ -46,7 +46,7 @@ class EpisodeWindow:
     def extend(self, episodes: Sequence[Episode]) -> None:
         """Add episodes that have just ended, in order."""
         if not episodes:
-            return  # as after most updates of short rollouts: the means need not be computed again
+            return  # usual after updates of short rollouts: the means stay the same
         self._episodes.extend(episodes)
         self.return_mean = float(np.mean([episode.reward for episode in self._episodes]))
         self.length_mean = float(np.mean([episode.length for episode in self._episodes]))

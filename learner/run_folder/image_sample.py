@@ -1,8 +1,8 @@
 """What the policy sees, as a picture: some image observations of the first rollouts. Pure.
 
-A row for each of four steps, from the first to the last of a rollout of one env copy. The channels are side by side, as
-those of stacked frames are; three channels are shown as red, green and blue. Of large images every second, third, … pixel is
-taken. Where the bounds are not those of bytes, the largest value is white, so that planes of 0 and 1 can be seen.
+There is a row for each of four steps, from the first to the last of one env copy's rollout. The channels, such as stacked
+frames, are side by side; three channels are shown as red, green and blue. Large images are reduced to every second, third, …
+pixel. If the bounds aren't those of bytes, the largest value is white, so that planes of 0 and 1 are visible.
 """
 
 from __future__ import annotations

@@ -2,10 +2,10 @@
 
 Every line has `time` (UTC, ISO 8601), `level`, `event` and `message`, the text for people. `event` is "joined",
 "left", "refused", "environment_raised", "policy_raised", "process_failed" or "asked_to_rejoin"
-(`millrace.learner.members.events`, whose fields stand beside it), "progress", or "said" for any other line of the log.
+(`millrace.learner.members.events`, with the fields of the event), "progress", or "said" for any other line of the log.
 
-Rule: log.jsonl is bounded, and nothing depends on it. Of a file that has grown too long, the newer half is kept. Lines that
-the disk refuses are dropped. It is opened for each line, because somebody may delete it, or its folder, meanwhile.
+Rule: log.jsonl is bounded, and nothing depends on it. If it grows too long, only the newer half is kept. Lines that the disk
+refuses are dropped. It is opened for each line, because somebody may delete it, or its folder, meanwhile.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ class LoggedLine(msgspec.Struct, frozen=True):
 
 @contextmanager
 def kept_log(folder: Path) -> Iterator[None]:
-    """What millrace warns of goes into the folder, too."""
+    """Write millrace's warnings into the folder, too."""
     handler = _RunLog(folder / RUN_LOG_FILE)
     logger = logging.getLogger("millrace")
     logger.addHandler(handler)
@@ -83,7 +83,7 @@ def kept_log(folder: Path) -> Iterator[None]:
 
 
 def newest_lines(folder: Path) -> list[LoggedLine]:
-    """The last lines of the log of a run folder, the oldest first. Empty if it has none that can be read."""
+    """The last lines of the log of a run folder, the oldest first. Empty if none can be read."""
     try:
         with os.fdopen(open_regular(folder / RUN_LOG_FILE), "rb") as file:
             lines = _end(file.fileno(), READ_BYTES).splitlines()
@@ -104,7 +104,7 @@ class _RunLog(logging.Handler):
         self.setFormatter(JsonLines())
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Append one line, unless it is a notice that is not kept."""
+        """Append one line, unless the record is a notice that isn't kept."""
         if not getattr(record, "kept", True):
             return
         with suppress(OSError, UnicodeError):
@@ -119,7 +119,7 @@ class _RunLog(logging.Handler):
 
 
 def _end(file: int, most: int) -> bytes:
-    """Whole lines from the end of a file, of so many bytes at most. Raises OSError."""
+    """Whole lines from the end of a file, at most this many bytes. Raises OSError."""
     begin = max(0, os.fstat(file).st_size - most)
     end = os.pread(file, most, begin)
     return end.partition(b"\n")[2] if begin else end

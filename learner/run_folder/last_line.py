@@ -1,4 +1,4 @@
-"""The last line of a program that trains: why it ended, and how to go on with the run. Pure.
+"""The last line of a program that trains: why it ended, and how to continue the run. Pure.
 
 Rule: it is one line. Notes that were added to the error on its way (`BaseException.__notes__`) follow it.
 """
@@ -15,23 +15,23 @@ from millrace.flags.program_name import typed_name
 from millrace.protocol.bounds import MAX_TEXT, one_line
 from millrace.protocol.errors import UserFacingError, first_line
 
-OURS = "millrace."  # how names of our modules begin
+OURS = "millrace."  # how the names of millrace's modules begin
 OF_LEARNER = "millrace.learner."
 
 
 def resume_command(run: Path, *, elsewhere: bool) -> str:
-    """What to type in a shell to go on with a run. `elsewhere`: its workers are started elsewhere, not by the learner."""
+    """The shell command that continues a run. `elsewhere`: its workers are started elsewhere, not by the learner."""
     return f"{typed_name()} {'learner' if elsewhere else 'train'} --resume {shlex.quote(str(run))}"
 
 
 def last_line(program: str, error: BaseException, hints: Sequence[str] = (), *, elsewhere: bool = False) -> str:
-    """Why `program` ended, for a terminal. `hints` follow the notes of the error; `elsewhere` as of `resume_command`."""
+    """Why `program` ended, for a terminal. `hints` follow the notes of the error; `elsewhere`: see `resume_command`."""
     more = [note for note in getattr(error, "__notes__", ()) if isinstance(note, str)]
     match error:
         case KeyboardInterrupt():
             why = "interrupted"
             if (run := getattr(error, "run", None)) is not None:  # `Interrupted`; its class need not be imported for this
-                more = [f"go on with: {resume_command(run, elsewhere=elsewhere)}"]
+                more = [f"continue with: {resume_command(run, elsewhere=elsewhere)}"]
         case UserFacingError():
             why = str(error)
         case _:
@@ -40,9 +40,8 @@ def last_line(program: str, error: BaseException, hints: Sequence[str] = (), *, 
 
 
 def users_code(error: BaseException) -> str:
-    """FILE:LINE where code that the learner calls for the user raised this, as the loss of an algorithm; else empty.
-
-    What a library raised belongs to the code that called it.
+    """FILE:LINE where user code that the learner calls, such as the loss of an algorithm, raised this; else empty. An error
+    in a library counts for the code that called it.
     """
     where = ""
     libraries = tuple(sysconfig.get_path(name) for name in ("stdlib", "purelib", "platlib"))

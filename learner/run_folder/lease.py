@@ -1,7 +1,7 @@
-"""The lock of a run is a lease: it lapses unless its owner renews it. The content of its file, and who lives by it. Pure.
+"""The lock of a run is a lease: it lapses unless its owner renews it. The file's content, and whether its owner lives. Pure.
 
-Rule: a living owner rewrites the lock file every few seconds with another count. An observer compares no clocks of two
-machines: it measures with its own how long the content stays the same.
+Rule: a living owner rewrites the lock file every few seconds with another count. An observer doesn't compare the clocks of
+two machines: it measures with its own clock how long the content stays the same.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ class Unreachable(Enum):
     INPROC = "inproc"
     """Its workers are threads: it listens in its own process only."""
     KEYS_OF_THE_RUN = "keys"
-    """Its keys are made for this run, and are in no file."""
+    """Its keys are made for this run, and are not in any file."""
 
 
 class Listens(NamedTuple):
     """Where the learner of a run listens for `millrace status`."""
 
     address: str
-    """As other machines reach it."""
+    """Its address for other machines."""
     here: str
-    """As processes on its own machine reach it."""
+    """Its address for processes on its own machine."""
     keys: str = ""
     """Its key folder; empty if it needs no key."""
 
@@ -47,13 +47,13 @@ class Owner(msgspec.Struct, frozen=True, kw_only=True):
     host: Line
     pid: Annotated[int, Meta(ge=1, le=2**31 - 1)]
     boot_id: Line
-    """Of the kernel that runs there: processes with the same one are on one machine."""
+    """Boot id of the kernel there: processes with the same one are on one machine."""
     token: Line
-    """Random: two locks never have the same."""
+    """Random: no two locks have the same."""
     network_namespace: Line = ""
-    """Empty if unknown. A container on the same machine may have one of its own."""
+    """Empty if unknown. A container on the same machine may have its own."""
     pid_namespace: Line = ""
-    """The namespace of `pid`; empty if unknown. A container may have one of its own."""
+    """The namespace of `pid`; empty if unknown. A container may have its own."""
     address: Line = ""
     """Where its learner listens, for other machines; empty if nobody can ask it, or it does not listen yet."""
     here: Line = ""
@@ -61,7 +61,7 @@ class Owner(msgspec.Struct, frozen=True, kw_only=True):
     keys: Line = ""
     """The key folder of its learner; empty if it needs no key."""
     unreachable: Unreachable | None = None
-    """Why nobody can ask it, where that is known."""
+    """Why nobody can ask it, if that is known."""
     count: Natural = 0
     """How often the owner has rewritten the file."""
 
@@ -69,11 +69,11 @@ class Owner(msgspec.Struct, frozen=True, kw_only=True):
         return f"process {self.pid} on {self.host}"
 
     def listening(self, where: Listens | Unreachable) -> Owner:
-        """The owner with the place where its learner listens; without it, if that is too long for the file."""
+        """The owner with the address where its learner listens; without the address if it is too long for the file."""
         if isinstance(where, Unreachable):
             return replace(self, address="", here="", keys="", unreachable=where)
         found = replace(self, address=where.address, here=where.here, keys=where.keys, unreachable=None)
-        fits = len(replace(found, count=HIGHEST_COUNT).encoded()) == WIDTH  # a longer one is not cut
+        fits = len(replace(found, count=HIGHEST_COUNT).encoded()) == WIDTH  # a longer text would not be cut
         return found if fits else replace(self, address="", here="", keys="", unreachable=None)
 
     def encoded(self) -> bytes:
@@ -82,9 +82,8 @@ class Owner(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def decoded(content: bytes) -> Owner | None:
-    """The owner that this content names. None if it names none: it was cut, or is being written.
-
-    It has an address only if that is one: a command connects to it, and a page shows it as a word to type.
+    """The owner that this content names; None if the content was cut or is being written. Its address is kept only if valid:
+    a command connects to it, and a page shows it as a word to type.
     """
     try:
         owner = msgspec.json.decode(content.strip(), type=Owner)
@@ -115,7 +114,7 @@ class LeaseWatch:
         self._dead_after_s = dead_after_s
 
     def judge(self, content: bytes, now: float) -> Verdict:
-        """What the content read now says. `now`: seconds by the observer's monotonic clock."""
+        """The verdict after reading this content. `now`: seconds by the observer's monotonic clock."""
         if content != self._content:
             return Verdict.ALIVE
         return Verdict.DEAD if now - self._since_s >= self._dead_after_s else Verdict.UNKNOWN

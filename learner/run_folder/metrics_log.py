@@ -1,8 +1,8 @@
 """The metrics of a run on disk: metrics.jsonl.
 
-Rule: the file ends with a whole row, and there is one row for each update. Rows that the disk refuses are written later. A
-resumed run first removes the rows that its checkpoint knows nothing of. If it makes the evaluation before which it was
-interrupted, that update's row gets its metrics.
+Rule: the file ends with a complete row, and there is one row for each update. Rows that the disk refuses are written later.
+A resumed run first removes the rows after its checkpoint. If the run was interrupted before an evaluation and then makes it,
+its metrics go into that update's row.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ from millrace.protocol.errors import RunError
 log = logging.getLogger("millrace.learner")
 
 METRICS_FILE = "metrics.jsonl"
-MOST_LINE_BYTES = 1 << 16  # of a row that is read while the file grows
+MOST_LINE_BYTES = 1 << 16  # longest row that is read while the file grows
 
 
 class MetricsLog:
     """Writes metrics.jsonl."""
 
     def __init__(self, folder: Path, from_env_steps: int = 0, from_update: float = math.inf) -> None:
-        """`from_env_steps`, `from_update`: of the checkpoint that the run goes on from; later rows are removed.
+        """`from_env_steps`, `from_update`: those of the checkpoint that the run continues from; later rows are removed.
 
-        An update whose rows only reset env copies adds no env step, so both are needed.
+        Both are needed, because an update whose rows only reset env copies adds no env step.
         Raises `RunError`, with a one-line message, if the file cannot be written.
         """
         table = folder / METRICS_FILE
@@ -91,7 +91,7 @@ class MetricsLog:
 def read_rows(path: Path) -> list[dict[str, Any]]:
     """The rows of a metrics.jsonl, each with its env steps. A last line that was cut off is ignored.
 
-    Other rows that cannot be read are left out, and the log says how many. Raises OSError.
+    Other unreadable rows are left out, and the log says how many. Raises OSError.
     """
     rows, unreadable = read_and_count_rows(path)
     if unreadable:
@@ -100,7 +100,7 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
 
 
 def read_and_count_rows(path: Path) -> tuple[list[dict[str, Any]], int]:
-    """The rows that can be read, and the number of others. A last line that was cut off does not count. Raises OSError."""
+    """The readable rows, and the number of others. A last line that was cut off doesn't count. Raises OSError."""
     *lines, _ = read(path, MOST_BYTES).split(b"\n")
     rows = [row for line in lines if (row := decoded_row(line)) is not None]
     return rows, len(lines) - len(rows)

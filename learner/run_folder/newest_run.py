@@ -1,4 +1,4 @@
-"""`--resume auto`: the run to continue. The same command thus starts a run and continues it, however it ended."""
+"""`--resume auto`: the run to continue. So the same command starts a run and continues it, however it ended."""
 
 from __future__ import annotations
 

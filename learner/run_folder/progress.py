@@ -23,10 +23,10 @@ Row = Mapping[str, float | None]
 
 
 class Progress(RunProgress, frozen=True, kw_only=True):
-    """The progress of a run as callbacks get it, the terminal among them: how far it is, what is new, and what they may ask.
+    """The progress of a run as callbacks get it, the terminal among them: how far it is, what is new, and requests.
 
     Returns are sums of raw rewards, undiscounted. Times are in seconds, speeds in env steps a second over all workers. A
-    number that does not exist yet is None. What only some methods of `Callback` get says so. Do not keep the arrays of
+    number that does not exist yet is None. Fields that only some methods of `Callback` get say so. Do not keep the arrays of
     `rollouts`, which are read-only: copy them.
 
     >>> import millrace
@@ -41,14 +41,15 @@ class Progress(RunProgress, frozen=True, kw_only=True):
     run: str = ""
     """path of the run folder"""
     facts: dict[str, FactMean] = {}
-    """of each name in `info_keys`: what the environment reported at the ends of the last 100 training episodes"""
+    """for each name in `info_keys`: what the environment reported at the ends of the last 100 training episodes"""
     note: str = ""
     """a message to the user, in one line"""
     settings: dict[str, Any] = {}
-    """all settings of the run, by name; those of the algorithm in `algorithm`"""
+    """all settings of the run, by name; `algorithm` has those of the algorithm"""
     metrics: dict[str, float] = {}
-    """numbers of the last update, or before the first one of cloning, by the names under which they are logged: losses and
-    the like"""
+    """numbers of the last update (before the first update, of cloning), by the names under which they are logged: losses and
+    the like
+    """
     episodes: tuple[Episode, ...] = ()
     """the episodes that ended in the rollouts of the last update"""
     lags: tuple[int, ...] = ()
@@ -56,29 +57,29 @@ class Progress(RunProgress, frozen=True, kw_only=True):
     evaluation: Evaluation | None = None
     """the last evaluation"""
     evaluated: EvaluatedPolicy = EvaluatedPolicy()
-    """the `version` of the policy that it is of, and its `env_steps`: with `eval_workers` an earlier one than the newest"""
+    """`version` and `env_steps` of the evaluated policy, which with `eval_workers` is older than the newest one"""
     best: tuple[float, int] | None = None
-    """mean return of the best evaluation so far, and env steps of the policy that it is of"""
+    """mean return of the best evaluation so far, and env steps of the evaluated policy"""
     checkpoint: str = ""
     """path of the newest checkpoint; empty before the first"""
     rollouts: tuple[Rollout, ...] = ()
-    """in `Callback.on_rollouts`: the rollouts of the next update, in the order in which they came"""
+    """in `Callback.on_rollouts`: the rollouts of the next update, in the order in which they arrived"""
     incarnations: tuple[int, ...] = ()
     """in `Callback.on_rollouts`: for each rollout the incarnation of its lane, which rises when the lane gets new copies;
     `Rollout.sequence` then starts from 0 again
     """
     requests: Requests | None = None
-    """what callbacks ask of the run"""
+    """the requests of callbacks"""
 
     def plain(self) -> RunProgress:
-        """What of it can be sent and written."""
+        """The part of it that can be sent and written."""
         return RunProgress(**{name: getattr(self, name) for name in RunProgress.__struct_fields__})
 
     def log(self, name: str, value: SupportsFloat) -> None:
         """Log a number with the metrics of this update. A name without a slash is logged as custom/NAME.
 
-        For `on_rollouts`, `on_update` and `on_evaluation`. A value that is not finite is logged as missing. Raises
-        `UsageError` for anything but a name of one line and a number.
+        Use it in `on_rollouts`, `on_update` and `on_evaluation`. A value that is not finite is logged as missing. Raises
+        `UsageError` for anything but a name without line breaks and a number.
         """
         if self.requests is None:
             raise UsageError(f"log {name}: this is not the progress of a run")
@@ -87,9 +88,9 @@ class Progress(RunProgress, frozen=True, kw_only=True):
     def set_env_attr(self, name: str, value: Any) -> None:
         """Set an attribute of every env copy that trains, from the next version of the weights on: a curriculum.
 
-        `value` is plain data: numbers, text, lists, dicts, numpy arrays. Each rollout is made under the attributes of its
-        version, so the result is the same for any number of workers. Checkpoints keep them. Evaluation is on env copies as
-        they are made. Raises `UsageError` if the value cannot be sent, and in `on_checkpoint` and `on_end`.
+        `value` is plain data: numbers, text, lists, dicts, numpy arrays. Each rollout is collected with the attributes of
+        its version, so the result is the same for any number of workers. Checkpoints keep them. Evaluations use env copies
+        without them. Raises `UsageError` if the value cannot be sent, and in `on_checkpoint` and `on_end`.
         """
         if self.requests is None:
             raise UsageError(f"set_env_attr {name}: this is not the progress of a run")
@@ -97,7 +98,7 @@ class Progress(RunProgress, frozen=True, kw_only=True):
 
     @property
     def env_attrs(self) -> dict[str, Any]:
-        """The attributes of env copies that were set so far, by name; in a resumed run also those from before."""
+        """The attributes of env copies that were set so far, by name; in a resumed run also those set earlier."""
         return {} if self.requests is None else self.requests.attributes.now()
 
     def row(self, train: Row) -> dict[str, float | None]:

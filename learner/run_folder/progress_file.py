@@ -1,7 +1,7 @@
-"""progress.json: how far a run is, once a second while it trains. Of a killed run it tells when the last sign of it was.
+"""progress.json: how far a run is, once a second while it trains. For a killed run it shows when it was last alive.
 
-Rule: nothing depends on it. It is there whole or not at all, but not flushed to the disk, because that would slow the
-training loop; a power failure may cost it. What the disk refuses is dropped. Once the run has a summary, that counts.
+Rule: nothing depends on it. It is replaced atomically, but not flushed to the disk, because that would slow the training
+loop; a power failure may destroy it. Refused writes are dropped. Once the run has a summary, the summary counts.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from millrace.protocol.progress import RunProgress
 
 PROGRESS_FILE = "progress.json"
 EVERY_S = 1.0
-LONGEST_SILENCE_S = 10.0  # then it is written again although nothing has changed: it is also a sign of life
+LONGEST_SILENCE_S = 10.0  # after this time it is written even if nothing has changed, as a sign of life
 
 
 class ProgressFile:
@@ -34,7 +34,8 @@ class ProgressFile:
         self._looked_s = 0.0
 
     def write(self, progress: Callable[[], RunProgress], now: float) -> None:
-        """Write how far the run is, if a second has passed since the last time, and something has changed or is long ago.
+        """Write how far the run is, if a second has passed since the last time, and something has changed or that was long
+        ago.
 
         `now`: seconds since 1970.
         """
@@ -52,9 +53,8 @@ class ProgressFile:
 
 
 def last_progress(run: Path, summary: Summary | None, total_steps: int = 0) -> RunProgress:
-    """How far a run is, or was when it ended: as its `summary` says, or else its progress.json.
-
-    `total_steps`: by its settings. If neither can be read, nothing but these is known.
+    """How far a run is, or was when it ended, from its `summary`, or else from its progress.json. `total_steps`: from its
+    settings; nothing else is known if neither can be read.
     """
     if summary is not None:
         return of_summary(summary, total_steps)
@@ -65,7 +65,7 @@ def last_progress(run: Path, summary: Summary | None, total_steps: int = 0) -> R
 
 
 def progress_before(resumed: Path | None, total_steps: int) -> RunProgress:
-    """How far a run of this many env steps is before it begins. One that is resumed goes on from its newest checkpoint."""
+    """How far a run of this many env steps is before it begins. A resumed run continues from its newest checkpoint."""
     env_steps = 0 if resumed is None else min(newest_env_steps(resumed), LARGEST)
     return RunProgress(env_steps=env_steps, total_steps=total_steps)
 

@@ -1,6 +1,6 @@
-"""A file of a run that grows by whole records: metrics.jsonl is one.
+"""A file of a run that grows by whole records, such as metrics.jsonl.
 
-Rule: the file ends with a whole record. What the disk refuses waits in memory, and is written later.
+Rule: the file ends with a whole record. Records that the disk refuses wait in memory, and are written later.
 """
 
 from __future__ import annotations
@@ -17,23 +17,23 @@ MOST_WAITING = 100_000  # records that the disk refused: 100 MB of memory for ro
 
 
 class RecordFile:
-    """A file to which whole records are appended. What the disk refuses waits, and a record that it cut off is removed.
+    """A file to which whole records are appended. Records that the disk refuses wait, and one that it cut off is removed.
 
     If the file is no longer at its path, it is made again there, with its folder.
     """
 
     def __init__(self, run: Path, name: str) -> None:
-        """`name`: of a file in this run folder, or in a folder of it. Raises OSError."""
+        """`name`: a file in this run folder, or in a subfolder. Raises OSError."""
         self._run = run
         self._path = run / name
         self._waiting: deque[bytes] = deque(maxlen=MOST_WAITING)
         self._bytes = 0
-        self._cut = 0  # bytes at the end of the file that the first record that waits replaces
+        self._cut = 0  # bytes at the end of the file that the first waiting record replaces
         self._open()
 
     @property
     def gone(self) -> bool:
-        """Whether its path names another file now, or none."""
+        """Whether its path now leads to another file, or to none."""
         try:
             return not os.path.samestat(os.stat(self._path), os.fstat(self._number))
         except OSError:
@@ -52,7 +52,7 @@ class RecordFile:
         self._waiting.append(record)
 
     def flush(self) -> None:
-        """Write the records that wait. Raises `RunError`."""
+        """Write the waiting records. Raises `RunError`."""
         try:
             if self.gone:
                 gone = self._file
@@ -64,7 +64,7 @@ class RecordFile:
                 self._cut = 0
             while self._waiting:
                 rest = self._waiting[0]
-                while rest:  # a disk that takes a part says why with the next
+                while rest:  # if the disk takes only a part, the next write says why
                     rest = rest[self._file.write(rest) :]
                 self._bytes += len(self._waiting.popleft())
         except OSError as error:
@@ -73,7 +73,7 @@ class RecordFile:
             raise RunError(f"{self._path}: rows are not written yet: {error.strerror}") from error
 
     def close(self) -> None:
-        """Close it. What waits is not written."""
+        """Close the file without writing the waiting records."""
         self._file.close()
 
     def _open(self) -> None:

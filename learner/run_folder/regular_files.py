@@ -1,8 +1,8 @@
 """Opens and lists the files of a run folder.
 
-Rule: a run folder may come from a stranger, so only regular files inside it are read and written. No link is followed, and
-a FIFO, a device or a folder in the place of a file is refused: an `OSError` says what is there. What other packages write
-goes into a `subfolder`, which is none of these either.
+Rule: a run folder may come from a stranger, so only regular files inside it are read and written. No link is followed, and a
+FIFO, a device or a folder in place of a file is refused: an `OSError` says what is there. Other packages write into a
+`subfolder`, which isn't a link either.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from pathlib import Path
 
 from millrace.protocol.errors import first_line
 
-MOST_TEXT_BYTES = 1 << 22  # of a file of settings or results
-MOST_BYTES = 1 << 31  # of metrics, and of the arrays of a policy
+MOST_TEXT_BYTES = 1 << 22  # largest file of settings or results
+MOST_BYTES = 1 << 31  # largest file of metrics, or of a policy's arrays
 
 log = logging.getLogger("millrace.learner")
 
@@ -47,9 +47,9 @@ def read(path: Path, most_bytes: int = MOST_TEXT_BYTES) -> bytes:
 
 
 def regular_files(run: Path, pattern: str) -> list[Path]:
-    """The regular files of a run folder with such names, as `videos/*.mp4`, in the order of their names.
+    """The regular files of a run folder whose names match, such as `videos/*.mp4`, in the order of their names.
 
-    What else has such a name is left out, and the log says so.
+    Anything else with such a name is left out, and the log says so.
     """
     folder, _, name = pattern.rpartition("/")
     if folder and not _is(stat.S_IFDIR, run / folder):
@@ -73,14 +73,14 @@ def reason(error: Exception) -> str:
 
 
 def _expect(kind: int, mode: int, path: Path) -> None:
-    """Raise `OSError` unless the kind of file is this one."""
+    """Raise `OSError` unless the file is of this kind."""
     if stat.S_IFMT(mode) != kind:
         expected, got = (KINDS.get(each, "a device") for each in (kind, stat.S_IFMT(mode)))
         raise OSError(errno.EINVAL, f"expected {expected}, got {got}", str(path))
 
 
 def _is(kind: int, path: Path) -> bool:
-    """Whether the kind of file is this one; the log says what it is instead."""
+    """Whether the file is of this kind; otherwise the log says what it is."""
     try:
         _expect(kind, path.lstat().st_mode, path)
     except FileNotFoundError:

@@ -16,13 +16,13 @@ from millrace.protocol.specs import SCORE
 
 SUMMARY_FILE = "summary.json"
 ALL_STEPS_DONE = "all steps done"
-"""why a run ended that was not ended before"""
+"""why a run ended if nothing ended it earlier"""
 EVALUATION_KEY = "eval/mean_reward"
 EVALUATION_LENGTH_KEY = "eval/mean_ep_length"
 Z_95 = 1.959964
 """Quantile of the normal distribution for an interval of 95 %."""
 EVALUATED_AT_KEY = "eval/env_steps"
-"""env steps of the policy that was evaluated beside training: fewer than those of the row with the result"""
+"""env steps of the policy that was evaluated beside training, which are fewer than those of the row with the result"""
 
 
 class FactMean(msgspec.Struct, frozen=True):
@@ -41,11 +41,11 @@ class FactMean(msgspec.Struct, frozen=True):
 METRICS_BESIDE_FACTS = frozenset(
     {"ep_rew_mean", "ep_len_mean", "exploration_rate", "mean_reward", "mean_ep_length", "env_steps"}
 )
-"""What else is logged as rollout/NAME or eval/NAME: no fact may be called so, because one of the two would be lost."""
+"""Other values logged as rollout/NAME or eval/NAME: no fact may have such a name, because one of the two would be lost."""
 
 
 def fact_means(names: Sequence[str], episodes: Iterable[Sequence[float]]) -> dict[str, FactMean]:
-    """The means of the facts of these episodes, by name. NaN is a fact that is missing."""
+    """The means of these episodes' facts, by name. NaN stands for a missing fact."""
     columns = zip(*episodes, strict=True)
     means = {}
     for name, column in zip_longest(names, columns, fillvalue=()):
@@ -58,7 +58,7 @@ def fact_means(names: Sequence[str], episodes: Iterable[Sequence[float]]) -> dic
 
 
 def fact_metrics(group: str, facts: Mapping[str, FactMean]) -> dict[str, float | None]:
-    """The facts as they are logged: eval/is_success and eval/is_success_missing."""
+    """The facts under the names by which they are logged: eval/is_success and eval/is_success_missing."""
     row: dict[str, float | None] = {}
     for name, fact in facts.items():
         row |= {f"{group}/{name}": fact.mean, f"{group}/{name}_missing": fact.missing}
@@ -83,10 +83,11 @@ class Evaluation(msgspec.Struct, frozen=True, kw_only=True):
     length_mean: Real
     """mean length of an episode in env steps"""
     cut: Natural = 0
-    """episodes that were stopped because they were too long; they count with the return they had by then"""
+    """episodes that were stopped because they were too long; their return up to then counts"""
     facts: dict[str, FactMean] = {}
-    """of each name in `info_keys`: what the environment reported at the ends of the episodes; and the score, if there were
-    opponents"""
+    """for each name in `info_keys`: what the environment reported at the ends of the episodes; and the score, if there were
+    opponents
+    """
     matches: Natural = 0
     """how many of the episodes were played against opponents"""
 
@@ -112,7 +113,7 @@ class Evaluation(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def score_interval(self) -> tuple[float, float] | None:
-        """Between which scores the true one lies with 95 % confidence (Wilson 1927), if there were opponents."""
+        """The 95 % confidence interval of the score (Wilson 1927), if there were opponents."""
         score = self.facts.get(SCORE)
         if not self.matches or score is None or score.mean is None:
             return None
@@ -129,11 +130,11 @@ class Evaluation(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class EvaluatedPolicy(msgspec.Struct, frozen=True):
-    """Which policy an evaluation is of. The defaults are of none."""
+    """The policy that an evaluation played. The defaults stand for no policy."""
 
     version: Version = -1
     env_steps: Natural = 0
-    """env steps of training of this version"""
+    """env steps of training up to this version"""
 
 
 class Best(msgspec.Struct, frozen=True, kw_only=True):
@@ -142,7 +143,7 @@ class Best(msgspec.Struct, frozen=True, kw_only=True):
     env_steps: Natural
     """env steps of training when it was evaluated"""
     chosen_by: Real
-    """the mean return by which it was chosen; as the maximum of several means it is biased upwards"""
+    """the mean return by which it was chosen, which is biased upwards as the maximum of several means"""
     evaluation: Evaluation
     """a second evaluation of the same policy, on other episodes"""
 
@@ -151,7 +152,7 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     """The results of a run, from its summary.json. `Run.summary` is None until the run has ended.
 
     Returns are sums of raw rewards, undiscounted. Numbers count from the beginning of the run, also after a resume, unless
-    their text says something else.
+    they say otherwise.
 
     >>> import millrace
     >>> summary = millrace.Run(run).summary
@@ -162,7 +163,7 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     env: str
     """id or name of the environment"""
     algo: str
-    """name of the algorithm; `module:Class` of one of your own"""
+    """name of the algorithm; `module:Class` for your own"""
     seed: int
     env_steps: Natural
     """env steps that updates used, over all env copies"""
@@ -170,20 +171,21 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     wall_s: Seconds
     """seconds of training; evaluations do not count"""
     env_steps_per_s: Real
-    """`env_steps` by `wall_s`"""
+    """`env_steps` / `wall_s`"""
     stop_reason: str
-    """why it ended: `all steps done`, a target that was reached, the callback that ended it, an error or a signal"""
+    """why it ended: `all steps done`, the target that it reached, the callback that ended it, an error or a signal"""
     cut_short: bool = False
     """an error or an interrupt ended the run"""
     return_mean_100: Real | None
     """mean return of the last 100 training episodes; None if none has ended"""
     facts_100: dict[str, FactMean] = {}
-    """of each name in `info_keys`: what the environment reported at the ends of these episodes"""
+    """for each name in `info_keys`: what the environment reported at the ends of these episodes"""
     evaluation: Evaluation | None
     """evaluation of the final policy by greedy episodes; None if the run was cut short before it"""
     ended_by: Real | None = None
-    """the mean return that ended the run, by reaching `target_return` or because a callback saw it, if it was of the final
-    policy. A return that decides something is biased upwards: `evaluation` is then a second one, on other episodes"""
+    """the mean return of the final policy, if it ended the run by reaching `target_return` or through a callback. A return
+    that decides something is biased upwards: `evaluation` is then a second one, on other episodes
+    """
     best: Best | None = None
     """the best policy of the run's own evaluations, if there were any"""
     ledger: dict[str, Natural] = {}

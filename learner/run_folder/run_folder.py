@@ -4,7 +4,7 @@
       config.toml           all settings of the run
       run.json              the format of the folder (run_format.py)
       metrics.jsonl         a row per update (metrics_log.py)
-      tensorboard/          the same for TensorBoard, if that is wanted
+      tensorboard/    the same for TensorBoard, if requested
       checkpoints/          to resume from (checkpoint.py)
       policy.safetensors    the arrays of the acting policy, by name
       best.safetensors      the same of the best policy in the run's own evaluations
@@ -16,7 +16,7 @@
       workers/              the logs of local worker processes
       run.lock              who trains the run now (run_lock.py)
 
-Rule: a file is there whole or not at all. The same policy gives the same bytes. Nothing is pickled.
+Rule: files are written atomically. The same policy gives the same bytes. Nothing is pickled.
 """
 
 from __future__ import annotations
@@ -113,7 +113,7 @@ class PolicyDescription(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class StoredPolicy(NamedTuple):
-    """A policy as its files describe it. What they name is not looked for: only the encoder is needed to act."""
+    """A policy as its files describe it. Modules that it names are not imported, except that acting needs the encoder."""
 
     card: PolicyDescription
     parameters: Floats
@@ -158,11 +158,11 @@ class RunFolder:
         self.path = path
         self._made = made
         self._is_relative = False
-        self._workers_elsewhere = False  # as `write_config` was told last
+        self._workers_elsewhere = False  # the last argument of `write_config`
         self.started_from = ""
-        """As in `RunFormat`."""
+        """See `RunFormat`."""
         self.writes = Writes()
-        """What the run writes into the folder, and the disk may refuse."""
+        """The run's writes into the folder, which the disk may refuse."""
         self.lock: RunLock | None = None
         """Held while this process trains the run."""
 
@@ -223,14 +223,14 @@ class RunFolder:
         return RunFolder(path)
 
     def stay(self) -> None:
-        """From now on it is the same folder also if the program, or an environment in it, changes its current folder."""
+        """Keep naming the same folder even if the program, or an environment in it, changes its working directory."""
         self._is_relative = not self.path.is_absolute()
         self.path = self.path.absolute()
         self._made = None if self._made is None else self._made.absolute()
 
     @property
     def shown(self) -> Path:
-        """Its path as it was given, if that still leads there."""
+        """The path that was given, if it still leads to the folder."""
         try:
             here = Path.cwd()
         except OSError:  # it was deleted
@@ -238,7 +238,7 @@ class RunFolder:
         return self.path.relative_to(here) if self._is_relative and self.path.is_relative_to(here) else self.path
 
     def remove(self) -> None:
-        """Remove the folder, and the parent folders made for it that nothing else is in.
+        """Remove the folder, and the parent folders made for it if they are empty.
 
         Does nothing if the folder was there before, or after `keep`.
         """
@@ -248,17 +248,17 @@ class RunFolder:
         for parent in self.path.parents:
             if not parent.is_relative_to(self._made):
                 break
-            with suppress(OSError):  # another run is in it, or has removed it
+            with suppress(OSError):  # another run is in the folder, or has removed it
                 parent.rmdir()
 
     def remove_temporary(self) -> None:
-        """Remove what a process that was killed has left: files that it had not written whole."""
+        """Remove the incomplete files of a process that was killed."""
         for left in self.path.glob(f"*{TEMPORARY}"):
             with suppress(OSError):
                 left.unlink()
 
     def remove_summary(self) -> None:
-        """A run that had ended goes on: its summary is no longer true. Raises `RunError` if it stays."""
+        """Remove the summary of a run that had ended and now continues. Raises `RunError` if that fails."""
         path = self.path / SUMMARY_FILE
         try:
             path.unlink(missing_ok=True)
@@ -266,11 +266,11 @@ class RunFolder:
             raise RunError(f"{path} cannot be removed: {reason(error)}; remove it, then resume the run") from error
 
     def keep(self) -> None:
-        """The run has begun: `remove` does nothing from now on."""
+        """Record that the run has begun: `remove` does nothing from now on."""
         self._made = None
 
     def is_gone(self) -> bool:
-        """Whether the folder or its config.toml is not at the path of the run: deleted or renamed. Raises `RunError`."""
+        """Whether the folder or its config.toml was deleted or renamed. Raises `RunError`."""
         try:
             return not stat.S_ISREG((self.path / CONFIG_FILE).stat().st_mode)
         except (FileNotFoundError, NotADirectoryError):
@@ -365,7 +365,7 @@ class RunFolder:
         return StoredPolicy(description, parameters, _flat([arrays[name] for name in names]))
 
     def policy_description(self) -> PolicyDescription | None:
-        """What policy.json says. None if that file is missing or cannot be read."""
+        """The content of policy.json; None if that file is missing or cannot be read."""
         try:
             return _decode_description(read(self.path / POLICY_JSON))
         except UNREADABLE:
@@ -376,7 +376,7 @@ class RunFolder:
         self._write(SUMMARY_FILE, msgspec.json.format(msgspec.json.encode(summary), indent=2) + b"\n")
 
     def summary(self) -> Summary | None:
-        """Read summary.json. None if it is missing, or damaged, which is said."""
+        """Read summary.json. None if it is missing or damaged; a warning is logged for a damaged one."""
         try:
             return read_summary(self.path)
         except FileNotFoundError:
@@ -412,7 +412,7 @@ def _checksum_matches(content: bytes) -> bool:
 
 
 def _decode_description(text: bytes) -> PolicyDescription:
-    """Decode policy.json. JSON has no infinity, so a missing bound is null there. Raises as `UNREADABLE`."""
+    """Decode policy.json. JSON has no infinity, so a missing bound is null there. Raises one of `UNREADABLE`."""
     fields = msgspec.json.decode(text, type=dict[str, Any])
     match fields:
         case {"policy": {"action": {"low": list(low), "high": list(high)} as action}}:

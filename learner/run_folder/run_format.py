@@ -1,8 +1,8 @@
-"""What tells which run a folder holds: its settings (config.toml), and its format (run.json), written when it is made.
+"""What identifies the run in a folder: its settings (config.toml) and its format (run.json), written when it is made.
 
 Rules: a folder of the current format or an older one can be evaluated, reported and resumed; a newer one is rejected in
-one line. Raise `RUN_FORMAT` when older code could not read a folder of the new one. Nothing is imported from a run folder:
-it may come from a stranger, and it names modules.
+one line. Raise `RUN_FORMAT` when older code could not read a folder of the new one. Modules are never imported from a run
+folder, because it may come from a stranger.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ HEAD = "# Repeat this run: millrace train --config THIS_FILE (it is whole if it 
 END = "# end\n"
 """The first and the last line of config.toml. A file that was cut off may still be TOML, with other settings."""
 MOST_CONFIG_BYTES = 1 << 18
-MOST_NESTED = 1_000_000  # lines, times dots in one line: tomllib reads each line by the name of its table, part for part
+MOST_NESTED = 1_000_000  # lines times dots in a line: for each line, tomllib goes through all parts of its table's name
 
 
 class RunFormat(msgspec.Struct, frozen=True, kw_only=True):
@@ -44,9 +44,9 @@ class RunFormat(msgspec.Struct, frozen=True, kw_only=True):
     millrace: str
     """the version of millrace that wrote it"""
     workers_elsewhere: bool = False
-    """Whether the run's workers were started elsewhere. Its setting `workers` then means nothing."""
+    """Whether the run's workers were started elsewhere. Its setting `workers` then has no meaning."""
     started_from: str = ""
-    """What the run began with in place of random weights, as its start printed it; empty if there was nothing."""
+    """What the run started from in place of random weights, as printed at its start; empty if there was nothing."""
 
 
 DISTRIBUTIONS = {"millrace": "millrace-rl", "torch": "torch", "gymnasium": "gymnasium", "numpy": "numpy"}
@@ -85,7 +85,7 @@ def write_format(folder: Path, *, workers_elsewhere: bool = False, started_from:
 
 
 def read_config(run: Path) -> dict[str, Any]:
-    """The settings in the config.toml of a run folder, as it has them; among them are env, algo and seed.
+    """The settings in the config.toml of a run folder, unchanged; they include env, algo and seed.
 
     Raises `UsageError` for a file that is missing or cannot be read, or names a module in the run folder.
     """
@@ -106,7 +106,7 @@ def read_config(run: Path) -> dict[str, Any]:
 
 
 def parse_toml(text: str, where: str) -> dict[str, Any]:
-    """The content of a TOML file. Raises `UsageError`, also for a config.toml that has the first line and not the last."""
+    """The content of a TOML file. Raises `UsageError`, also for a config.toml that has the first line but not the last."""
     text = text.removeprefix("\ufeff")  # a byte order mark, which some editors write
     if text.startswith(HEAD) and not text.rstrip().endswith(END.strip()):
         raise UsageError(f"{where} is cut off: expected {END.strip()!r} as its last line; restore it, or start a new run")
@@ -115,14 +115,14 @@ def parse_toml(text: str, where: str) -> dict[str, Any]:
         raise UsageError(f"{where} has tables in tables in tables, or very long lines; expected the settings of a run")
     try:
         table = tomllib.loads(text)
-        msgspec.json.encode(table)  # raises for a whole number of more digits than Python writes
+        msgspec.json.encode(table)  # raises for a whole number with more digits than Python writes
     except (ValueError, OverflowError, RecursionError) as error:
         raise UsageError(f"{where} is not TOML: {one_line(str(error))}") from error
     return table
 
 
 def is_run_folder(folder: Path) -> bool:
-    """Whether this is a run folder, or has a policy as one has it."""
+    """Whether this is a run folder, or has the policy files of one."""
 
     def has(name: str) -> bool:
         return os.path.lexists(folder / name)

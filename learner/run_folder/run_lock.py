@@ -2,8 +2,8 @@
 
 Rule: the file `run.lock` names the owner. On one machine the system's lock on it (flock) decides; the kernel releases it
 when the process dies, however it dies. Machines that share the folder may not see each other's system locks. So the owner
-also rewrites the file every few seconds (`lease.py`); an owner on another machine that does not is dead. The lock of a dead
-owner is taken over. Commands that only read a run folder do not ask for it.
+also rewrites the file every few seconds (`lease.py`); an owner on another machine that stops doing so counts as dead. The
+lock of a dead owner is taken over. Commands that only read a run folder don't need the lock.
 """
 
 from __future__ import annotations
@@ -43,17 +43,17 @@ class Pace(NamedTuple):
     dead_after: float = 30.0
     look_every: float = 0.5
     confirm_after: float = 1.0
-    """After a lock was taken over from another machine: when to see whether a third one took it at the same time."""
+    """When to check, after taking over a lock from another machine, whether a third machine took it at the same time."""
 
 
 PACE = Pace()
 WHY_UNREACHABLE = {
     Unreachable.INPROC: "with --transport inproc it listens in its own process only; run it with --transport ipc",
     Unreachable.KEYS_OF_THE_RUN: (
-        "with --transport tcp and --keys, the keys of its local workers are in no file; run it with --transport ipc"
+        "with --transport tcp and --keys, the keys of its local workers are not in any file; run it with --transport ipc"
     ),
 }
-JOIN_S = 5.0  # a file system that does not answer must not keep the process
+JOIN_S = 5.0  # a file system that doesn't answer must not block the process
 
 
 class RunLock:
@@ -82,7 +82,7 @@ class RunLock:
         self._file = -1
         self._other: Owner | None = None
         self._stop = threading.Event()
-        self._writing = threading.Lock()  # of this object: the thread and `confirm` both read and rewrite the file
+        self._writing = threading.Lock()  # guards this object: the thread and `confirm` both read and rewrite the file
         self._thread = threading.Thread(target=self._rewrite_often, name="run-lock", daemon=True)
 
     def __enter__(self) -> Self:
@@ -121,8 +121,8 @@ class RunLock:
         """Raise `RunTakenOver` if another process is known to have taken the run over. Costs nothing."""
         if self._other is not None:
             raise RunTakenOver(
-                f"run {self._folder}: {self._other} has taken it over, because this process seemed dead for "
-                f"{self._pace.dead_after:.0f} s; it goes on there, and nothing more is written here"
+                f"run {self._folder}: {self._other} took it over, because this process seemed dead for "
+                f"{self._pace.dead_after:.0f} s; it continues there, and nothing more is written here"
             )
 
     def confirm(self) -> None:
@@ -142,7 +142,7 @@ class RunLock:
                     self._file = open_regular(self._path, os.O_RDWR)
                     made = False
                 except FileNotFoundError:
-                    continue  # it was released between the two
+                    continue  # it was released in between
             try:
                 if self._take_open_file(made=made):
                     return
@@ -198,7 +198,7 @@ class RunLock:
         while True:
             self._sleep(pace.look_every)
             try:
-                content = read(self._path)  # by its name: a file system may keep the content of an open file
+                content = read(self._path)  # by its name: a file system may cache the content of an open file
             except FileNotFoundError:
                 return  # its owner has released it
             match watch.judge(content, self._clock()):
@@ -225,7 +225,7 @@ class RunLock:
             self._rewrite()
 
     def _rewrite(self) -> None:
-        with self._writing, suppress(OSError):  # a file system that does not answer now may do so the next time
+        with self._writing, suppress(OSError):  # a file system that doesn't answer now may answer next time
             if self._other is not None:
                 return
             try:
@@ -262,7 +262,7 @@ class RunLock:
         return owner is not None and owner.token == self._owner.token
 
     def _is_open_file(self) -> bool:
-        """Whether the open file is the one of this name: its owner may have removed it."""
+        """Whether the open file is still the one at this path: its owner may have removed it."""
         with suppress(FileNotFoundError):
             return os.path.samestat(os.fstat(self._file), os.lstat(self._path))
         return False
@@ -284,7 +284,7 @@ class LearnerOfRun(NamedTuple):
 
 
 def learner_of_run(folder: Path) -> LearnerOfRun:
-    """Where the learner listens that trains the run in this folder now.
+    """Where the learner that trains the run in this folder now listens.
 
     Raises `UsageError`, with a one-line message, if none does, or if it cannot be asked from this machine.
     """
@@ -301,11 +301,9 @@ def learner_of_run(folder: Path) -> LearnerOfRun:
 
 
 def living_owner(folder: Path, now: float) -> Owner:
-    """Who seems to train the run in this folder, for people to read; `now` is wall-clock time.
-
-    A process here is looked for by its number. Another one, in a container too, rewrites the file every few seconds; if the
-    clocks of the two machines differ by much, this is wrong, so nothing that is written depends on it. Raises
-    `UsageError`, with a one-line message, if nobody seems to.
+    """Who seems to train the run in this folder, for display; `now` is wall-clock time. A process on this machine is looked
+    up by its number. Others, also in containers, rewrite the file every few seconds; if the clocks of two machines differ by
+    much, the answer is wrong, so no write depends on it. Raises `UsageError`, with a one-line message, if nobody seems to.
     """
     path = folder / LOCK_FILE
     try:
@@ -323,12 +321,12 @@ def living_owner(folder: Path, now: float) -> Owner:
 
 
 def _is_gone(owner: Owner) -> bool:
-    """Whether no process has the owner's number any more. False where that cannot be known."""
+    """Whether no process has the owner's number any more. False if that cannot be known."""
     return _has_our_numbers(owner) and not _is_alive(owner.pid)
 
 
 def _has_our_numbers(owner: Owner) -> bool:
-    """Whether the owner's process has the same number for it and for us: it is on this machine, in the same container."""
+    """Whether the owner's process number is valid for this process: it is on this machine, in the same container."""
     return owner.boot_id == _boot() and owner.pid_namespace == _namespace(NUMBERS)
 
 
@@ -337,13 +335,13 @@ def _is_alive(pid: int) -> bool:
         os.kill(pid, 0)
     except ProcessLookupError:
         return False
-    except PermissionError:  # it is another user's
+    except PermissionError:  # the process of another user
         return True
     return True
 
 
 def _boot() -> str:
-    """Which running kernel this is; the host's name where that cannot be read."""
+    """The boot id of the running kernel; the host's name if that cannot be read."""
     try:
         return BOOT_ID.read_text().strip()
     except OSError:
@@ -351,7 +349,7 @@ def _boot() -> str:
 
 
 def _namespace(kind: Path) -> str:
-    """In which one of this machine this process is; empty where that is not known."""
+    """The namespace of this kind that this process is in; empty if that is not known."""
     try:
         return os.readlink(kind)
     except OSError:

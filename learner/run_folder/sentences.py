@@ -1,11 +1,11 @@
 """Words and sentences for people: how far a run is, what slows it down, what went wrong in it, and how it ended. Pure.
 
-Whoever shows a `RunProgress` takes its words from here, so that all say the same.
+Everything that shows a `RunProgress` takes its words from here, so that all use the same ones.
 
-Rule: the side that waits less is the slower one. Where learner and workers take turns, one waits while the other works, so
-the shares in which they wait add up to about 1; where they work at the same time, only the faster one waits. If they add up
-to more, both wait at once: for some workers, or for messages on their way. This is said only if the learner waits for longer
-than it works, because otherwise faster workers or messages would change little.
+Rule: the side that waits less is the slower one. If learner and workers take turns, one waits while the other works, so the
+shares of time that they wait add up to about 1; if they work at the same time, only the faster one waits. If the shares add
+up to more, both wait at once: for some workers, or for messages on their way. This is said only if the learner waits for
+longer than it works, because otherwise faster workers or messages would change little.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from collections.abc import Mapping
 from millrace.protocol.messages import Status
 from millrace.protocol.progress import RunProgress
 
-ABOUT_EQUAL = 0.2  # a smaller difference between the shares in which both sides wait names none of them
+ABOUT_EQUAL = 0.2  # if the shares of time that both sides wait differ by less, neither side is named
 BOTH_WAIT = 0.1  # for a larger share of the time than this, learner and workers wait at once
 LEAST_PER_S = 1e-4  # an env step in three hours; a smaller speed is 0
-LONG_RETURN = 1e12  # from here on the digits of a return make a table too wide
+LONG_RETURN = 1e12  # from this size on, the digits of a return would make a table too wide
 COLLECTING = ("act", "step", "wait")
 WRONG = {
     "lost": ("rollout was lost and dealt again", "rollouts were lost and dealt again"),
@@ -30,17 +30,17 @@ WRONG = {
     "messages_bad": ("message could not be read", "messages could not be read"),
     "late_actions": ("action came too late", "actions came too late"),
 }
-"""What is said of one and of several, by name in the ledger"""
+"""Singular and plural, by name in the ledger"""
 
 
 def steps_in_words(progress: RunProgress) -> str:
-    """How many env steps are made, and of how many."""
+    """How many env steps have been made, and of how many."""
     made = f"{progress.env_steps_made:,}"
     return f"{made} of {progress.total_steps:,}" if progress.total_steps else made
 
 
 def percent(progress: RunProgress) -> str:
-    """How much of the run is done. It is 100% only once all is."""
+    """How much of the run is done. It is 100% only once all of it is done."""
     return f"{math.floor(100 * progress.share)}%"
 
 
@@ -66,7 +66,7 @@ def lag_in_words(progress: RunProgress) -> str:
 
 
 def weights_in_words(version: int, newest: int) -> str:
-    """Which weights a worker holds, by their version and that of the newest; -1: none."""
+    """Which weights a worker holds: `version` compared with the `newest`; -1: none."""
     if version < 0:
         return "none"
     return f"{newest - version} behind" if version < newest else "newest"
@@ -80,7 +80,7 @@ def workers_here(status: Status) -> str:
 
 
 def bottleneck(progress: RunProgress) -> str:
-    """Who is waited for now, or else which part of the run takes most of the time. Empty while nothing is known."""
+    """Whom the learner waits for now, or else which part of the run takes most of the time. Empty while nothing is known."""
     return who_waits(progress) or slowest_part(progress.stages)
 
 
@@ -139,19 +139,19 @@ def duration(seconds: float) -> str:
 
 
 def last_sign(progress: RunProgress) -> str:
-    """Since when there is no sign of a run that has no results, by local time. Empty if that is not known."""
+    """Since when a run without results has shown no sign of life, in local time. Empty if that is not known."""
     if not progress.at_s:
         return ""
     return time.strftime("no sign since %Y-%m-%d %H:%M:%S", time.localtime(progress.at_s))
 
 
 def ending(reason: str, after: str = "", *, cut_short: bool) -> str:
-    """How a run ended, and why. `after`: after how long."""
+    """How a run ended, and why. `after`: words for how long it ran."""
     how = "Interrupted" if cut_short else "Finished"
     return f"{how}{after}" if reason == how.lower() else f"{how}{after}: {reason}"
 
 
 def went_wrong(counts: Mapping[str, float | None]) -> str:
-    """What was lost, dropped or bad, by these counts of the ledger. Empty if nothing was."""
+    """What was lost, dropped or unreadable, from these counts of the ledger. Empty if nothing was."""
     found = ((counts.get(name) or 0, texts) for name, texts in WRONG.items())
     return ", ".join(f"{count:,.0f} {texts[count != 1]}" for count, texts in found if count > 0)

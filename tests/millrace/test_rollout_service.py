@@ -257,7 +257,10 @@ def test_a_damaged_file_is_named(tmp_path: Path) -> None:
         ({"env_steps": -1}, "Expected `int` >= 0"),
         ({"incarnations": [2**53] * 4}, "Expected `int` <= "),
         ({"ledger": {"issued": 2**53}}, "Expected `int` <= "),
-        ({"ledger": {"used": 5}}, "ledger: expected as many tickets and transitions as became of them, got fewer"),
+        (
+            {"ledger": {"used": 5}},
+            "ledger: expected at least as many tickets and transitions as were used or lost, got fewer",
+        ),
         ({"normalizer": {}}, "'observations'"),
         ({"normalizer": {"observations": {"count": 3, "mean": [None] * 4, "squares": [1] * 4}}}, "expected finite numbers"),
         ({"normalizer": {"observations": {"count": 3, "mean": [0, 0], "squares": [1] * 4}}}, "could not be broadcast"),

@@ -219,7 +219,7 @@ def test_a_setting_in_the_wrong_table_is_refused(tmp_path: Path) -> None:
         ("own_module:BadDefault", "its setting level: its default does not fit its type: Expected `int`, got `str`.*"),
         ("own_module:NotPlain", "its setting what: expected a default of numbers, text, .*, got <object .*>"),
         ("own_module:Untyped", "the types of its settings cannot be read: name 'Nowhere' is not defined"),
-        ("__main__:Nothing", r"this class was made in a script, .*: millrace.train\(resume=…, algo=Nothing\), or put .*"),
+        ("__main__:Nothing", r"this class is defined in a script, .*: millrace.train\(resume=…, algo=Nothing\), or put .*"),
     ],
 )
 def test_what_is_wrong_with_it_is_said_in_one_line(name: str, says: str) -> None:
@@ -255,7 +255,7 @@ def test_the_help_shows_its_settings_with_their_texts(capsys: pytest.CaptureFixt
         "--penalty FLOAT Weight of the penalty. (default: 0.1)",
         "--kind {soft,hard} How it is computed. (default: soft)",
         "--cutoff FLOAT|none (default: none)",
-        "--rollout-steps INT T, the steps of each env copy in a rollout. (default: 16)",
+        "--rollout-steps INT T, the number of steps of each env copy in a rollout. (default: 16)",
     ):
         assert line in text
     (tmp_path / "own_module.py").unlink()

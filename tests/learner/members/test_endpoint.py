@@ -77,7 +77,7 @@ def test_between_processes_that_share_a_file_there_are_no_keys(tmp_path: Path) -
 def test_insecure_is_spelt_out_and_says_what_it_risks(home: Path, bind: str, caplog: pytest.LogCaptureFixture) -> None:
     assert keyring_for(Config(bind=bind, insecure=True), NOW) is None
     (line,) = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
-    assert line.startswith(f"{bind} is open to everybody who can reach it, without keys")
+    assert line.startswith(f"{bind} is open to anyone who can reach it, without keys")
     assert "--insecure" in line
     assert not home.exists()
     with pytest.raises(UsageError, match="expected one, got both"):

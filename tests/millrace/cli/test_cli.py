@@ -387,9 +387,11 @@ def test_an_error_in_millrace_hides_its_traceback_until_asked(capsys: Captured, 
 def test_an_interrupted_run_says_how_to_go_on(capsys: Captured, monkeypatch: pytest.MonkeyPatch) -> None:
     failing(monkeypatch, Interrupted(Path("runs/mine")))
     line = refusal(capsys, "train", "CartPole-v1", exit_code=130)
-    assert line == "interrupted; go on with: millrace train --resume runs/mine"
+    assert line == "interrupted; continue with: millrace train --resume runs/mine"
     line = refusal(capsys, "learner", "CartPole-v1", exit_code=130)
-    assert line == "interrupted; go on with: millrace learner --resume runs/mine", "`train` would start workers of its own"
+    assert line == "interrupted; continue with: millrace learner --resume runs/mine", (
+        "`train` would start workers of its own"
+    )
     failing(monkeypatch, KeyboardInterrupt())
     assert refusal(capsys, "train", "CartPole-v1", exit_code=130) == "interrupted"
 

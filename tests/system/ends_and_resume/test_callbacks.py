@@ -284,7 +284,7 @@ def test_a_callback_by_its_name_is_called_again_when_the_run_is_resumed(
     assert main(["train", "--resume", str(folder), "--callbacks", "mine_on_disk:Fail"]) == 1
     err = capsys.readouterr().err.strip().splitlines()
     assert err[-1].startswith("millrace: mine_on_disk.py:7: ValueError: no; raised in Fail.on_update; ")
-    assert f"; go on with: millrace train --resume {folder}; " in err[-1]
+    assert f"; continue with: millrace train --resume {folder}; " in err[-1]
     assert main(["train", ENV, *flags, "--callbacks", "mine_on_disk:Stp"]) == 2
     assert "module mine_on_disk has no Stp; did you mean mine_on_disk:Stop?" in capsys.readouterr().err
     assert folder_of(tmp_path / "runs") == folder, "no folder is made for a callback that does not exist"

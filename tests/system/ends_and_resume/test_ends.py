@@ -57,7 +57,7 @@ def raises_at(update: int, error: BaseException) -> Watch:
 
 def how_to_go_on(folder: Path) -> list[str]:
     env_steps = checkpoint.newest(folder)[0].env_steps
-    return [f"{env_steps:,} env steps are saved; go on with: {resume_command(folder, elsewhere=False)}"]
+    return [f"{env_steps:,} env steps are saved; continue with: {resume_command(folder, elsewhere=False)}"]
 
 
 def parameters(folder: Path) -> torch.Tensor:

@@ -148,7 +148,7 @@ def test_a_worker_delivers_its_rollout_after_sigterm(stage: Stage) -> None:
     assert ledger["lost"] - lost <= LANES
     assert ledger["transitions_late"] == 0
     assert int(learner.checkpoints()[-1].stem) == learner.summary()["env_steps"], "the last update was not saved"
-    assert re.search("go on with: .*millrace learner --resume", learner.said().splitlines()[-1])
+    assert re.search("continue with: .*millrace learner --resume", learner.said().splitlines()[-1])
 
 
 # ---------------------------------------------------------------- the learner

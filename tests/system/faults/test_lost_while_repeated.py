@@ -16,8 +16,8 @@ from tests.system.stage.preloaded import workers_of
 from tests.system.stage.processes import START_S, Learner, Stage
 
 TRAP = "tests.system.environments.slow_envs:BreaksWhileRepeated"
-CONTINUES = r"lane \d goes on with worker w\d: \d+ env steps are repeated first"
-ANEW = r"lane \d goes on with worker w\d: 2 env copies begin new episodes"
+CONTINUES = r"lane \d continues on worker w\d: \d+ env steps are replayed first"
+ANEW = r"lane \d continues on worker w\d: 2 env copies begin new episodes"
 
 
 def started(stage: Stage, name: str, trap: Path) -> Learner:

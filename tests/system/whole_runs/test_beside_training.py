@@ -194,7 +194,7 @@ def test_a_signal_while_the_learner_waits_for_it_ends_the_run_in_time(
     sys.stdout.write(f"\nsignal {number}, a step of {step_s:g} s, {flags}: it ended after {seconds:.2f} s\n")
     assert seconds <= within_s * crowding()
     said = started.said()
-    assert re.search("interrupted; go on with: .*millrace train --resume", said)
+    assert re.search("interrupted; continue with: .*millrace train --resume", said)
     assert "Traceback" not in said
     past = checkpoint.newest(folder_of(stage.runs))[0].state["past"]
     assert 0 < past["pending"]["version"] < past["version"]

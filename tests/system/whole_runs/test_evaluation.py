@@ -174,7 +174,7 @@ def test_a_signal_during_an_evaluation_ends_the_run_at_once_with_its_checkpoint(
     assert run.ends() == 130, run.said()
     seconds = time.monotonic() - began_s
     assert seconds <= 2.0 * crowding(), f"the run ended {seconds:.2f} s after the signal"
-    assert re.search("interrupted; go on with: .*millrace train --resume", run.said())
+    assert re.search("interrupted; continue with: .*millrace train --resume", run.said())
     assert "Traceback" not in run.said()
     rows = read_rows(next(stage.runs.glob("*/metrics.jsonl")))
     assert saved_at == rows[-1]["time/total_timesteps"] > 0

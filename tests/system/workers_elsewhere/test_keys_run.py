@@ -120,7 +120,7 @@ def test_an_insecure_learner_warns_and_a_worker_of_it_runs_no_code(stage: Stage)
     settings = {"env-kwargs": "", "insecure": " ", "advertise": "127.0.0.1"}
     learner = stage.learner("tcp://0.0.0.0:*", settings, env="tests.support.envs.toy:Spaces-v0")
     address = join_address(learner)
-    assert "is open to everybody who can reach it" in learner.said()
+    assert "is open to anyone who can reach it" in learner.said()
     worker = stage.worker(address, "w", "--no-code")
     assert worker.ends() == 2
     assert "imports a module, which this worker does not do" in worker.said()
