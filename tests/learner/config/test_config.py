@@ -164,7 +164,7 @@ def test_a_target_that_no_evaluation_can_reach_is_said() -> None:
         ({"learning_rat": 1.0}, "unknown setting learning_rat; did you mean learning_rate?"),
         (
             {"algo": "reinforce", "core": "gru"},
-            "unknown setting core; it is one of ppo, a2c, impala, dqn, rainbow, sac, td3, tqc, crossq, xqc alone",
+            "unknown setting core; it is one of ppo, a2c, dqn, rainbow, impala, sac, td3, tqc, crossq, xqc alone",
         ),
         ({"core": "rnn"}, "core: expected one of lstm, gru, none, got 'rnn'"),
         ({"algo": "pp0"}, "algo pp0: expected one of ppo"),

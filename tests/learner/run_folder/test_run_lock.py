@@ -211,7 +211,7 @@ def test_who_was_replaced_notices_and_writes_nothing_more(tmp_path: Path) -> Non
         theirs = (tmp_path / LOCK_FILE).read_bytes()
         mine.check()  # not known yet
         for _ in range(2):
-            with pytest.raises(RunTakenOver, match=rf"^run {tmp_path}: process 77 on far has taken it over, .* 30 s"):
+            with pytest.raises(RunTakenOver, match=rf"^run {tmp_path}: process 77 on far took it over, .* 30 s"):
                 mine.confirm()
         with pytest.raises(RunTakenOver):
             mine.check()
@@ -261,7 +261,7 @@ def test_the_lock_says_where_the_learner_listens_and_keeps_saying_it(tmp_path: P
             assert owner_of(tmp_path).address == ""
         for why, line in (
             (Unreachable.INPROC, "cannot be asked: with --transport inproc it listens in its own process only"),
-            (Unreachable.KEYS_OF_THE_RUN, "cannot be asked: .* the keys of its local workers are in no file; run it with"),
+            (Unreachable.KEYS_OF_THE_RUN, "cannot be asked: .* the keys of its local workers are not in any file; run it with"),
         ):
             held.announce(why)
             with pytest.raises(UsageError, match=line):
