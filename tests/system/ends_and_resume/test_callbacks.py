@@ -234,7 +234,7 @@ def test_a_run_that_another_process_takes_over_ends_without_a_summary(tmp_path: 
         run(tmp_path, told, checkpoint_every_s=0.0)
     (end,) = told.of("on_end")
     assert (end.updates, end.cut_short) == (4, True)
-    assert "process 77 on far has taken it over" in end.stop_reason
+    assert "process 77 on far took it over" in end.stop_reason
     assert not (folder_of(tmp_path / "runs") / "summary.json").exists()
 
 

@@ -96,7 +96,7 @@ def test_machines_that_share_a_folder_without_system_locks_judge_by_the_lease(st
     third.trains(2)
     second.go_on()
     assert second.ends(START_S) == 1, second.said()
-    assert f"process {third.pid} on three has taken it over" in second.said().splitlines()[-1]
+    assert f"process {third.pid} on three took it over" in second.said().splitlines()[-1]
     assert not (first.folder / "summary.json").exists(), "it wrote into a run that is not its own any more"
     third.trains(2)
     third.signal(signal.SIGTERM)
@@ -132,7 +132,7 @@ def test_a_second_learner_is_refused_a_killed_one_replaced_and_a_replaced_one_en
     other = Owner(host="far", pid=77, boot_id="another kernel", token="theirs").encoded()
     lock.write_bytes(other)  # as if a process elsewhere had found this one dead
     assert third.ends(START_S) == 1, third.said()
-    assert "process 77 on far has taken it over" in third.said().splitlines()[-1]
+    assert "process 77 on far took it over" in third.said().splitlines()[-1]
     assert lock.read_bytes() == other
     assert not (first.folder / "summary.json").exists(), "it wrote into a run that is not its own any more"
 

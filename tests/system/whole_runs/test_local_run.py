@@ -538,7 +538,7 @@ def test_status_asks_the_learner_of_a_run_that_acts_in_the_learner(tmp_path: Pat
     [
         (("--transport", "inproc"), "with --transport inproc it listens in its own process only"),
         (("--transport", "inproc", "--inference", "learner"), "with --transport inproc it listens in its own process only"),
-        (("--transport", "tcp", "--keys", "KEYS"), "the keys of its local workers are in no file"),
+        (("--transport", "tcp", "--keys", "KEYS"), "the keys of its local workers are not in any file"),
     ],
 )
 def test_status_of_a_run_that_nobody_can_ask_is_one_line_that_says_why(
