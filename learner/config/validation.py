@@ -160,7 +160,9 @@ def check_rollout_settings(config: RolloutConfig) -> None:
     if len(names) > MAX_FACTS or len(set(names)) < len(names):
         raise UsageError(f"info_keys: expected at most {MAX_FACTS} different names, got {len(names)}")
     if wrong := [name for name in names if not name or name != one_line(name, MAX_NAME)]:
-        raise UsageError(f"info_keys: expected names without line breaks, got {one_line(safe_repr(wrong[0]), MAX_NAME)}")
+        raise UsageError(
+            f"info_keys: expected non-empty names without tabs or line breaks, got {one_line(safe_repr(wrong[0]), MAX_NAME)}"
+        )
     if taken := METRICS_BESIDE_FACTS.union(f"{name}_missing" for name in names).intersection(names):
         raise UsageError(f"info_keys: expected another name than {min(taken)}, which is the name of another logged value")
     if config.wrappers and config.vector != "loop":

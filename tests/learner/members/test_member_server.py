@@ -308,7 +308,7 @@ def test_what_a_connection_had_sent_that_a_newer_one_replaced_is_no_warning(capl
     assert "(the last one was refused: its connection has no routing id" in str(served.server.no_workers(2, 1.0))
     served.says(b"w1", hello)
     assert [record.levelname for record in caplog.records] == ["INFO", "INFO"]
-    assert "nothing is wrong if it has connected again" in caplog.messages[0]
+    assert "this is harmless if it has connected again" in caplog.messages[0]
     assert len(served.coordinator.members) == 2
 
 

@@ -93,9 +93,9 @@ def test_a_resumed_run_may_ask_for_others(run: Path, tmp_path: Path, caplog: pyt
     [
         (["a", "a"], "info_keys: expected at most 32 different names, got 2"),
         ([f"k{n}" for n in range(33)], "info_keys: expected at most 32 different names, got 33"),
-        (["a\tb"], "info_keys: expected names in one line"),
-        ([""], "info_keys: expected names in one line, got ''"),
-        (["ep_rew_mean"], "info_keys: expected another name than ep_rew_mean, under which something else is logged"),
+        (["a\tb"], "info_keys: expected non-empty names without tabs or line breaks"),
+        ([""], "info_keys: expected non-empty names without tabs or line breaks, got ''"),
+        (["ep_rew_mean"], "info_keys: expected another name than ep_rew_mean, which is the name of another logged value"),
         (["distance_missing", "distance"], "info_keys: expected another name than distance_missing, under which"),
     ],
 )
