@@ -96,7 +96,7 @@ def test_a_resumed_run_may_ask_for_others(run: Path, tmp_path: Path, caplog: pyt
         (["a\tb"], "info_keys: expected non-empty names without tabs or line breaks"),
         ([""], "info_keys: expected non-empty names without tabs or line breaks, got ''"),
         (["ep_rew_mean"], "info_keys: expected another name than ep_rew_mean, which is the name of another logged value"),
-        (["distance_missing", "distance"], "info_keys: expected another name than distance_missing, under which"),
+        (["distance_missing", "distance"], "info_keys: expected another name than distance_missing, which is"),
     ],
 )
 def test_names_that_are_refused(keys: list[str], line: str, tmp_path: Path) -> None:
