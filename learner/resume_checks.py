@@ -15,7 +15,7 @@ import msgspec
 
 from millrace.learner.between_updates.stop_rules import BY_THE_POLICY_OF, reason_to_stop
 from millrace.learner.config.config import Config
-from millrace.learner.config.hyperparameters import QLearningConfig
+from millrace.learner.config.hyperparameters import OffPolicyConfig, QLearningConfig
 from millrace.learner.config.layers import config_of_run
 from millrace.learner.config.resume_rules import Change, OnResume, changes, refusal
 from millrace.learner.env_spaces import EnvSpaces
@@ -64,6 +64,12 @@ def check_settings(config: Config, run: Path) -> list[str]:
         changed += changes(before.algorithm, config.algorithm)
     if why := refusal(changed):
         raise UsageError(f"run {run}: {why}; a run keeps this setting: resume it without, or start a new run")
+    match before.algorithm, config.algorithm:
+        case OffPolicyConfig(core=str()) as had, OffPolicyConfig() as has if had.rollout_steps != has.rollout_steps:
+            raise UsageError(
+                f"run {run}: rollout_steps: expected {had.rollout_steps}, the length of the sequences in its replay buffer, "
+                f"got {has.rollout_steps}; resume it without this setting, or start a new run"
+            )
     return [f"run {run}: {line}" for line in _differences(before, config, changed)]
 
 

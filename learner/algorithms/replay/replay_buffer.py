@@ -465,7 +465,7 @@ class ReplayBuffer:
         return {
             "size": self.size,
             "arrays": {name: torch.tensor(array[:used]) for name, array in self._arrays().items()},
-            "shared": {name: list(map(torch.tensor, images.saved(used))) for name, images in self._shared().items()},
+            "shared": {name: list(map(torch.from_numpy, images.saved(used))) for name, images in self._shared().items()},
             "newest": {lane: torch.tensor(written) for lane, written in self._newest.items()},
             "written": self._written,
             "highest": self._highest,
@@ -482,11 +482,10 @@ class ReplayBuffer:
         self._is_row[used:] = False
         if "mask" in state["arrays"]:
             self._make_mask(state["arrays"]["mask"].shape[1])
-        self._obs = tuple(
-            self._room(leaf, shared=f"obs{i}" in state["shared"]) for i, leaf in enumerate(self._content.observation)
-        )
+        shared = state.get("shared", {})
+        self._obs = tuple(self._room(leaf, shared=f"obs{i}" in shared) for i, leaf in enumerate(self._content.observation))
         for name, images in self._shared().items():
-            images.load(*(tensor.numpy() for tensor in state["shared"][name]))
+            images.load(*(tensor.numpy() for tensor in shared[name]))
         for name, array in self._arrays().items():
             if name != "weight":
                 array[:used] = state["arrays"][name].numpy()

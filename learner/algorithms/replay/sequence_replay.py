@@ -175,7 +175,9 @@ class SequenceReplay:
         if self._tree is not None and self._alpha is not None:
             self._tree.set(slots, self._highest**self._alpha)
         self._written += len(used)
-        newest = np.full(len(arrays["valid"]), NONE)
+        # A seat that waits all the time, as it did at the end of its sequence before, still continues that one.
+        waits = ~arrays["begins"].any(1)
+        newest = np.where(waits, arrays["before"], NONE)
         newest[used] = numbers
         self._newest[lane] = newest
 

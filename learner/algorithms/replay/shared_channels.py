@@ -20,6 +20,10 @@ CHUNK_BYTES = 1 << 24
 NONE = -1
 WORTHWHILE = 0.5
 """Share of the channels of some images that may differ, at most, for storing them once to be worth its time"""
+INDEX_BYTES = 250
+"""of the index by digest, for each channel: about what Python's objects take"""
+LEAST_BYTES = 1024
+"""of a channel: the index of smaller ones would take a large part of what sharing saves"""
 
 
 class SharedChannels:
@@ -40,13 +44,15 @@ class SharedChannels:
 
     @property
     def nbytes(self) -> int:
-        """Memory of the channels and of the numbers, in bytes, without the index by digest."""
-        return self._of_slot.nbytes + sum(chunk.nbytes for chunk in self._chunks)
+        """Memory of the channels, their numbers and the index by digest, in bytes; that of the index is an estimate."""
+        return self._of_slot.nbytes + sum(chunk.nbytes for chunk in self._chunks) + INDEX_BYTES * len(self._number)
 
     @staticmethod
     def worthwhile(leaf: Leaf, images: Bytes) -> bool:
         """Whether these images [K, *leaf] share so many channels that storing each once saves memory."""
         channels = _by_channel(leaf, images)
+        if channels.shape[1] < LEAST_BYTES:
+            return False
         distinct = {_digest(channel) for channel in channels}
         return len(distinct) <= WORTHWHILE * len(channels)
 
@@ -86,11 +92,12 @@ class SharedChannels:
         return number
 
     def _add_chunk(self) -> None:
-        first = len(self._uses)
+        first = len(self._chunks) * self._per_chunk
         self._chunks.append(np.zeros((self._per_chunk, self._channel_bytes), np.uint8))
-        self._uses += [0] * self._per_chunk
-        self._digest += [b""] * self._per_chunk
-        self._free += range(first + self._per_chunk - 1, first - 1, -1)
+        end = first + self._per_chunk
+        self._uses[first:] = [0] * self._per_chunk
+        self._digest[first:] = [b""] * self._per_chunk
+        self._free += range(end - 1, first - 1, -1)  # last: without it, the chunk would only stay empty
 
     def _release(self, number: int) -> None:
         self._uses[number] -= 1

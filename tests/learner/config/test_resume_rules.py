@@ -157,6 +157,13 @@ def test_the_rest_is_taken(tmp_path: Path) -> None:
     ]
 
 
+def test_sequences_in_a_replay_buffer_keep_their_length(tmp_path: Path) -> None:
+    run = a_run(tmp_path, algo="dqn", core="gru", rollout_steps=16)
+    assert check_settings(resolve(resume=run, learning_rate=1e-4), run) == []
+    with pytest.raises(UsageError, match=r"rollout_steps: expected 16, the length of the sequences .*, got 8; resume"):
+        check_settings(resolve(resume=run, rollout_steps=8), run)
+
+
 def test_another_replay_ratio_is_said(tmp_path: Path) -> None:
     run = a_run(tmp_path, algo="dqn", gradient_steps=64)
     *_, line = check_settings(resolve(resume=run, envs=16), run)

@@ -48,7 +48,8 @@ class Given:
             known = None if fresh else self.newest.get((lane, n))
             if batch.valid[:, n].any():
                 self.before[first] = known
-            self.newest[lane, n] = first if batch.valid[:, n].any() else None
+            waits = batch.obs[0][0, n, 0] == batch.obs[0][-1, n, 0]
+            self.newest[lane, n] = first if batch.valid[:, n].any() else known if waits else None
         return batch
 
     def drop(self, lane: int) -> None:

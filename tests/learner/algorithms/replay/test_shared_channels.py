@@ -18,19 +18,19 @@ from millrace.protocol.rollout import Batch
 from millrace.protocol.specs import Leaf
 from tests.support.examples import examples
 
-FIRST = Leaf("", "box", (3, 8, 9), "uint8", divisor=255)
-LAST = Leaf("", "box", (8, 9, 3), "uint8", divisor=255)
+FIRST = Leaf("", "box", (3, 32, 33), "uint8", divisor=255)
+LAST = Leaf("", "box", (32, 33, 3), "uint8", divisor=255)
 LEAVES = pytest.mark.parametrize("leaf", [FIRST, LAST], ids=["channels first", "channels last"])
 
 
 def stacked(leaf: Leaf, frames: Bytes) -> Bytes:
-    """Frames [..., 3, 8, 9] as images of this leaf."""
+    """Frames [..., 3, 32, 33] as images of this leaf."""
     return np.moveaxis(frames, -3, -1) if leaf.has_channels_last else frames
 
 
 def distinct(leaf: Leaf, images: Bytes) -> int:
     channels = np.moveaxis(images, -1, 1) if leaf.has_channels_last else images
-    return len(np.unique(channels.reshape(-1, 72), axis=0))
+    return len(np.unique(channels.reshape(-1, 1056), axis=0))
 
 
 @LEAVES
@@ -39,7 +39,7 @@ def distinct(leaf: Leaf, images: Bytes) -> int:
 def test_what_is_read_is_what_was_written(leaf: Leaf, data: st.DataObject) -> None:
     """Of few frames, so that channels are shared between slots and places, and overwritten by themselves."""
     generator = np.random.default_rng(data.draw(st.integers(0, 2**32)))
-    frames = generator.integers(0, 256, (6, 8, 9), np.uint8)
+    frames = generator.integers(0, 256, (6, 32, 33), np.uint8)
     size = data.draw(st.integers(1, 9))
     shared, plain = SharedChannels(size, leaf), np.zeros((size, *leaf.shape), np.uint8)
     written: set[int] = set()
@@ -58,7 +58,7 @@ def test_what_is_read_is_what_was_written(leaf: Leaf, data: st.DataObject) -> No
 @LEAVES
 def test_what_was_saved_is_restored_and_does_not_depend_on_the_past(leaf: Leaf) -> None:
     generator = np.random.default_rng(0)
-    frames = generator.integers(0, 256, (6, 8, 9), np.uint8)
+    frames = generator.integers(0, 256, (6, 32, 33), np.uint8)
     images = stacked(leaf, frames[generator.integers(0, 6, (5, 3))])
     one, other = SharedChannels(5, leaf), SharedChannels(5, leaf)
     one[np.arange(5)] = images
@@ -76,9 +76,9 @@ def test_what_was_saved_is_restored_and_does_not_depend_on_the_past(leaf: Leaf) 
 def played(seed: int, first: bool, stacks: bool, steps: int = 6, copies: int = 2) -> Batch:
     """A rollout of frame stacks, or of pictures that share nothing."""
     generator = np.random.default_rng(seed)
-    frames = generator.integers(0, 256, (steps + 3, copies, 8, 9), np.uint8)
+    frames = generator.integers(0, 256, (steps + 3, copies, 32, 33), np.uint8)
     if not stacks:
-        obs = generator.integers(0, 256, (steps + 1, copies, 3, 8, 9), np.uint8)
+        obs = generator.integers(0, 256, (steps + 1, copies, 3, 32, 33), np.uint8)
     else:
         obs = np.stack([frames[t : t + 3].swapaxes(0, 1) for t in range(steps + 1)])
     ends = generator.random((steps, copies)) < 0.2
@@ -124,7 +124,7 @@ def test_a_replay_of_frame_stacks_draws_what_a_plain_one_draws_and_takes_less(mo
     assert not isinstance(plain._obs[0], SharedChannels)
     for one, other in zip(sharing.sample(60)[1], plain.sample(60)[1], strict=True):
         np.testing.assert_array_equal(one, other)
-    assert 72 * len(sharing._obs[0]._number) < plain._obs[0].nbytes / 2
+    assert 1056 * len(sharing._obs[0]._number) < 0.6 * plain._obs[0].nbytes
     assert len(saved(sharing)) < len(saved(plain))
 
 
@@ -161,5 +161,5 @@ def test_the_memory_that_is_said_is_what_it_takes() -> None:
     buffer = filled(replay())
     stored = buffer._obs[0]
     assert isinstance(stored, SharedChannels)
-    plain = 40 * 3 * 72
+    plain = 40 * 3 * 1056
     assert buffer.bytes == buffer._content.bytes - plain + stored.nbytes
