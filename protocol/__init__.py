@@ -1,4 +1,4 @@
-"""The contract: all that a worker and the learner agree on. Imports neither of them; see README.md here for the wire."""
+"""The contract between a worker and the learner. Imports neither of them; README.md in this folder describes the wire."""
 
-if __name__ != "millrace.protocol":  # else each module would exist twice, and so would each class
+if __name__ != "millrace.protocol":  # otherwise each module and class would exist twice
     raise ImportError(f"import millrace.protocol instead of {__name__}", name=__name__)

@@ -2,7 +2,7 @@
 
 Rule: a row has the choices of all Discrete and MultiDiscrete parts, then the bits of all MultiBinary parts, then the numbers
 of all Box parts. Each of the three has its parts in the order of the space. So a mixed action has at most three
-distributions, whatever its parts are, and only what converts it for the environment knows of them.
+distributions, whatever its parts are, and only the code that converts it for the environment knows the parts.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from msgspec.structs import replace
 from millrace.protocol.specs import ActionPart, ActionSpec
 
 Path = tuple[str | int, ...]
-"""Where a part stands (`ActionPart.path`)."""
+"""The position of a part (`ActionPart.path`)."""
 
 
 class PlacedPart(NamedTuple):
-    """A part of an action, as if it were an action of its own."""
+    """A part of an action, as an action by itself."""
 
     path: Path
     spec: ActionSpec
     columns: slice
-    """of a stored row"""
+    """its columns in a stored row"""
 
 
 def mixed(parts: Sequence[tuple[Path, ActionSpec]]) -> ActionSpec:
@@ -79,15 +79,15 @@ Nest = Callable[[Sequence[Any]], Any]
 
 
 def make_nest(paths: Sequence[Path]) -> Nest:
-    """A function from values, in order, to the Dict or Tuple in which they stand at these paths.
+    """A function from values, in order, to the Dict or Tuple that has them at these paths.
 
-    The path of a single value may be empty. Raises `ValueError` for paths of no Dict or Tuple.
+    The path of a single value may be empty. Raises `ValueError` unless the paths describe a Dict or Tuple.
     """
     return _nest(list(enumerate(paths)))
 
 
 def _nest(placed: Sequence[tuple[int, Path]]) -> Nest:
-    """The same for some of the values, each with its number and the rest of its path."""
+    """Like `make_nest`, for some of the values, each with its number and the rest of its path."""
     number, path = placed[0]
     if not path and len(placed) == 1:
         return itemgetter(number)

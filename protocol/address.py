@@ -1,6 +1,6 @@
-"""Addresses: which are valid, which only this machine can reach, and what to type on another machine.
+"""Addresses: which are valid, which only this machine can reach, and which to type on another machine.
 
-Rule: an address counts as reachable by others unless it certainly is not. An IPv6 address stands in brackets. Pure,
+Rule: an address counts as reachable by others unless it certainly is not. An IPv6 address is in brackets. Pure,
 except for `needs_ipv6` and `resolves`, which ask the system's resolver about names.
 """
 
@@ -62,7 +62,7 @@ def is_local(address: str) -> bool:
 
 
 def needs_ipv6(address: str) -> bool:
-    """True for an IPv6 address, and for a name without an IPv4 address: with IPv6 on, ZeroMQ tries no IPv4 address."""
+    """True for an IPv6 address, and for a name without an IPv4 address: with IPv6 on, ZeroMQ doesn't try IPv4 addresses."""
     host = host_of(address)
     if host.startswith("["):
         return True
@@ -117,7 +117,7 @@ def key_of_peer(peer: bytes) -> bytes:
 
 
 def name_for_people(peer: bytes) -> str:
-    """The worker's name as text without control characters, for logs and errors. A stranger's may be any bytes."""
+    """The worker's name as text without control characters, for logs and errors. A stranger's name may be any bytes."""
     return one_line(worker_name(peer).decode(errors="replace"), MAX_NAME)
 
 
@@ -134,5 +134,5 @@ def _is_name(host: str) -> bool:
 def _has_address(host: str, family: socket.AddressFamily) -> bool:
     try:
         return bool(socket.getaddrinfo(host, None, family))
-    except (OSError, UnicodeError):  # UnicodeError: no name of a host, as one with an empty part between two dots
+    except (OSError, UnicodeError):  # UnicodeError: not a host name, such as one with two dots in a row
         return False

@@ -36,37 +36,38 @@ class WorkerExit(msgspec.Struct, frozen=True, array_like=True):
     worker: Name
     process_nonce: Natural
     reason: Line
-    """how it ended: an exit code, a signal, or a timeout that its supervisor enforced, by the name of its flag"""
+    """how it ended: an exit code, a signal, or the name of the timeout flag that its supervisor enforced"""
     failed: bool
     """whether the environment, the policy, or the worker is to blame: it did not leave on purpose"""
     of_policy: bool = False
     """it failed in a call of a policy that the user wrote; no environment is to blame"""
     hung: bool = False
-    """its supervisor has ended it, because a call took too long: what led there is not repeated"""
+    """its supervisor ended it, because a call took too long: its steps are not replayed"""
 
 
 @dataclass(frozen=True)
 class StartFailed:
-    """A worker's process that ended by itself before it had joined a run. Only its supervisor can say why, and only here:
-    the learner has never heard of it.
+    """A worker's process that ended by itself before it had joined a run. Only its supervisor can say why, because the
+    learner has never heard of it.
     """
 
     worker: str
     reason: str
-    """one line: how it ended, and whether it is started again"""
+    """one line: how it ended, and whether it is restarted"""
     last_lines: str
-    """what it wrote last; empty if it has written nothing, or has no log"""
+    """the last lines of its output; empty if it has written nothing, or has no log"""
 
 
 class Alive(Message, frozen=True):
-    """A supervisor speaks for its workers. It is believed if it knows a worker's `process_nonce` and uses the same key.
+    """A supervisor speaks for its workers.
 
-    Once the run is over, it is answered by `Drain`: the supervisor then ends workers that do not leave by themselves.
+    It is believed if it knows a worker's `process_nonce` and uses the same key. Once the run is over, the answer is `Drain`:
+    the supervisor then ends workers that don't leave by themselves.
     """
 
     running: Annotated[tuple[WorkerActivity, ...], Meta(max_length=MAX_WORKERS)]
     ended: Annotated[tuple[WorkerExit, ...], Meta(max_length=MAX_WORKERS)]
-    """those that ended a short while ago; repeated, because a message may be lost"""
+    """workers that ended a short while ago; repeated, because a message may be lost"""
     replies: Natural | None = None
     """number of the last HeartbeatReply that came to the supervisor, if its workers share the weights that it gets; null if
     they do not"""

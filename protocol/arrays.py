@@ -1,4 +1,4 @@
-"""Names for the types of numpy arrays. Shapes and dtypes stand in the comments and docstrings beside them."""
+"""Names for the types of numpy arrays. Comments and docstrings give the shapes and dtypes."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""Bounds of the texts, numbers and lists in a message, as types for its fields. How large the message itself may be stands
-in `millrace.protocol.wire.message_sizes`. Pure.
+"""Bounds of the texts, numbers and lists in a message, as types for its fields. `millrace.protocol.wire.message_sizes`
+bounds the size of the message itself. Pure.
 
-Rule: every text, number and list in a message has a bound, and decoding refuses what exceeds it. So a peer can neither fill
-the memory nor a log, nor write control characters to a terminal. A sender makes its own texts fit (`one_line`, `text`).
+Rule: every text, number and list in a message has a bound, and decoding refuses what exceeds it. So a peer can't fill the
+memory or a log, or write control characters to a terminal. A sender shortens its own texts (`one_line`, `text`).
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ import msgspec
 from msgspec import Meta
 
 INVALID = (msgspec.MsgspecError, ValueError, RecursionError)
-"""What decoding raises: ValueError for bytes that are not UTF-8 and for too many digits, RecursionError for lists in lists.
-Whoever decodes what another program wrote catches all of them.
+"""What decoding raises: ValueError for bytes that are not UTF-8 and for too many digits, RecursionError for deeply nested
+lists. Code that decodes what another program wrote catches all of them.
 """
 
 MAX_NAME = 200  # characters
@@ -24,19 +24,19 @@ MAX_LINE = 1_000  # characters
 MAX_TEXT = 64_000  # characters
 LARGEST = 2**53  # every whole number up to here is exact as a float64 too
 MAX_TICKETS = 1 << 16  # in one message
-MAX_WORKERS = 1_024  # that one supervisor speaks for
+MAX_WORKERS = 1_024  # workers that one supervisor speaks for
 MAX_COPIES = 1 << 16  # in one lane
 MAX_SAVED_BYTES = 1 << 22  # state of one env copy that its environment has saved
 MAX_SEEDS = 1_024  # in one order to evaluate
 MAX_FACTS = 32  # of an episode
-MOST_FRAMES = 1_500  # that are sent of one episode: a minute of video at 25 frames a second
+MOST_FRAMES = 1_500  # frames of one episode that are sent: a minute of video at 25 frames per second
 
 _NO_CONTROL = r"^[^\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]*\Z"
 
 Name = Annotated[str, Meta(max_length=MAX_NAME, pattern=_NO_CONTROL)]
 Line = Annotated[str, Meta(max_length=MAX_LINE, pattern=_NO_CONTROL)]
 Text = Annotated[str, Meta(max_length=MAX_TEXT)]
-"""Several lines, as a traceback. It may hold control characters: `escaped` makes it safe to show."""
+"""Several lines, such as a traceback. It may contain control characters: `escaped` makes it safe to show."""
 Natural = Annotated[int, Meta(ge=0, le=LARGEST)]
 Count = Annotated[int, Meta(ge=1, le=LARGEST)]
 Whole = Annotated[int, Meta(ge=-LARGEST, le=LARGEST)]
@@ -64,7 +64,7 @@ _CONTROL_EXCEPT_NEWLINE = re.compile(rf"[\x00-\x08{_HIDDEN}]")
 
 
 def one_line(text: str, most: int = MAX_LINE) -> str:
-    """The text as a `Line`, or as a `Name`: control characters are escaped (`\\x1b`), and what is too long is cut."""
+    """The text as a `Line`, or as a `Name`: control characters are escaped (`\\x1b`), and long texts are cut."""
     return _cut(_CONTROL.sub(_escape, text), most)
 
 
@@ -74,7 +74,7 @@ def escaped(text: str) -> str:
 
 
 def escaped_json(text: str) -> str:
-    """JSON in which control characters stand as JSON's escapes, safe to show."""
+    """JSON in which control characters are written as JSON escapes, safe to show."""
     return _CONTROL_EXCEPT_NEWLINE.sub(lambda match: f"\\u{ord(match[0]):04x}", text)
 
 
@@ -84,7 +84,7 @@ def indented(text: str) -> str:
 
 
 def last_text(text: str) -> str:
-    """The text as a `Text`: of one that is too long, the end, where a traceback says what was raised."""
+    """The text as a `Text`: if it is too long, only its end, where a traceback says what was raised."""
     return escaped(text)[-MAX_TEXT:]
 
 

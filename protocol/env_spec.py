@@ -3,8 +3,9 @@
 Only this file may unpickle, and only in `PickledCallable.load`: a callable that the *learner* sent to a worker which allows
 `AllowedCode.CALLABLES`. Nothing that a worker sends is ever unpickled.
 
-Rule: what other processes find by name travels by name. What only this process has (a function, a class or a registered id
-of a script or notebook) travels as a pickled callable, with the specs of the ids for which it may ask gymnasium.
+Rule: things that other processes find by name are sent by name. Things that only this process has (a function, a class or a
+registered id of a script or notebook) are sent as a pickled callable, with the specs of the ids for which it may ask
+gymnasium.
 """
 
 from __future__ import annotations
@@ -55,23 +56,23 @@ _Made = TypeVar("_Made")
 
 
 class AllowedCode(Enum):
-    """Which code a worker runs for its learner. It depends on how surely the worker knows the learner."""
+    """Which code a worker runs for its learner. It depends on whether the worker can trust the learner."""
 
     REGISTERED = 0
     """only environments that are registered on the worker's machine, by id, and their attributes without a leading
-    underscore: the learner may be anybody
+    underscore: the learner may be anyone
     """
     MODULES = 1
     """also `module:EnvId`, which imports the module: the learner runs on this machine"""
     CALLABLES = 2
-    """also pickled callables, and functions and classes that the learner names: its key is known, or only this user can
-    have started it
+    """also pickled callables, and functions and classes that the learner names: its key is known, or only this user can have
+    started the learner
     """
 
     def refuses_to_call(self, what: str) -> str:
         """Why a worker that allows only this code does not call `what`, by name or pickled; empty if it does.
 
-        Any function of any module can be named, with any arguments: that is as much as a pickled callable can do.
+        A name can be any function of any module, with any arguments, so it can do as much as a pickled callable.
         """
         if self is AllowedCode.CALLABLES:
             return ""
@@ -97,7 +98,7 @@ class PickledCallable:
 
     @classmethod
     def of(cls, made: Callable[..., object], what: str) -> PickledCallable:
-        """Pickle a callable. `what` names it in errors. Raises `UsageError` for one that cannot be sent."""
+        """Pickle a callable. `what` names it in errors. Raises `UsageError` if it can't be sent."""
         import cloudpickle
 
         try:
@@ -132,13 +133,13 @@ class PickledCallable:
 
 
 def check_arguments(arguments: Mapping[str, Any], of: str, makes: str = "gymnasium.make(ID, {name}={name})") -> None:
-    """Raise `UsageError` for a keyword argument that no message can carry. `of`: what takes it, for the error.
+    """Raise `UsageError` for a keyword argument that no message can carry.
 
-    `makes`: how a function of the user's makes it with another argument of this name.
+    `of`: what takes it, for the error. `makes`: how a user-defined function makes it with another argument of this name.
     """
     for name, value in arguments.items():
         try:
-            if not isinstance(value, Scalar):  # msgspec would encode a date, and others, as text
+            if not isinstance(value, Scalar):  # msgspec would encode a date, for example, as text
                 raise TypeError
             msgspec.msgpack.decode(msgspec.msgpack.encode({name: value}), type=dict[str, Scalar])
         except (TypeError, ValueError, OverflowError) as error:  # msgspec.ValidationError is a ValueError
@@ -168,7 +169,7 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     applies them itself, and these are only their names.
     """
     eval_kwargs: dict[str, Scalar] = {}
-    """keyword arguments of copies that play evaluations, in addition to `kwargs` or in place of those of the same name"""
+    """keyword arguments of copies that play evaluations, in addition to `kwargs`; they override those of the same name"""
 
     @staticmethod
     def of(
@@ -177,10 +178,10 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         wrappers: Sequence[WrapperLike] = (),
         eval_kwargs: dict[str, Scalar] | None = None,
     ) -> EnvSpec:
-        """Make a spec from what a user gives: an id or a name, gymnasium's `EnvSpec`, or a callable that takes `kwargs`.
+        """Make a spec from the user's argument: an id or a name, gymnasium's `EnvSpec`, or a callable that takes `kwargs`.
 
-        `wrappers`: each takes an environment and returns one, or is the name of such a callable. `eval_kwargs`: as the
-        field. Raises `UsageError` for what cannot be found, a callable that is too large to send, and arguments that no
+        `wrappers`: each takes an environment and returns one, or is the name of such a callable. `eval_kwargs`: see the
+        field. Raises `UsageError` for names that can't be found, a callable that is too large to send, and arguments that no
         message can carry.
         """
         if isinstance(env, EnvSpec):
@@ -222,7 +223,7 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def called_code(self) -> str:
-        """What a worker calls that the learner names or sends, in words: a factory, or a wrapper. Empty for an id alone."""
+        """What a worker has to call for the learner, in words: a factory, or a wrapper. Empty for only an id."""
         if self.factory is not None or names_a_function(self.id):
             return FACTORY
         return "a wrapper" if self.wrappers else ""
@@ -232,15 +233,15 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return filled(self.kwargs, self.id)
 
     def make(self, render_mode: str | None = None) -> gymnasium.Env[Any, Any]:
-        """Make one env copy, in its wrappers. Raises `UsageError`, with advice, if it or a package cannot be found.
+        """Make one env copy, including its wrappers. Raises `UsageError`, with advice, if it or a package cannot be found.
 
-        An environment of PettingZoo becomes one with seats. `detail` of the error is the traceback if a constructor raised.
+        A PettingZoo environment becomes one with seats. `detail` of the error is the traceback if a constructor raised.
         """
         made = self.make_as_given(render_mode)
         return seated(made, self.id) if has_seats(made) else made
 
     def make_as_given(self, render_mode: str | None = None) -> Any:
-        """As `make`, but an environment of PettingZoo stays one."""
+        """Like `make`, but a PettingZoo environment stays one."""
         kwargs = self.kwargs_of_copy() | ({} if render_mode is None else {"render_mode": render_mode})
         if self.factory is not None:
             return made_by_callable(self.id, self.factory.load(), kwargs)
@@ -283,7 +284,10 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def _why_not(env_id: str) -> str:
-    """Why a registered environment that perhaps was meant cannot be made; empty if it can. No function is called."""
+    """Why a registered environment, which may be the one that was meant, can't be made; empty if it can.
+
+    Calls no function.
+    """
     if ":" in env_id:
         return ""
     load_plugins(env_id)
@@ -298,7 +302,8 @@ def _why_not(env_id: str) -> str:
     return ""
 
 
-# -------------------------------------------------------------------------------------------- what only this process has
+# -------------------------------------------------------------------------------------------- things that only this process
+# has
 
 
 class _Factory:
@@ -313,7 +318,7 @@ class _Factory:
     ) -> None:
         """`env` returns the environment without wrappers; None: `name` is its id.
 
-        `specs`: of ids that a process may not know that has just started, and for which the code may ask gymnasium.
+        `specs`: specs of ids that a new process may not know, and for which the code may ask gymnasium.
         """
         self._name = name
         self._env = env
@@ -335,10 +340,10 @@ class _Factory:
 
 
 class _UnpickledLater:
-    """A class or function that is unpickled when it is called: who does not need it need not have its modules."""
+    """A class or function that is unpickled when it is called, so that a process without calls doesn't need its modules."""
 
     def __init__(self, point: Callable[..., object]) -> None:
-        """Raises `UsageError` for one that cannot be sent."""
+        """Raises `UsageError` if it can't be sent."""
         self._point = PickledCallable.of(point, "environment")
 
     def __call__(self, **kwargs: Any) -> Any:
@@ -346,7 +351,7 @@ class _UnpickledLater:
 
 
 def _pickled(name: str, env: Callable[..., object] | None, wrappers: tuple[WrapperLike, ...]) -> PickledCallable:
-    """The factory as it travels: without specs, if they cannot. Raises `UsageError`."""
+    """The factory as it is sent: without specs if they can't be pickled. Raises `UsageError`."""
     try:
         specs = tuple(_perhaps_needed(spec) for spec in gymnasium.registry.values() if not _is_gymnasiums(spec))
         return PickledCallable.of(_Factory(name, env, wrappers, specs), f"environment {name}")
@@ -355,7 +360,7 @@ def _pickled(name: str, env: Callable[..., object] | None, wrappers: tuple[Wrapp
 
 
 def _perhaps_needed(spec: GymnasiumSpec) -> GymnasiumSpec:
-    """As `_sent`, without what only its environment needs."""
+    """Like `_sent`, without the parts that only its environment needs."""
     sent = _sent(spec)
     return dataclasses.replace(sent, entry_point=_UnpickledLater(sent.entry_point)) if callable(sent.entry_point) else sent
 
@@ -371,9 +376,9 @@ class _SpecFactory:
 
 
 def _sent(spec: GymnasiumSpec) -> GymnasiumSpec:
-    """The spec as another process can use it: a class of this script stands in it, in place of its name.
+    """The spec in a form that another process can use: it contains a class of this script in place of its name.
 
-    What has a name that gymnasium imports is named, so that only who makes this environment needs the module.
+    Classes that gymnasium can import are named, so that only a process that makes this environment needs the module.
     """
     point = spec.entry_point
     name = point if isinstance(point, str) else name_of(point)
@@ -384,12 +389,15 @@ def _sent(spec: GymnasiumSpec) -> GymnasiumSpec:
 
 
 def remembered_name(env: EnvLike | EnvSpec) -> str:
-    """The name by which a run remembers an environment that was given in Python, and finds it again if it can."""
+    """The name under which a run remembers an environment that was passed in Python, and finds it again if possible."""
     return env.id if isinstance(env, EnvSpec) else _named(env)[0]
 
 
 def _given(env: EnvLike) -> tuple[str, Callable[..., object] | None]:
-    """The name of what a user gave, and what makes it if workers cannot find it by that name. Raises `UsageError`."""
+    """The name of the user's argument, and a callable that makes it if workers can't find it by that name.
+
+    Raises `UsageError`.
+    """
     name, factory = _named(env)
     if factory is None and not found_by_others(name):
         last = "my_env" if "lambda" in name else last_part(name)
@@ -415,7 +423,7 @@ def _named(env: EnvLike) -> tuple[str, Callable[..., object] | None]:
 
 
 def _registered_here(env_id: str, given: GymnasiumSpec | None = None) -> tuple[str, Callable[..., object] | None]:
-    """The name of an id, and what makes it if it is registered in this process only."""
+    """The name of an id, and a callable that makes it if it is registered in this process only."""
     module, _, plain = env_id.rpartition(":")
     if module not in ("", MAIN):
         return env_id, None
@@ -430,7 +438,7 @@ def _registered_here(env_id: str, given: GymnasiumSpec | None = None) -> tuple[s
 
 
 def _is_of_everyone(spec: GymnasiumSpec) -> bool:
-    """Whether a process that has just started knows this spec: it is gymnasium's, ours or a plugin's, and unchanged."""
+    """Whether a new process knows this spec: it comes unchanged from gymnasium, millrace or a plugin."""
     known = gymnasium.registry.get(spec.id)
     try:
         if known is None or spec != known:
@@ -443,7 +451,7 @@ def _is_of_everyone(spec: GymnasiumSpec) -> bool:
 
 
 def _is_gymnasiums(spec: GymnasiumSpec) -> bool:
-    """Whether gymnasium itself registers it. Its classes can be registered by anybody, under other ids."""
+    """Whether gymnasium itself registers it. Anyone can register its classes under other ids."""
     return spec.id in ids_of_gymnasium() and _module_of(spec).partition(".")[0] == "gymnasium"
 
 

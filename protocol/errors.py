@@ -1,22 +1,19 @@
 """Every error millrace knows, in two families.
 
     MillraceError
-    ├── UserFacingError         raised: this side cannot go on; the command line prints its one line, exits with `exit_code`
-    │   ├── UsageError            2   bad flag, unknown environment, unsupported space, folder that exists, …
-    │   ├── Refused               2   the learner refused this worker
-    │   ├── RunTakenOver          1   another process trains this run now; this one must write nothing more
-    │   └── RunError              1   the run cannot go on
-    │       ├── CheckpointError   1   a checkpoint is missing, broken or of another format
-    │       ├── NoWorkers         1   no worker is left, or none ever joined
-    │       ├── WorkerLost        1   a worker is gone, and env copies with it, where none may be lost
-    │       ├── Stalled           1   a deadline passed; the text says what was waited for
-    │       ├── PolicyFailed      1   a policy that the user wrote raised in a worker, hung, or returned something unusable
-    │       └── EnvironmentFailed 1   the environment raised too often; the text carries its traceback
-    └── PeerError             counted and answered, never raised into the loop: a peer sent something wrong
-        ├── BadMessage            not a valid message: shape, size, type or version
-        └── BadRollout            a rollout that breaks the row format
+    ├── UserFacingError         raised: this side cannot continue; the command line prints its one line, exits with
+    `exit_code` │   ├── UsageError            2   bad flag, unknown environment, unsupported space, folder that exists, … │
+    ├── Refused               2   the learner refused this worker │   ├── RunTakenOver          1   another process trains
+    this run now; this one must write nothing more │   └── RunError              1   the run cannot continue │       ├──
+    CheckpointError   1   a checkpoint is missing, broken or of another format │       ├── NoWorkers         1   no worker is
+    left, or none ever joined │       ├── WorkerLost        1   a worker is gone, and so are its env copies, although none
+    may be lost │       ├── Stalled           1   a deadline passed; the text says what was waited for │       ├──
+    PolicyFailed 1   a policy that the user wrote raised in a worker, hung, or returned something unusable │       └──
+    EnvironmentFailed 1 the environment raised too often; the text carries its traceback └── PeerError             counted
+    and answered, never raised into the loop: a peer sent something wrong ├── BadMessage            not a valid message:
+    shape, size, type or version └── BadRollout            a rollout that breaks the row format
 
-A message is one line: who, what, expected, got, what to do next. `WorkerTraceback` is in no family: it is a cause.
+A message is one line: who, what, expected, got, what to do next. `WorkerTraceback` is in neither family: it is a cause.
 """
 
 from __future__ import annotations
@@ -37,7 +34,7 @@ WordedFrom = ParamSpec("WordedFrom")
 
 
 def first_line(error: BaseException, otherwise: str = "no message") -> str:
-    """The first line of an exception's message; `otherwise` if it has none, or if the user's `__str__` of it raises."""
+    """The first line of an exception's message; `otherwise` if it has none, or if its user-defined `__str__` raises."""
     try:
         text = str(error)
     except Exception:
@@ -46,7 +43,7 @@ def first_line(error: BaseException, otherwise: str = "no message") -> str:
 
 
 def safe_repr(value: object) -> str:
-    """The `repr` of a value, or another text if that raises: what an error quotes may be an object of the user's."""
+    """The `repr` of a value, or another text if that raises: an error may quote a user-defined object."""
     try:
         return repr(value)
     except Exception as error:
@@ -54,9 +51,10 @@ def safe_repr(value: object) -> str:
 
 
 def words_an_error(words: Callable[WordedFrom, str]) -> Callable[WordedFrom, str]:
-    """Makes a function that words an error, or advice for one, unable to raise: then it returns an empty string.
+    """Makes a function that words an error, or advice, return an empty string instead of raising.
 
-    It asks objects of the user's, or of other packages, which may be anything. The error itself counts more than advice.
+    It inspects objects of the user or of other packages, which may be anything, and the error itself matters more than
+    advice.
     """
 
     @wraps(words)
@@ -70,7 +68,7 @@ def words_an_error(words: Callable[WordedFrom, str]) -> Callable[WordedFrom, str
 
 
 def joined(line: str, advice: str) -> str:
-    """A line with advice at its end, if there is any."""
+    """A line with advice at its end, if any."""
     return f"{line}; {advice}" if advice else line
 
 
@@ -93,10 +91,10 @@ class MillraceError(Exception):
 
 
 class UserFacingError(MillraceError):
-    """One side cannot go on: the base of all errors that a user meets.
+    """One side cannot continue: the base of all errors that a user meets.
 
-    The command line prints the line and exits with `exit_code`: 2 for what the user asked for, 1 for what happened. `detail`
-    is text to show below the line, as the traceback of a worker; often empty.
+    The command line prints the line and exits with `exit_code`: 2 for a wrong request, 1 for a failure. `detail` is text to
+    show below the line, such as a worker's traceback; often empty.
 
     >>> import millrace
     >>> try:
@@ -107,19 +105,19 @@ class UserFacingError(MillraceError):
     """
 
     exit_code = 1
-    """what the command line exits with"""
+    """exit code of the command line"""
 
     def __init__(self, line: str, detail: str = "") -> None:
-        """`line` is the whole message: what it quotes is escaped, so it stays one line. `detail` is shown below it."""
+        """`line` is the whole message: quoted text is escaped, so it stays one line. `detail` is shown below it."""
         super().__init__(one_line(line))
         self.detail = detail
 
 
 class UsageError(UserFacingError):
-    """What the user asked for cannot be done; the text says what can.
+    """The user's request can't be fulfilled; the text says what is possible.
 
-    It is about an unknown setting or environment, a value out of its range, a space that no policy can have, a folder that
-    is no run, or a call that comes too early. Most are raised before a worker starts.
+    Causes are an unknown setting or environment, a value out of range, an unsupported space, a folder that isn't a run, or a
+    call that comes too early. Most are raised before a worker starts.
 
     >>> import millrace
     >>> millrace.train("CartPole-v1", learning_rat=1e-3)
@@ -131,7 +129,7 @@ class UsageError(UserFacingError):
 
 
 def usage_error(error: OSError) -> UsageError | None:
-    """The line for an error of the system that follows from what the user asked for; None for any other."""
+    """The line for an error of the system that is caused by the user's request; None for any other."""
     match error.errno:
         case errno.ENAMETOOLONG:
             return UsageError(f"path {one_line(str(error.filename), 500)}: {error.strerror}; choose a shorter one")
@@ -154,9 +152,10 @@ class RunTakenOver(UserFacingError):
 
 
 class RunError(UserFacingError):
-    """The run cannot go on, or a file cannot be written. The errors below say more.
+    """The run cannot continue, or a file cannot be written.
 
-    A training run has kept its newest whole checkpoint, from which `millrace.train(resume=run)` continues.
+    Its subclasses are more specific. A training run has kept its newest undamaged checkpoint, from which
+    `millrace.train(resume=run)` continues.
 
     >>> import millrace
     >>> millrace.Run(run).plot("no-such-folder/curve.svg")
@@ -167,10 +166,10 @@ class RunError(UserFacingError):
 
 @contextmanager
 def refusals_of(package: str) -> Iterator[None]:
-    """What a package that is not ours refuses becomes a `RunError`: one line that names the package and what it said.
+    """Errors of another package become a `RunError`: one line with the package and its message.
 
-    For packages that do something of their own for the user (log elsewhere, write a film, start machines). What torch or
-    numpy raise is mostly our mistake, and stays what it is.
+    For packages that do a separate job for the user (log elsewhere, write a video, start machines). Errors of torch or numpy
+    are mostly mistakes in millrace, and stay unchanged.
     """
     try:
         yield
@@ -181,7 +180,7 @@ def refusals_of(package: str) -> Iterator[None]:
 
 
 def _whole_message(error: Exception) -> str:
-    """All lines of its message in one: the first may only announce what follows."""
+    """All lines of its message in one, because the first one may only announce the rest."""
     try:
         return one_line(" ".join(str(error).split()), MAX_TEXT) or "no message"
     except Exception:  # its __str__ raised
@@ -191,7 +190,7 @@ def _whole_message(error: Exception) -> str:
 class CheckpointError(RunError):
     """A checkpoint, or a file that `RolloutService.save` wrote, is missing, broken, of another format or of another policy.
 
-    A run that resumes takes the newest checkpoint that is whole; this is raised if there is none.
+    A resumed run takes the newest undamaged checkpoint; this is raised if there is none.
 
     >>> import millrace, pathlib
     >>> _ = pathlib.Path("state.npz").write_bytes(b"not a saved state")
@@ -206,9 +205,9 @@ class CheckpointError(RunError):
 class NoWorkers(RunError):
     """No worker is left, or none ever joined, for as long as `no_workers_timeout_s`. The line says how to start one.
 
-    If this program started the workers and nobody else can join, it is raised at once when none of them is left, with the
-    reason of the last one. A training run that had begun has then written a checkpoint. A vector environment waits for its
-    own workers for a minute, and for those elsewhere for `timeout`.
+    If this program started the workers and no others can join, it is raised at once when none of them is left, with the
+    reason of the last one. A training run that had begun has written a checkpoint. A vector environment waits for its own
+    workers for a minute, and for those elsewhere for `timeout`.
 
     >>> import millrace
     >>> try:
@@ -241,9 +240,10 @@ class WorkerLost(RunError):
 
 
 class Stalled(RunError):
-    """Workers are there, but nothing came from them for ten minutes, or for as long as one call of the environment may take.
+    """Workers have joined, but sent nothing for ten minutes, or for as long as one call of the environment may take.
 
-    The line says what was waited for: mostly an environment that hangs. `step_timeout_s` ends the worker of one that does.
+    The line says what was awaited: mostly an environment that hangs. `step_timeout_s` ends the worker of such an
+    environment.
 
     >>> import millrace
     >>> try:
@@ -254,17 +254,18 @@ class Stalled(RunError):
 
 
 class WorkerTraceback(Exception):
-    """The worker's traceback, shown in the place of this process's own, which does not have the frames."""
+    """The worker's traceback, shown in place of this process's own, which lacks these frames."""
 
     def __str__(self) -> str:
-        return f'\n"""\n{super().__str__()}\n"""'  # as the standard library shows that of another process
+        return f'\n"""\n{super().__str__()}\n"""'  # as the standard library shows a traceback of another process
 
 
 def worker_exception(traceback: str) -> Exception | None:
-    """The exception of which a worker sent this traceback; None if it sent none. Its own cause is the `WorkerTraceback`.
+    """The exception for a traceback that a worker sent; None if it sent none.
 
-    Nothing is unpickled or imported for it, and it is shown without control characters. Only an exception of Python's own is
-    made again, by its name and with its message as the one argument; any other is a `WorkerTraceback`.
+    Its cause is the `WorkerTraceback`. Nothing is unpickled or imported for it, and it is shown without control characters.
+    Only a built-in exception is rebuilt, by its name and with its message as the only argument; any other is a
+    `WorkerTraceback`.
     """
     if not traceback:
         return None
@@ -279,7 +280,7 @@ def worker_exception(traceback: str) -> Exception | None:
         return text
     try:
         error = kind(message) if colon else kind()
-    except TypeError:  # it takes other arguments, as UnicodeDecodeError does
+    except TypeError:  # it takes other arguments, like UnicodeDecodeError
         return text
     error.__cause__ = text
     return error
@@ -288,7 +289,7 @@ def worker_exception(traceback: str) -> Exception | None:
 class EnvironmentFailed(RunError):
     """The environment raised; `detail` is the traceback where it happened. In a worker, `lane` is the lane of its copy.
 
-    Its `__cause__` is the environment's exception if that is one of Python's own; otherwise it shows the traceback.
+    Its `__cause__` is the environment's exception if it is a built-in one; otherwise it shows the traceback.
 
     >>> import millrace
     >>> def broken():
@@ -307,10 +308,10 @@ class EnvironmentFailed(RunError):
 
 
 class PolicyFailed(RunError):
-    """A policy that the user wrote raised in a worker, did not return in time, or returned what no rollout can hold.
+    """A policy that the user wrote raised in a worker, did not return in time, or returned something unusable.
 
     The line names the worker and the policy. `detail` is the traceback of the worker, if the policy raised, and `__cause__`
-    its exception, as that of `EnvironmentFailed`.
+    its exception, as in `EnvironmentFailed`.
 
     >>> import millrace
     >>> class Policy:
@@ -345,7 +346,7 @@ class BadRollout(PeerError):
 
 
 def unexpected_arguments(words: Sequence[str], *, one_run: bool) -> str:
-    """What is wrong with a command that got these words, too many. `one_run`: it takes one run, and has got that."""
+    """The error of a command that got these words too many. `one_run`: it takes one run, and already has it."""
     if one_run:
         return f"expected one run, got {1 + len(words)}; name one of them"
     return f"unexpected argument {words[0]}"

@@ -1,6 +1,6 @@
-"""Paths of the user that may begin with `~`, the home folder of this user, or `~NAME`, that of another.
+"""Paths that may begin with `~`, the home folder of this user, or `~NAME`, the home folder of another.
 
-Rule: a home folder that is not known is one line, as for an unknown user or a container without one.
+Rule: an unknown home folder, of an unknown user or in a container without one, is an error of one line.
 """
 
 from __future__ import annotations

@@ -1,13 +1,13 @@
-"""What a lane has done so far, as far as it is needed to continue the lane on new env copies. Plain data.
+"""The part of a lane's past that is needed to continue the lane on new env copies. Plain data.
 
-Law: an episode is how it began and its actions. A copy is seeded once, when it starts. Each later episode begins with a
-reset without a seed, from the random numbers that the environment then has. So whoever seeds a new copy as the old one was,
-gives it the random numbers that it had before its last reset, resets it and repeats the actions, has the old copy again, if
-the environment repeats itself. A worker tells with each rollout which episodes began in it (`EpisodeBegin`). The learner
-adds up the rollouts, and hands what it has (`LanePast`) to the worker that is to continue the lane. An environment that can
-save its state is not repeated: the state after the last row is in `LanePast.memory`.
+Law: an episode is determined by how it began and by its actions. A copy is seeded once, when it starts. Each later episode
+begins with a reset without a seed, from the environment's random state at that time. So if you seed a new copy like the old
+one, set the random state from before its last reset, reset it and repeat the actions, you get the old copy again, if the
+environment repeats itself. A worker reports with each rollout which episodes began in it (`EpisodeBegin`). The learner
+accumulates the rollouts, and sends the result (`LanePast`) to the worker that continues the lane. The episodes of an
+environment that can save its state are not repeated: the state after the last row is in `LanePast.memory`.
 
-The number of a start decides the seed, and rises when a copy starts anew: when it failed, or could not be continued.
+The number of a start determines the seed, and rises when a copy starts anew because it failed or could not be continued.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ MAX_RANDOM_BYTES = 64
 
 RandomState = Annotated[bytes, Meta(max_length=MAX_RANDOM_BYTES)]
 """State of an environment's random generator (`workers/copies/random_state.py`), from which a reset without a seed begins an
-episode. No bytes: the episode began with the seed of the copy's start."""
+episode. Empty: the episode began with the seed of the copy's start.
+"""
 
 
 class EpisodeBegin(msgspec.Struct, frozen=True, array_like=True):
@@ -90,7 +91,7 @@ class LanePast(msgspec.Struct, frozen=True, array_like=True):
 
     @classmethod
     def unknown(cls, lane: int, copies: int) -> LanePast:
-        """Of a lane whose copies were started once, and of which nothing can be continued."""
+        """The past of a lane whose copies were started once and can't be continued."""
         nothing = np.zeros(0, np.float32)
         return cls(lane, (LastEpisode(0, None, 0, False),) * copies, nothing, attributes=(), obs=(), memory=())
 

@@ -64,7 +64,7 @@ class Hello(Message, frozen=True, array_like=False):  # a map, as in every versi
 
     @property
     def is_first_attempt(self) -> bool:
-        """Whether the process has joined nowhere before."""
+        """Whether the process has not joined before."""
         return self.attempt <= self.process_nonce + 1
 
 
@@ -130,7 +130,7 @@ class Permit(msgspec.Struct, frozen=True, array_like=True):
     """with sequence 0: what to continue. None: new episodes begin, as the first ones of the lane do (rule PAST)"""
 
     def of_new_episodes(self, copies: int) -> Permit:
-        """The ticket, for a lane of so many copies that begin new episodes after their first ones."""
+        """The ticket, for a lane of this many copies that begin new episodes after their first ones."""
         return msgspec.structs.replace(self, past=LanePast.unknown(self.lane, copies))
 
 
@@ -159,7 +159,7 @@ class Collect(Message, frozen=True):
 
     @property
     def versions(self) -> set[int]:
-        """Those of the weights that it names."""
+        """The versions of the weights that it names."""
         return versions_of(self.version, [permit.opponent for permit in self.permits])
 
 
@@ -291,7 +291,7 @@ class Evaluate(Message, frozen=True):
 
     @property
     def versions(self) -> set[int]:
-        """Those of the weights that it names."""
+        """The versions of the weights that it names."""
         return versions_of(self.version, self.opponents)
 
 

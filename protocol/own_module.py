@@ -1,7 +1,7 @@
-"""Imports what a setting of the user names, as `module:name`: an algorithm, a callback, a policy, an encoder, a wrapper.
+"""Imports the object that a setting names as `module:name`: an algorithm, a callback, a policy, an encoder, a wrapper.
 
-Rule: whatever is wrong is one line that quotes the setting. What the user's code raised has its traceback as detail; a
-package that is missing needs none.
+Rule: each error is one line that quotes the setting. If user code raised, its traceback is the detail; a missing package
+needs none.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def own_callable(name: str, what: str, example: str) -> Callable[..., Any]:
 
 
 def import_own(module: str, what: str) -> ModuleType:
-    """Import a module. `what`: as of `own_callable`. Raises `UsageError`."""
+    """Import a module. `what`: see `own_callable`. Raises `UsageError`."""
     try:
         return importlib.import_module(module)
     except ModuleNotFoundError as error:
@@ -51,7 +51,8 @@ def import_own(module: str, what: str) -> ModuleType:
 def refuse_modules_in(folder: Path, names: Iterable[str]) -> None:
     """Raise `UsageError` if one of these names, as `module:name`, would be imported from this folder, a run folder.
 
-    Such a folder may come from a stranger, and what it names is imported; so nothing is imported from the folder itself.
+    Such a folder may come from a stranger, and modules that it names are imported; so nothing is imported from the folder
+    itself.
     """
     inside = folder.resolve()
     entries = [
@@ -69,13 +70,13 @@ def refuse_modules_in(folder: Path, names: Iterable[str]) -> None:
                 is_inside = entry.joinpath(*parts).is_relative_to(inside)
             if is_inside:
                 raise UsageError(
-                    f"run {folder}: {one_line(name, 200)} would be imported from the run folder, and nothing is; if you "
+                    f"run {folder}: {one_line(name, 200)} would be imported from the run folder, which is refused; if you "
                     "trust that module, put it into a folder of your own"
                 )
 
 
 def callable_of(module: ModuleType, qualname: str, what: str) -> Callable[..., Any]:
-    """The function or class that a module has under this name. `what`: as of `own_callable`. Raises `UsageError`."""
+    """The function or class that a module has under this name. `what`: see `own_callable`. Raises `UsageError`."""
     named = attribute(module, qualname)
     if named is None:
         known = [name for name, value in vars(module).items() if callable(value) and not name.startswith("_")]
@@ -87,7 +88,7 @@ def callable_of(module: ModuleType, qualname: str, what: str) -> Callable[..., A
 
 
 def own_code_failed(what: str, error: BaseException) -> UsageError:
-    """The error for what the user's code raised."""
+    """The error for an exception of user code."""
     return UsageError(f"{what} failed: {_why(error)}", "".join(traceback.format_exception(error)))
 
 

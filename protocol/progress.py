@@ -1,7 +1,7 @@
-"""How far a run is: one record, which the learner answers with, writes into the run folder, and shows. Pure.
+"""How far a run is: one record that the learner sends, writes into the run folder, and shows. Pure.
 
-Rule: it is plain data of bounded size, so that it can be sent, and read from a folder that may come from a stranger. Whoever
-tells people how far a run is renders this record, and counts nothing of its own.
+Rule: it is plain data of bounded size, so that it can be sent, and read from a folder that may come from a stranger.
+Everything that shows how far a run is renders this record, and counts nothing itself.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ class RunProgress(msgspec.Struct, frozen=True, kw_only=True):
     at_s: Moment = 0.0
     """when this was so; 0 if that is not known"""
     env_steps: Natural = 0
-    """env steps that updates have used so far, those before a resume included"""
+    """env steps that updates have used so far, including those before a resume"""
     collected: Natural = 0
     """env steps of the rollouts that the learner waits for, as workers report them; 0 while it waits for none"""
     total_steps: Natural = 0
-    """env steps to train for; 0 for what has no end: a learner of one's own, or a vector environment"""
+    """env steps to train for; 0 if there is no end: your own learner, or a vector environment"""
     updates: Natural = 0
-    """updates made so far, those before a resume included"""
+    """updates made so far, including those before a resume"""
     wall_s: Figure = 0.0
-    """seconds of training, those before a resume included; evaluations do not count"""
+    """seconds of training, including those before a resume; evaluations do not count"""
     steps_per_s: Figure = 0.0
     """env steps per second of training since this process started, `collected` included"""
     return_mean: Real | None = None
@@ -45,12 +45,12 @@ class RunProgress(msgspec.Struct, frozen=True, kw_only=True):
     stages: dict[Name, Figure] = {}
     """seconds that the learner, and all workers together, have spent in each stage so far"""
     phase: Name = ""
-    """what the learner does: starting, gathering rollouts, learning, or evaluating; empty if that is not known"""
+    """what the learner is doing: starting, gathering rollouts, learning, or evaluating; empty if that is not known"""
     waiting: Line = ""
     """who waits for whom, and for what share of the time, or how far an evaluation is: "evaluating for 41 s: 37 of 100
     episodes (…"; empty if nobody waits long"""
     stop_reason: Line = ""
-    """why the run ended; empty while it goes on"""
+    """why the run ended; empty while it continues"""
     cut_short: bool = False
     """whether an error or an interrupt ended it"""
 
@@ -61,7 +61,7 @@ class RunProgress(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def share(self) -> float:
-        """How much of the run is done, from 0 to 1; 0 for what has no end."""
+        """How much of the run is done, from 0 to 1; 0 if there is no end."""
         return min(1.0, self.env_steps_made / self.total_steps) if self.total_steps else 0.0
 
     @property

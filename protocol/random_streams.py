@@ -1,8 +1,8 @@
-"""Where all random numbers come from: each stream is derived from a seed, by its purpose. Pure; imports no torch.
+"""All random streams: each is derived from a seed and its purpose. Pure; imports no torch.
 
 Law: streams of one seed never share a purpose and indices, and none is the stream of the seed itself, because each has a
-spawn key of numpy's `SeedSequence`. gymnasium's environments draw from the seed itself (`np_random`). So what chooses
-actions, or decides what is learned from, is independent of what the environment draws, also where both have the same seed.
+spawn key of numpy's `SeedSequence`. gymnasium's environments draw from the seed itself (`np_random`). So the random numbers
+that choose actions, or rows to learn from, are independent of the environment's, even if both have the same seed.
 """
 
 from __future__ import annotations
@@ -13,7 +13,10 @@ import numpy as np
 
 
 class Purpose(IntEnum):
-    """What a stream is for, and its indices. The numbers decide the bits of every run: a new purpose takes a new number."""
+    """What a stream is for, and its indices.
+
+    The numbers determine the bits of every run: a new purpose gets a new number.
+    """
 
     WEIGHTS = 1
     """initial weights, except those of an encoder"""
@@ -22,7 +25,7 @@ class Purpose(IntEnum):
     SHUFFLES = 3
     """which rows make a minibatch"""
     NOISE = 4
-    """of SAC's actions and TD3's target actions in a gradient step"""
+    """noise of SAC's actions and TD3's target actions in a gradient step"""
     REPLAY = 5
     """what is drawn from a replay buffer"""
     PRIOR = 6
@@ -79,7 +82,7 @@ class RoundStreams:
 
 
 def env_seed(seed: int, purpose: Purpose, *indices: int) -> int:
-    """A reset seed, 31 bits, because environments pass seeds to C. Those of different indices differ in practice."""
+    """A reset seed, 31 bits, because environments pass seeds to C. Seeds of different indices differ in practice."""
     return int(_sequence(seed, purpose, indices).generate_state(1)[0] >> 1)
 
 

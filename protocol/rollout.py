@@ -1,19 +1,19 @@
 """The row format. Pure: arrays in, arrays out.
 
-Row t says: in `obs[t]` we did `action[t]`, got `reward[t]` and saw `obs[t+1]`, wherever `valid[t]`. This is gymnasium's
-NEXT_STEP autoreset: the step after an episode's end only resets that copy, so its row holds no transition and is not valid.
-Hence, for every copy:
+Row t says: in `obs[t]` the policy took `action[t]`, got `reward[t]` and saw `obs[t+1]`, wherever `valid[t]`. This is
+gymnasium's NEXT_STEP autoreset: the step after an episode's end only resets that copy, so its row holds no transition and is
+not valid. Hence, for every copy:
 
     valid[t+1]  ==  not (terminated[t] or truncated[t])
 
 If both flags are set, terminated wins. Every consumer (returns, losses, counts, replay buffer) masks with `valid`.
 
 With several agents, a column is one seat of a copy (`millrace.protocol.envs.seats`), and more rows are not valid: those of a
-seat that waits for others, or is not there. A seat's row is the one in which its outcome comes: until then `obs` shows the
-observation in which the seat acted, and `action` and `log_prob` what it did, and the row after it shows what it saw next.
-So the sentence above holds for every valid row, and one rule is added: *a row that is not valid passes through*. What is
-carried from a seat's row to its next one, a return or a recurrent state, is not changed by the rows between. `ended` cuts,
-as ever. `resets` says which steps only reset the copy:
+seat that waits for others, or isn't present. A seat's row is the one in which its outcome arrives: until then `obs` shows
+the observation in which the seat acted, and `action` and `log_prob` its action, and the row after it shows its next
+observation. So the sentence above holds for every valid row, and one rule is added: *a row that is not valid passes
+through*. Rows between a seat's row and its next one don't change what is carried over, such as a return or a recurrent
+state. `ended` cuts, as always. `resets` says which steps only reset the copy:
 
     an ended row is valid, and no later row of that seat is until its copy is reset
     a step that resets has no valid row
@@ -103,7 +103,7 @@ class Rollout(msgspec.Struct, frozen=True, tag=True, array_like=True, forbid_unk
 def _env_steps(valid: Array, resets: Array | None) -> int:
     if resets is None:
         return int(np.count_nonzero(valid))
-    return int(np.count_nonzero(np.atleast_1d(resets)[:-1] == 0))  # a rollout that was not checked may have any shape
+    return int(np.count_nonzero(np.atleast_1d(resets)[:-1] == 0))  # an unchecked rollout may have any shape
 
 
 def rollout_bytes(run: RunSpec) -> int:
@@ -122,9 +122,9 @@ def rollout_bytes(run: RunSpec) -> int:
 
 
 def memory_bytes(run: RunSpec) -> int:
-    """Number of bytes of `Rollout.memory`, at most, without the states that environments have saved.
+    """Largest number of bytes of `Rollout.memory`, without the states that environments have saved.
 
-    Without seats, it is exactly that, if the worker can continue a lane.
+    Without seats, it is the exact number, if the worker can continue a lane.
     """
     if run.teams:
         return 0
@@ -159,7 +159,8 @@ class Batch(msgspec.Struct, frozen=True):
     """[ΣN] True where no state carries over from an earlier rollout: the column's lane has just been started, or a rollout
     between the two was not used"""
     columns_per_rollout: int
-    """N, with seats N · A: each lane has so many adjacent columns, or a multiple if the batch has several of its rollouts"""
+    """N, with seats N · A: number of adjacent columns of each lane, or a multiple if the batch has several of its rollouts
+    """
     episodes: tuple[Episode, ...]
     extras: tuple[Array, ...] = ()
     """one array [T, ΣN, *shape] for each of `RunSpec.extras`"""
@@ -175,15 +176,15 @@ class Batch(msgspec.Struct, frozen=True):
 
 
 def _by_column(flags: bool | Bools, columns: int) -> Bools:
-    """One flag, or [N] one for each env copy, for each of its columns."""
+    """The flags by column, from a single flag or from one [N] for each env copy."""
     return np.repeat(np.atleast_1d(flags), columns // np.size(flags))
 
 
 def stack_rollouts(rollouts: Sequence[Rollout], fresh: Sequence[bool | Bools] | None = None) -> Batch:
-    """Copy rollouts into one writable batch [T, ΣN], in lane order; those of one lane stay in the order they came in.
+    """Copy rollouts into one writable batch [T, ΣN], in lane order; rollouts of one lane stay in the given order.
 
-    `fresh`: for each rollout, whether nothing carries over from an earlier one, or [copies] for each env copy; None: that is
-    so for the first of a lane.
+    `fresh`: for each rollout, whether nothing carries over from an earlier one, or [copies] for each env copy; None: True
+    for the first of a lane.
     """
     if fresh is None:
         fresh = [rollout.sequence == 0 for rollout in rollouts]
@@ -194,7 +195,7 @@ def stack_rollouts(rollouts: Sequence[Rollout], fresh: Sequence[bool | Bools] | 
         return np.concatenate(arrays, axis=1)
 
     def side_by_side_if_any(arrays: Sequence[Array | None]) -> Array | None:
-        """All rollouts of a run have the array, or none has."""
+        """The joined array: either all rollouts of a run have it, or none."""
         return None if arrays[0] is None else side_by_side([array for array in arrays if array is not None])
 
     columns_per_rollout = ordered[0].reward.shape[1]

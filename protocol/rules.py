@@ -27,12 +27,12 @@ _END = re.compile(r"\n\s*\n|\n(?=\s*(?:- |\d+\. |\|))| \|(?=\s)|\Z")
 
 
 class Words(NamedTuple):
-    """What the document says of a rule."""
+    """The text of a rule in the document."""
 
     section: str
-    """the heading below which it stands"""
+    """the heading above it"""
     text: str
-    """in one line; an ellipsis stands for what is left out between two parts"""
+    """in one line; an ellipsis stands for omitted text between two parts"""
 
     @property
     def where(self) -> str:
@@ -217,7 +217,7 @@ class Rule(Enum):
 
     @property
     def words(self) -> Words:
-        """What the document says of it."""
+        """Its text in the document."""
         return in_document()[self.name]
 
 
@@ -241,6 +241,6 @@ def in_document() -> dict[str, Words]:
 
 
 def _plain(text: str) -> str:
-    """A part of the document in one line, without marks of bold words, links, and what ends the sentence."""
+    """A part of the document in one line, without bold markers, links, and the punctuation at its end."""
     unlinked = re.sub(r"\[([^]]+)\]\(#[^)]*\)", r"\1", text.replace("**", ""))
     return " ".join(unlinked.split()).rstrip(".;,:")

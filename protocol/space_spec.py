@@ -1,7 +1,7 @@
-"""An environment as plain data: its spaces with exact bounds, its metadata and its time limit. It travels in `Described`.
+"""An environment as plain data: its spaces with exact bounds, its metadata and its time limit. It is sent in `Described`.
 
-Rule: sizes are checked before anything of that size is allocated. `check_size` is called on what a peer sent, before the
-spaces are made.
+Rule: sizes are checked before anything of that size is allocated. `check_size` checks a peer's description before the spaces
+are made.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from millrace.protocol.arrays import Array
 from millrace.protocol.bounds import Count, Line, Name, Natural, Text, Whole
 from millrace.protocol.errors import BadMessage
 
-MAX_LEAVES = 48  # arrays of an observation: a rollout sends each in a frame of its own
+MAX_LEAVES = 48  # arrays of an observation: a rollout sends each in its own frame
 MAX_DEPTH = 8
 MAX_WRAPPERS = 1 << 8  # classes of an environment's wrappers
-MAX_SPACES = 1 << 12  # of an environment, those inside others included, if they have random generators
+MAX_SPACES = 1 << 12  # of an environment, including nested ones, if they have random generators
 MAX_SEATS = 1 << 10  # agents of an environment
 MAX_ELEMENTS = 1 << 24  # of all leaves of a space together
 
@@ -124,7 +124,7 @@ def check_size(description: EnvDescription) -> None:
 
 
 def check_space(name: str, space: SpaceSpec) -> None:
-    """The same for one space, which messages call `name`."""
+    """Like `check_size`, for one space, which errors call `name`."""
     leaves = list(_leaves(space, 0))
     if len(leaves) > MAX_LEAVES:
         raise BadMessage(f"{name}: expected at most {MAX_LEAVES} arrays, got {len(leaves)}")

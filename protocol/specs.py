@@ -1,4 +1,4 @@
-"""Plain data that describe a run: spaces, policy, and how much to collect. They travel in `Welcome`."""
+"""Plain data that describe a run: spaces, policy, and how much to collect. They are sent in `Welcome`."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from millrace.protocol.env_spec import AllowedCode, EnvSpec, PickledCallable, Sc
 from millrace.protocol.space_spec import Shape
 from millrace.protocol.wire.weight_dtypes import ActingDtype
 
-WIDE_DTYPES = frozenset({"float64", "int32", "uint32", "int64", "uint64"})  # those of more than float32's 24 bits
+WIDE_DTYPES = frozenset({"float64", "int32", "uint32", "int64", "uint64"})  # with more than float32's 24 bits
 MIN_IMAGE_SIDE = 5  # pixels: a 3 x 3 convolution, then one with stride 2
 HEARTBEAT_S = 1.0  # between two heartbeats of a worker, unless the learner wants them more often
 
@@ -36,12 +36,12 @@ class Leaf(msgspec.Struct, frozen=True):
 
     @property
     def name(self) -> str:
-        """As errors name it."""
+        """Its name in errors."""
         return f"observation {self.path}".strip()
 
     @property
     def is_wide(self) -> bool:
-        """Whether it is a Box of numbers that float32 may not tell apart, such as a time in seconds since 1970."""
+        """Whether it is a Box of numbers that float32 may not distinguish, such as a time in seconds since 1970."""
         return self.kind == "box" and self.dtype in WIDE_DTYPES
 
     @property
@@ -56,7 +56,7 @@ class Leaf(msgspec.Struct, frozen=True):
 
     @property
     def has_channels_last(self) -> bool:
-        """Of an image: whether its last dimension holds the channels. It does, unless it is larger than the first."""
+        """Whether an image's last dimension has the channels. It does, unless it is larger than the first."""
         return self.shape[2] <= self.shape[0]
 
 
@@ -102,12 +102,12 @@ class ActionSpec(msgspec.Struct, frozen=True):
 
     @property
     def in_words(self) -> str:
-        """As errors name it."""
+        """Its name in errors."""
         return "a Dict or Tuple" if self.kind == "mixed" else f"{self.kind}{list(self.shape)}"
 
     @property
     def choices(self) -> int:
-        """How many choices all its entries have together: the number of their logits, and the length of a mask."""
+        """How many choices all its entries have together, which is the number of logits and the length of a mask."""
         return sum(self.sizes)
 
     @property
@@ -189,7 +189,7 @@ class PolicySpec(msgspec.Struct, frozen=True):
 
     @property
     def seen(self) -> tuple[Leaf, ...]:
-        """All arrays of an observation that rows hold."""
+        """All arrays of an observation in rows."""
         return (*self.observation, *self.critic)
 
     @property
@@ -291,7 +291,7 @@ class RunSpec(msgspec.Struct, frozen=True, tag=True):
 
     @property
     def sent_seats(self) -> int:
-        """How many seats of each copy a rollout has the rows of."""
+        """How many seats of each copy have rows in a rollout."""
         return len(self.teams[0]) if self.teams else self.seats_of_copy
 
     @property
@@ -305,33 +305,36 @@ class RunSpec(msgspec.Struct, frozen=True, tag=True):
 
     @property
     def info_keys(self) -> tuple[str, ...]:
-        """The facts that an environment reports. Those after them are counted: the score, or the returns of the seats."""
+        """The facts that an environment reports. The later ones are computed: the score, or the returns of the seats."""
         counted = 1 if self.teams else len(self.seats) if self.has_seat_returns else 0
         return self.facts[: len(self.facts) - counted]
 
     @property
     def has_seat_returns(self) -> bool:
-        """Whether the return of each seat is a fact of an episode: where there are not too many."""
+        """Whether the return of each seat is a fact of an episode, which it is unless there are too many."""
         return bool(self.seats) and self.facts[-len(self.seats) :] == seat_returns(self.seats)
 
     @property
     def seats_of_copy(self) -> int:
-        """A, 1 for an environment of gymnasium's."""
+        """A; 1 for a gymnasium environment."""
         return max(1, len(self.seats))
 
     @property
     def row_axes(self) -> tuple[str, str | tuple[str, ...]]:
-        """The axes of the rows of a rollout, as errors name them (`millrace.protocol.rows.array_checks`)."""
+        """The axes of the rows of a rollout, for errors (`millrace.protocol.rows.array_checks`)."""
         return "step", self.seats or "copy"
 
     @property
     def sent_axes(self) -> tuple[str, str | tuple[str, ...]]:
-        """Those of the rows that are sent. With teams, a column is of one seat in one copy and of another in the next."""
+        """The axes of the rows that are sent.
+
+        With teams, a column belongs to one seat in one copy and to another in the next.
+        """
         return ("step", "column") if self.teams else self.row_axes
 
     @property
     def policy_code(self) -> tuple[str, ...]:
-        """The user's callables that make policies, or parts of them, in the workers: as errors name them."""
+        """The user-defined callables that make policies, or parts of them, in the workers, by their names in errors."""
         called = [("encoder", self.policy.encoder), ("policy", self.policy.own)]
         if self.opponent is not None:
             called.append(("encoder", self.opponent.encoder))
@@ -402,12 +405,12 @@ class StepSpec(msgspec.Struct, frozen=True, tag=True):
 
     @property
     def seats_of_copy(self) -> int:
-        """A, 1 for environments of gymnasium's."""
+        """A; 1 for gymnasium environments."""
         return max(1, len(self.seats))
 
     @property
     def leaves(self) -> tuple[Leaf, ...]:
-        """What the arrays `Stepped.obs` hold."""
+        """The leaves of the arrays in `Stepped.obs`."""
         return (*self.observation, *(SEAT_LEAVES if self.seats else ()))
 
     def rows(self, lane: int) -> slice:

@@ -16,12 +16,12 @@ class TokenBucket:
         self._filled_s: float | None = None
 
     def holds(self, tokens: float, now: float) -> bool:
-        """Whether so many tokens can be spent at `now`, in seconds of a clock that never goes back."""
+        """Whether this many tokens can be spent at `now`, in seconds of a clock that never goes back."""
         if self._filled_s is not None:
             self._tokens = min(self._most, self._tokens + (now - self._filled_s) * self._per_s)
         self._filled_s = now
         return self._tokens >= tokens
 
     def spend(self, tokens: float) -> None:
-        """Spend so many tokens. Ask `holds` first."""
+        """Spend this many tokens. Ask `holds` first."""
         self._tokens -= tokens

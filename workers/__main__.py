@@ -30,7 +30,7 @@ log = logging.getLogger("millrace.worker")
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run workers, one or with --processes many. Returns the exit code. Raises `UsageError` for words that are no flags."""
+    """Run workers, one or with --processes many. Returns the exit code. Raises `UsageError` for words that aren't flags."""
     flags = parse_flags(WorkerFlags, sys.argv[1:] if argv is None else argv, "worker")
     shown = one_line(flags.called, MAX_NAME)
     logging.basicConfig(
@@ -51,7 +51,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _check(flags: WorkerFlags) -> None:
-    """Raise `UsageError` for a flag that no worker can follow."""
+    """Raise `UsageError` for a flag that no worker can obey."""
     if flags.address.startswith("inproc://"):
         raise UsageError(f"address {flags.address}: expected ipc://PATH or tcp://HOST:PORT; inproc reaches no other process")
     check_worker_name(flags.called if flags.processes == 1 else f"{flags.called}-w{flags.processes - 1}")
@@ -60,7 +60,7 @@ def _check(flags: WorkerFlags) -> None:
 
 
 def _supervise(flags: WorkerFlags, token: Token | None, signals: list[int]) -> int:
-    """Run workers, each in a process of its own, and watch them here. Returns the exit code."""
+    """Run workers, each in its own process, and watch them here. Returns the exit code."""
     cores = sorted(os.sched_getaffinity(0)) if flags.pin else []
     passed = ["--join-timeout-s", str(flags.join_timeout_s)]
     passed += [f"--{flag.replace('_', '-')}" for flag in ("stay", "evaluate", "insecure", "no_code") if getattr(flags, flag)]

@@ -1,8 +1,9 @@
-"""How the actions of a rollout are chosen: by a policy of ours, for all lanes in one pass, or by the user's own.
+"""How the actions of a rollout are chosen: by a built-in policy, for all lanes in one pass, or by a user-defined one.
 
-Rule: the actions of a lane depend on its observations, state and random generator, and not on the other lanes. A call of the
-user's code is named on the worker's page (`workers/activity.py`), so that it has a timeout; policies of ours are not slowed.
-In a masked run, the last array of an observation is the mask of the allowed actions (`millrace.protocol.policy.masks`).
+Rule: the actions of a lane depend on its observations, state and random generator, and not on the other lanes. Calls of user
+code are recorded on the worker's page (`workers/activity.py`), so that they have a timeout; this doesn't slow built-in
+policies. In a masked run, the last array of an observation is the mask of the allowed actions
+(`millrace.protocol.policy.masks`).
 """
 
 from __future__ import annotations
@@ -40,12 +41,12 @@ class StepActions(Protocol):
     def act(self, t: int, obs: Sequence[Array], state: Floats) -> Array:
         """Choose the actions [L, N, *action] of step t in observations [L, N, *leaf]. Updates state [L, N, S].
 
-        The array is new: who gets it may change it.
+        The array is new: the caller may change it.
         """
         ...
 
     def written(self, i: int) -> list[Array]:
-        """All arrays [T, N, …] of lane i in which `act` keeps what it chose, one row for each step."""
+        """All arrays [T, N, …] of lane i in which `act` keeps its results, one row for each step."""
         ...
 
 
@@ -53,7 +54,7 @@ class RolloutActions(StepActions, Protocol):
     """The actions of one rollout of each of L lanes, which are kept."""
 
     def columns(self, i: int) -> ActedRows:
-        """After T steps: those of lane i."""
+        """The columns of lane i after T steps."""
         ...
 
 
@@ -65,7 +66,7 @@ class Acting(Protocol):
         ...
 
     def begin(self, generators: Sequence[np.random.Generator]) -> RolloutActions:
-        """Begin a rollout of the lanes whose random generators these are."""
+        """Begin a rollout of the lanes that have these random generators."""
         ...
 
     def choose(self, obs: Sequence[Array], state: Floats, generator: np.random.Generator, *, greedy: bool) -> Array:
@@ -81,7 +82,7 @@ def acting_of(run: RunSpec, policy: Policy | CalledPolicy) -> Acting:
 
 
 class _EncodingPolicy:
-    """A policy of ours whose encoder is the user's: a call is named on the page, and what it raises is the policy's."""
+    """A built-in policy with a user-defined encoder: calls are recorded on the page, and its errors are the policy's."""
 
     def __init__(self, encoder: str, policy: Policy) -> None:
         self._encoder = encoder
@@ -101,7 +102,7 @@ class _EncodingPolicy:
 
 
 class _BuiltInActing:
-    """A policy of ours. The noise of a whole rollout is drawn in one call, and so are the log-probabilities computed."""
+    """A built-in policy. One call draws the noise of a whole rollout, and one computes its log-probabilities."""
 
     def __init__(self, run: RunSpec, policy: Policy) -> None:
         self.run = run
@@ -157,7 +158,7 @@ class _BuiltInActions:
 
 
 class _OwnActing:
-    """A policy of the user's, called once for each lane."""
+    """A user-defined policy, called once for each lane."""
 
     def __init__(self, run: RunSpec, policy: CalledPolicy) -> None:
         self.run = run

@@ -1,12 +1,12 @@
-"""What a worker does, in a page of memory that it shares with its supervisor.
+"""What a worker is doing, in a page of memory that it shares with its supervisor.
 
-Rule: each number has one writer. The worker writes what it does, since when, and how many calls of the environment have
-returned; when a learner welcomes it, how long the run lets a call take; before it leaves on purpose, its exit code. The
-supervisor only reads. So it sees what a worker does also while a C extension holds the worker's interpreter lock. The memory
-is an unlinked file that a child process inherits. Behind the page, the worker's stacks are written when the supervisor asks
-for them by a signal.
+Rule: each number has one writer. The worker writes what it is doing, since when, and how many calls of the environment have
+returned; when a learner welcomes it, how long a call may take; before it leaves on purpose, its exit code. The supervisor
+only reads. So it sees what a worker is doing even while a C extension holds the worker's interpreter lock. The memory is an
+unlinked file that a child process inherits. The worker's stacks are written behind the page when the supervisor asks for
+them by a signal.
 
-A worker in a thread has a page of its own that nobody shares.
+A worker in a thread has its own page, which isn't shared.
 """
 
 from __future__ import annotations
@@ -61,20 +61,20 @@ class Activity:
             faulthandler.register(STACK_SIGNAL, file=fd, all_threads=True)
 
     def begin(self, doing: int) -> None:
-        """From now on, the worker does this. The time is written first, so that no reader sees the new activity with the
+        """Record that the worker now does this. The time is written first, so that no reader sees the new activity with the
         time of the old one.
         """
         self.seconds[SINCE_S] = perf_counter()
         self.numbers[DOING] = doing
 
     def end(self, calls: int = 1) -> None:
-        """So many calls of the environment have returned; the worker runs its own code again."""
+        """Record that this many calls of the environment have returned, and that the worker runs its own code again."""
         self.numbers[ENV_CALLS] += calls
         self.begin(WAITING)
 
     @contextmanager
     def during(self, doing: int) -> Iterator[None]:
-        """Within it, the worker makes one call of the environment, or of a policy; perhaps within another one."""
+        """While it is entered, the worker makes one call of the environment or of a policy; may be nested."""
         before = self.numbers[DOING]
         self.begin(doing)
         try:
@@ -85,12 +85,12 @@ class Activity:
                 self.begin(before)
 
     def limit(self, timeouts: CallTimeouts) -> None:
-        """From now on, a call of the user's code may take so long. Before, it may take any time."""
+        """Set how long a call of user code may take from now on. Before, it may take any time."""
         self.seconds[START_TIMEOUT_S] = timeouts.start_s
         self.seconds[STEP_TIMEOUT_S] = timeouts.step_s
 
     def leave(self, exit_code: int) -> None:
-        """The worker is about to leave on purpose, with this exit code."""
+        """Record that the worker is about to leave on purpose, with this exit code."""
         self.seconds[LEAVES_SINCE_S] = perf_counter()
         self.numbers[LEAVES] = exit_code + 1
 
@@ -107,22 +107,22 @@ def activity() -> Activity:
 
 
 def share_activity(page: Activity) -> None:
-    """The worker that runs in this thread writes to this page. Call it before it makes anything."""
+    """Let the worker in this thread write to this page. Call this before it makes anything."""
     _of_thread.activity = page
 
 
 class Reading(NamedTuple):
-    """What a page says at one moment."""
+    """The content of a page at one moment."""
 
     doing: Doing
     for_s: float
     env_calls: int
     exit_code: int | None
-    """with which the worker leaves on purpose; None if it does not"""
+    """exit code with which the worker leaves on purpose; None if it doesn't"""
     leaves_for_s: float
     """seconds since it began to leave"""
     timeouts: CallTimeouts
-    """of its run"""
+    """the timeouts of its run"""
 
 
 class ActivityReader:
@@ -142,8 +142,8 @@ class ActivityReader:
             self._seconds = page.seconds
 
     def read(self, now: float) -> Reading:
-        """What the worker does. Environment code can write to the page, so every value is made to fit its bounds."""
-        timeouts = self.timeouts()  # before what it does: a call never counts by the limits of a later run
+        """What the worker is doing. Environment code can write to the page, so every value is forced into its bounds."""
+        timeouts = self.timeouts()  # read before the activity, so that a call is never judged by the limits of a later run
         code = self._numbers[DOING]  # before the time: see `Activity.begin`
         doing = DOINGS[code] if 0 <= code < len(DOINGS) else "waiting"
         leaves = self._numbers[LEAVES]
@@ -157,7 +157,7 @@ class ActivityReader:
         )
 
     def timeouts(self) -> CallTimeouts:
-        """How long a call may take in the worker's run; any time before it is welcomed to one."""
+        """How long a call may take in the worker's run; without limit before it is welcomed to a run."""
         return CallTimeouts(_limit_s(self._seconds[START_TIMEOUT_S]), _limit_s(self._seconds[STEP_TIMEOUT_S]))
 
     def stacks(self) -> str:

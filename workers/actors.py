@@ -1,6 +1,6 @@
-"""Those that act in the env copies of a run: the collector and the evaluator of a worker, under one policy.
+"""What acts in the env copies of a run: the collector and the evaluator of a worker, which share a policy.
 
-Rule: the policy holds the weights of the task that is done. They are loaded when another task comes with others.
+Rule: the policy has the weights of the current task. They are loaded when a task has other weights.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class Actors:
 
     @property
     def note(self) -> str:
-        """What whoever trains should know of the environment; empty if nothing."""
+        """What the user should know about the environment; empty if nothing."""
         return self._collector.note
 
     @property
@@ -80,6 +80,6 @@ MakeActors = Callable[[RunSpec], Actors]
 
 
 def make_local_actors(run: RunSpec) -> Actors:
-    """Actors with env copies of their own."""
+    """Actors with their own env copies."""
     policy = make_policy(run.policy, run.images_dtype) if run.policy.own is None else CalledPolicy(run.policy, run.extras)
     return Actors(Collector(run, policy), Evaluator(run, policy))

@@ -1,11 +1,11 @@
-"""The env copies that this process makes: which one it is making now, and the slots that they hold.
+"""The env copies that this process makes: which one is being made now, and their slots.
 
-Rule: a copy holds its slot from before it is made until after it was closed, so no two live copies have the same one. If
-its constructor raises, it may have started something: then the slot is free when the process and its children have ended.
+Rule: a copy holds its slot from before it is made until after it was closed, so no two live copies have the same one. If its
+constructor raises, it may have started a process: then the slot is free only when this process and its children have ended.
 
-Rule: a copy that was described, and has done nothing else, is the next one that its thread makes, if that would be the same.
-If not, it is closed first. A worker closes it, too, if it has made none for `UNUSED_S` of a run: it may be spare. So no
-worker has a copy for long that it does not need.
+Rule: a copy that was only described is reused as the next copy that its thread makes, if that one would be the same. If not,
+it is closed first. A worker also closes it if it has not made a copy for `UNUSED_S` of a run, because it may be spare. So no
+worker keeps a copy for long that it doesn't need.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ from millrace.protocol.errors import UsageError
 from millrace.workers.activity import CLOSING, activity
 from millrace.workers.machine_slots import slots
 
-UNUSED_S = 60.0  # since the run began: more workers may have to join before the first order comes
+UNUSED_S = 60.0  # since the run began: more workers may have to join before the first order arrives
 
-_slots: dict[int, int] = {}  # of this process's copies that are being made or are open, by their id
+_slots: dict[int, int] = {}  # slots of this process's open copies and the one being made, by id
 Made = TypeVar("Made")
 Dress = Callable[[Made, EnvCopy], Made]
-"""Takes a copy that was made, and which one it is. Returns what to use in its place, or raises."""
+"""Takes a copy and its identity. Returns what to use in its place, or raises."""
 
 
 @dataclass(frozen=True)
 class EnvMaker:
-    """Makes copies of an environment. Equal makers make equal copies, unless one asks which copy it is."""
+    """Makes copies of an environment. Equal makers make equal copies, unless a copy asks which one it is."""
 
     env: EnvSpec
     render_mode: str | None = None
@@ -48,20 +48,20 @@ class EnvMaker:
 
 @dataclass(frozen=True)
 class DescribedCopy:
-    """A copy that was described, and not reset or stepped."""
+    """A copy that was described, but not reset or stepped."""
 
     copy: gymnasium.Env[Any, Any]
     maker: EnvMaker
     asked: bool
-    """Whether it asked which copy it is: it was told that it is the first."""
+    """Whether it asked which copy it is, and was told that it is the first."""
 
     def is_as_new(self, which: EnvCopy, make: Callable[[], Any]) -> bool:
-        """Whether this copy, if it were made now, would be the same."""
+        """Whether making this copy now would give the same."""
         return make == self.maker and (which == FIRST_COPY or not self.asked)
 
 
 class _OfThread(threading.local):
-    described: DescribedCopy | None = None  # not used yet
+    described: DescribedCopy | None = None  # if not used yet
 
 
 _of_thread = _OfThread()
@@ -88,14 +88,14 @@ def close_described() -> None:
 
 
 def as_made(copy: Made, which: EnvCopy) -> Made:
-    """The copy as it was made: a `Dress`."""
+    """The copy itself: a `Dress` that changes nothing."""
     return copy
 
 
 def make_copy(which: EnvCopy, make: Callable[[], Made], dress: Dress[Made] = as_made) -> Made:
-    """The copy, dressed, with a slot of its own: what `make` returns, or in its place the one that was described.
+    """The copy, dressed, with its own slot: what `make` returns, or the described copy in its place.
 
-    If `dress` raises, the copy is closed. `give_back` frees the slot when the copy was closed.
+    If `dress` raises, the copy is closed. `give_back` frees the slot after the copy was closed.
     """
     described = _of_thread.described
     if described is not None and described.is_as_new(which, make):
@@ -123,7 +123,7 @@ def _made(which: EnvCopy, make: Callable[[], Made]) -> tuple[Made, bool]:
             _slots[id(made)] = _slots.pop(id(under_way))
             return made, under_way.asked
         finally:
-            _slots.pop(id(under_way), None)  # if it could not be made, its slot stays taken
+            _slots.pop(id(under_way), None)  # if making it failed, its slot stays taken
 
 
 def give_back(copy: object) -> None:
@@ -133,7 +133,7 @@ def give_back(copy: object) -> None:
 
 
 def close_copy(copy: Any) -> None:
-    """Close a copy; what it raises is ignored. Then its slot is free."""
+    """Close a copy, ignoring exceptions, and free its slot."""
     with suppress(BaseException), activity().during(CLOSING):
         copy.close()
     give_back(copy)
@@ -142,8 +142,8 @@ def close_copy(copy: Any) -> None:
 def env_copy() -> EnvCopy:
     """The copy that is being made now, for the constructor of an environment or a wrapper: ask there, and keep it.
 
-    In a program that makes an environment itself, it is copy 0, with a slot that the process holds until it ends. Raises
-    `UsageError` in a worker, and in a thread that the constructor starts, when this thread makes no copy.
+    In a program that makes an environment itself, it is copy 0, with a slot that the process holds until it ends. In a
+    worker, and in a thread that the constructor starts, raises `UsageError` if this thread isn't making a copy.
 
     >>> import millrace
     >>> millrace.env_copy().number
@@ -160,5 +160,5 @@ def env_copy() -> EnvCopy:
 
 @cache
 def _of_process(pid: int) -> EnvCopy:
-    """The copy of a process that makes its environment itself; a fork has another one."""
+    """The copy of a process that makes its environment itself; a fork has a different one."""
     return EnvCopy(slot=slots().take())

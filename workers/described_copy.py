@@ -1,7 +1,7 @@
 """Makes an env copy for a learner that does not know the environment yet, and describes it.
 
-Rule: the environment's code runs here and not in the learner. The copy is only made, and what it says of itself is read;
-then it waits to be used (`copy_slots.py`).
+Rule: the environment's code runs here and not in the learner. The copy is only made, and its attributes are read; then it is
+kept for later use (`copy_slots.py`).
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from millrace.workers.copy_slots import EnvMaker, close_copy, keep_described, ma
 def describe(order: Describe) -> EnvDescription:
     """The description of the environment. Its copy is kept for the next one that this thread makes.
 
-    Raises `UsageError`, with advice, if the environment cannot be what the learner asks for: its id is unknown, a package
-    is missing, or its spaces are not supported. Raises `EnvironmentFailed` for any exception of its own code, and for an
-    exit of the process that its code asks for.
+    Raises `UsageError`, with advice, if the environment doesn't meet the learner's request: its id is unknown, a package
+    is missing, or its spaces are not supported. Raises `EnvironmentFailed` for any exception of its own code, and if its
+    code tries to exit the process.
     """
     with _failures_of(order.env), activity().during(DESCRIBING):
         made = make_to_describe(EnvMaker(order.env, order.render_mode))
@@ -60,7 +60,7 @@ def _failures_of(env: EnvSpec) -> Iterator[None]:
 def _check_kind(order: Describe, env: gymnasium.Env[object, object]) -> None:
     """Raise `UsageError` unless the env copies that the learner asks for have the spaces of this single copy."""
     if isinstance(env, SeatedEnv):
-        return  # the learner refuses all but a loop
+        return  # the learner refuses anything but a loop
     spaces_of = copies_kind(order.vector).spaces
     if spaces_of is None:
         return

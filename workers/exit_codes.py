@@ -1,6 +1,6 @@
 """Exit codes that say why a worker left, besides 0 and 1. Only its supervisor sees the last two: others get 1 and 2.
 
-Which ends are final, and which workers are started again, the supervisor decides (`supervise/supervisor.py`).
+The supervisor decides which ends are final, and which workers are restarted (`supervise/supervisor.py`).
 """
 
 EXIT_REFUSED = 2

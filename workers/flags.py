@@ -21,7 +21,7 @@ class WorkerFlags(msgspec.Struct, frozen=True, kw_only=True):
     address: Annotated[str, Flag(positional=True)]
     """address of the learner: ipc://PATH or tcp://HOST:PORT"""
     processes: Annotated[int, Flag("N"), Meta(ge=1)] = 1
-    """start N workers, one process each; one that fails is restarted. Together they get each version of the weights once"""
+    """start N workers, one process each; failed ones are restarted. All together receive each version of the weights once"""
     name: str = ""
     """name of this worker, unique in the run; if not given, host name and process id"""
     stay: bool = False
@@ -39,8 +39,8 @@ class WorkerFlags(msgspec.Struct, frozen=True, kw_only=True):
     pin: bool = False
     """with --processes: pin each worker to one CPU core"""
     join_timeout_s: SecondsFlag = 60.0
-    """leave when no learner has answered for S seconds (with --stay: never); a worker that had joined waits for its learner
-    to come back, 600 s or S if that is longer
+    """leave if no learner has answered for S seconds (with --stay: never); a worker that has joined waits for its learner to
+    come back for S seconds, but at least 600 s
     """
 
     parent: Annotated[int, HIDDEN] = 0

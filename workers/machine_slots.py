@@ -1,15 +1,15 @@
-"""The slots of this machine: each env copy holds the lowest number that is free, for its port, folder or display.
+"""The slots of this machine: each env copy holds the lowest free number, for its port, folder or display.
 
 Rule: no two live env copies that use one file of slots have the same slot. A slot is a lock on one byte of this file, which
 stays empty. The lock belongs to an open file and not to a process, so a worker and its supervisor hold it together, and the
 kernel frees it when both are gone.
 
-Rule: each user of the machine has a file of their own, because whoever can write the file can lock all of it. Users who
-trust one another share one on purpose: they set `FILE_VARIABLE` to the same path. A search for a slot ends after `MOST`.
+Rule: each user of the machine has their own file, because anyone who can write the file can lock all of it. Users who trust
+one another can share one by setting `FILE_VARIABLE` to the same path. A search for a slot ends after `MOST`.
 
-Rule: with a limit K of this machine (`LIMIT_VARIABLE`), the slots are 0 to K - 1. A copy that finds none waits for
-`WAIT_S`; then its worker leaves the run, so that the learner can place its lanes elsewhere, and is started again when there
-is room.
+Rule: with a limit K of this machine (`LIMIT_VARIABLE`), the slots are 0 to K - 1. A copy that finds none free waits for
+`WAIT_S`; then its worker leaves the run, so that the learner can place its lanes elsewhere, and is restarted when a slot is
+free.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ log = logging.getLogger("millrace.worker")
 
 FILE_VARIABLE = "MILLRACE_SLOTS"
 LIMIT_VARIABLE = "MILLRACE_COPIES_PER_MACHINE"
-FILE = "/tmp/millrace-slots-{user}"  # not of $TMPDIR, which may differ between the processes of a user
+FILE = "/tmp/millrace-slots-{user}"  # not in $TMPDIR, which may differ between the processes of a user
 FLAGS = os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC  # a link is not followed, a FIFO does not block
 OWN = 0o600  # a mode
 SHARED = 0o666  # a mode
-MOST = 1 << 16  # slots of a file; there are as many ports
+MOST = 1 << 16  # slots of a file, as many as there are ports
 FLOCK = "hhqqi4x"  # struct flock on Linux: type, whence, start, length, process
 
 TOUCH_EVERY_S = 3600.0
@@ -51,10 +51,10 @@ class NoSlot(UsageError):
 
 
 class Slots:
-    """The slots that one process holds. Its threads may use it at the same time."""
+    """The slots that one process holds. Thread-safe."""
 
     def __init__(self, fd: int | None = None, most: int = 0) -> None:
-        """`fd`: the file, as the supervisor opened it. None: open it. Raises `UsageError` if that is not possible.
+        """`fd`: the file that the supervisor opened. None: open it. Raises `UsageError` if that fails.
 
         `most`: how many slots the machine has; 0: no limit.
         """
@@ -65,7 +65,7 @@ class Slots:
         self._lock = threading.Lock()
 
     def take(self) -> int:
-        """Hold the lowest number that is free on this machine, from 0. Give it back when the env copy is closed.
+        """Hold the lowest free number on this machine, from 0. Give it back when the env copy is closed.
 
         Raises `NoSlot` if none becomes free within `WAIT_S`, and `UsageError` if there is no limit and all are locked.
         """
@@ -88,7 +88,7 @@ class Slots:
         return slot
 
     def have_room(self, copies: int) -> bool:
-        """Whether so many slots are free now."""
+        """Whether this many slots are free now."""
         taken = [slot for _ in range(copies) if (slot := self._take_now()) is not None]
         for slot in taken:
             self.give_back(slot)
@@ -118,7 +118,7 @@ def slots() -> Slots:
     """The slots of this process."""
     if (own := _of_processes.get(os.getpid())) is None:
         opened = Slots(most=copies_per_machine())
-        if (own := _of_processes.setdefault(os.getpid(), opened)) is not opened:  # another thread was first
+        if (own := _of_processes.setdefault(os.getpid(), opened)) is not opened:  # another thread opened them first
             os.close(opened.fd)
     return own
 
@@ -141,7 +141,7 @@ def copies_per_machine() -> int:
 
 
 def slots_path() -> Path:
-    """The file that holds the slots of this process: the one that several users share on purpose, or this user's own."""
+    """The file with the slots of this process: one that several users share on purpose, or this user's own."""
     return Path(os.environ.get(FILE_VARIABLE) or FILE.format(user=os.geteuid()))
 
 
@@ -170,25 +170,25 @@ def open_slots() -> int:
 
 
 def free_all(fd: int) -> None:
-    """Free every slot that is held through this descriptor, also for those who share it, and close it."""
+    """Free every slot that is held through this descriptor, also for processes that share it, and close it."""
     _lock(fd, fcntl.F_UNLCK, 0, 0)
     os.close(fd)
 
 
 def touch(fd: int) -> None:
-    """Mark the file as used: what cleans /tmp deletes what is old, and then new processes would see no slot taken."""
+    """Mark the file as used: otherwise a cleaner of /tmp might delete it, and new processes would see no slot taken."""
     with suppress(OSError):
         if time.time() - os.fstat(fd).st_mtime > TOUCH_EVERY_S:
             os.utime(fd)
 
 
 def _owner(fd: int) -> str:
-    """Whose file this is."""
+    """The owner of the file, in words."""
     return _name(os.fstat(fd).st_uid)
 
 
 def _name(user: int) -> str:
-    """A user, by name where the system knows one."""
+    """A user, by name if the system knows one."""
     try:
         return f"user {pwd.getpwuid(user).pw_name}"
     except KeyError:
@@ -196,7 +196,7 @@ def _name(user: int) -> str:
 
 
 def _is_locked_by(fd: int, slot: int) -> bool:
-    """Lock this slot, unless somebody else holds it."""
+    """Lock this slot. False if another process holds it."""
     with suppress(BlockingIOError, PermissionError):
         _lock(fd, fcntl.F_WRLCK, slot, 1)
         return True
@@ -204,7 +204,7 @@ def _is_locked_by(fd: int, slot: int) -> bool:
 
 
 def _lock(fd: int, kind: int, start: int, length: int) -> None:
-    """Lock or free this range without waiting. Without open file locks (macOS, gVisor), the locks are the process's own."""
+    """Lock or free this range without waiting. Without open file locks (macOS, gVisor), the locks belong to the process."""
     if hasattr(fcntl, "F_OFD_SETLK"):
         try:
             fcntl.fcntl(fd, fcntl.F_OFD_SETLK, struct.pack(FLOCK, kind, os.SEEK_SET, start, length, 0))

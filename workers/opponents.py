@@ -1,8 +1,8 @@
-"""Who acts for the seats of the other teams: earlier weights of the policy, or a program of the user's.
+"""The players of the other teams' seats: earlier weights of the policy, or a user-defined program.
 
-Rule: in each env copy the policy plays one team, and one opponent all others, for whole episodes: another opponent comes
-where the copy is reset. So a lane keeps its opponents from rollout to rollout, although their weights may be asked for no
-more. An opponent draws its actions, from random numbers of the lane that no other choice uses.
+Rule: in each env copy the policy plays one team, and one opponent all others, for whole episodes: the opponent changes when
+the copy is reset. So a lane keeps its opponents from rollout to rollout, even if no ticket names their weights any more. An
+opponent samples its actions with random numbers of the lane that nothing else uses.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ from millrace.workers.activity import PREPARING, activity
 
 
 class Opponent:
-    """One opponent: a policy that acts, by the number that tickets have for it."""
+    """One opponent: a policy that acts, and the number that tickets have for it."""
 
     def __init__(self, run: RunSpec, number: int, weights: Weights | None) -> None:
-        """`weights`: those of this version; none for a program of the user's."""
+        """`weights`: the weights of this version; None for a user-defined program."""
         self.number = number
         if weights is None:
             spec = msgspec.structs.replace(run.policy, own=OwnPolicySpec(run.scripted[-1 - number], ()))
@@ -46,7 +46,7 @@ class Opponent:
 
 
 Opponents = Callable[[int], Opponent]
-"""The opponent of a number."""
+"""Finds the opponent with a number."""
 
 
 class KnownOpponents:
@@ -55,10 +55,10 @@ class KnownOpponents:
     def __init__(self, run: RunSpec) -> None:
         self._run = run
         self._known = WeakValueDictionary[int, Opponent]()
-        self._programs: list[Opponent] = []  # they stay, for making one may take long
+        self._programs: list[Opponent] = []  # they are kept, because making one may take long
 
     def among(self, weights: Mapping[int, Weights]) -> Opponents:
-        """How to find an opponent. `weights`: by version, of those that may be new."""
+        """A function that finds an opponent. `weights`: available weights by version, among them those of new opponents."""
 
         def find(number: int) -> Opponent:
             if (found := self._known.get(number)) is None:
@@ -73,10 +73,10 @@ class KnownOpponents:
 
 
 class Match(NamedTuple):
-    """Who plays in a copy."""
+    """Which team the policy plays in a copy, and against whom."""
 
     team: int
-    """that of the policy"""
+    """the policy's team"""
     opponent: Opponent
 
 
@@ -97,7 +97,7 @@ class OtherTeams:
         self._state = zero_state(run.opponent or run.policy, len(self.mine))  # [N · A, S]
 
     def act(self, obs: Sequence[Array], acts: Bools, taken: Array) -> None:
-        """Replace the actions `taken` [N · A, *action] of the seats of other teams that act."""
+        """Replace the actions `taken` [N · A, *action] of acting seats of other teams."""
         theirs = acts & ~self.mine
         for opponent in dict.fromkeys(match.opponent for match in self._matches):
             playing = np.repeat([match.opponent is opponent for match in self._matches], self._run.seats_of_copy)
@@ -108,17 +108,17 @@ class OtherTeams:
                 taken[columns] = opponent.to_env_action(chosen)
 
     def begin(self, copies: Collection[int], opponent: Opponent) -> None:
-        """Episodes of these copies begin, against this opponent."""
+        """Begin episodes of these copies against this opponent."""
         for n in copies:
             self._matches[n] = self._matches[n]._replace(opponent=opponent)
             self._state[n * self._run.seats_of_copy : (n + 1) * self._run.seats_of_copy] = 0.0
 
     def result(self, n: int, returns: Sequence[float]) -> tuple[float, float, int]:
-        """Of an episode of copy n, by the returns of its seats: the return of the policy's team, the score, the opponent."""
+        """The result of an episode of copy n, from its seats' returns: the return of the policy's team, score, opponent."""
         of_teams = [sum(returns[seat] for seat in team) for team in self._run.teams]
         own = of_teams[self._matches[n].team]
         best = max(of_teams)
-        score = 1 / of_teams.count(best) if own == best else 0.0  # of all teams the scores add up to 1
+        score = 1 / of_teams.count(best) if own == best else 0.0  # the scores of all teams add up to 1
         return own, score, self._matches[n].opponent.number
 
 

@@ -2,7 +2,7 @@
 
 Exit codes: 0 drained, asked to leave, or its supervisor has ended; EXIT_NO_LEARNER if no learner answered, EXIT_UNSUITABLE
 if it cannot take part in this run; 1 failed; 2 refused, or bad usage. The code is also written to the page that the
-supervisor reads: an end without that is a failure.
+supervisor reads: an exit without it counts as a failure.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from millrace.workers.worker import Worker, WorkerOptions, identity, parent_is_g
 LEAVE_AT_ONCE = 2  # requests to leave: the rollout in progress is abandoned
 LOOK_FOR_PARENT_S = 0.5
 LEAVE_ORPHANED_WITHIN_S = 2.0  # after the supervisor's death
-CLOSED_WITHIN_S = 1.0  # the sockets of a killed process
+CLOSED_WITHIN_S = 1.0  # until the sockets of a killed process are closed
 AFTER_SUPERVISOR_S = 60.0  # how much later than the supervisor the watchdog ends a worker that hangs
 
 
@@ -90,7 +90,7 @@ def _exit_code(code: int, reason: str) -> int:
 
 
 def _end_after_supervisor(parent: int, address: str) -> None:
-    """End this process if the supervisor is dead and the environment does not return, so that the worker cannot leave."""
+    """End this process if the supervisor is dead and the worker can't leave because the environment doesn't return."""
     while not parent_is_gone(parent):
         time.sleep(LOOK_FOR_PARENT_S)
     time.sleep(LEAVE_ORPHANED_WITHIN_S)
@@ -99,9 +99,9 @@ def _end_after_supervisor(parent: int, address: str) -> None:
 
 
 def _kill_own_session() -> None:
-    """End this process after all that its environment has started: the supervisor cannot do it any more.
+    """End everything that its environment has started, then this process, because the supervisor can't do it any more.
 
-    This process is the last one, because it alone holds the slots of its env copies now.
+    This process is ended last, because only it still holds the slots of its env copies.
     """
     if os.getpgrp() == os.getpid():
         sys.stderr.flush()
@@ -113,10 +113,10 @@ def _kill_own_session() -> None:
 
 
 def _remove_socket_of_killed_parent(address: str) -> None:
-    """Remove the socket, and the folder that the learner made for it: a killed learner could not.
+    """Remove the socket, and the folder that the learner made for it, because a killed learner could not.
 
     The parent may have been the supervisor of a `millrace worker`: then the learner lives, and the next worker needs it.
-    Linux gives the children of a killed process away before its last thread has freed the memory and closed the sockets.
+    Linux reparents the children of a killed process before its last thread has freed the memory and closed the sockets.
     """
     scheme, _, path = address.partition("://")
     if scheme == "ipc" and Path(path).parent.name.startswith("millrace-"):

@@ -1,12 +1,12 @@
-"""Weights that a supervisor gets once and all its workers read, in a file in memory that they inherit.
+"""Weights that a supervisor receives once for all its workers, in an in-memory file that they inherit.
 
-Rule: the file has a few places, which the supervisor, its only writer, fills in turn. The table at its beginning says what
-each holds: which version, and of which learner, by the first of that learner's sessions. So no worker takes the weights of
-another run, or of a learner that was there before, although versions begin at 0 again. An entry is cleared before its place
-is filled, and written after that: a reader that finds the same entry before and after it has read the place has all of it.
-Whatever a worker does not find, the learner sends to it directly.
+Rule: the file has a few places, which the supervisor, its only writer, fills in turn. The table at its beginning says which
+version each place has, and of which learner, identified by the learner's first session. So no worker takes the weights of
+another run or of an earlier learner, although versions begin at 0 again. An entry is cleared before its place is filled, and
+written afterwards: a reader that finds the same entry before and after reading the place has all of it. If a worker doesn't
+find weights, the learner sends them to it directly.
 
-Linux only; elsewhere every worker gets weights of its own. This file imports neither numpy nor gymnasium.
+Linux only; elsewhere the learner sends the weights to every worker. This file imports neither numpy nor gymnasium.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from millrace.protocol.alive import SHARED_VERSIONS
 from millrace.protocol.wire.wake_up import WakePipe
 
 SUPPORTED = hasattr(os, "memfd_create") and hasattr(os, "pipe2")
-PLACE_BYTES = 1 << 33  # more than any message has; only what was written takes memory
-FRAMES = 4  # of a message, at most
+PLACE_BYTES = 1 << 33  # more than the largest message; only written pages take memory
+FRAMES = 4  # most frames of a message
 ENTRY = struct.Struct("<7Q")  # first session, version, number of frames, their lengths
 SESSIONS = 1 << 24  # a learner has fewer; it draws the first of 2**48
 
 
 def is_of_learner(session: int, first_session: int) -> bool:  # rule SHARED_OF_LEARNER
-    """Whether this session is of the learner whose first session this is."""
+    """Whether this session belongs to the learner with this first session."""
     return 0 <= session - first_session < SESSIONS
 
 
@@ -39,13 +39,16 @@ class SharedWeights:
         self._next = 0  # place to fill
 
     def descriptors(self, worker: str) -> tuple[int, int]:
-        """What the worker of this name inherits: the file, and the end of a pipe which says that weights have come."""
+        """The descriptors that this worker inherits: the file, and the end of a pipe that signals new weights."""
         if worker not in self._pipes:
             self._pipes[worker] = WakePipe()
         return self._fd, self._pipes[worker].read_fd
 
     def write(self, first_session: int, version: int, frames: Sequence[bytes | memoryview]) -> None:
-        """Share this message. Raises `OSError` without memory, and `struct.error` for what is no message of weights."""
+        """Share this message.
+
+        Raises `OSError` if there is no memory, and `struct.error` if this isn't a message of weights.
+        """
         lengths = [*map(len, frames), *[0] * (FRAMES - len(frames))]
         entry = ENTRY.pack(first_session, version, len(frames), *lengths)
         place = self._next
@@ -74,10 +77,10 @@ class SharedWeightsReader:
         self._fd = fd
         self._wake = WakePipe(read_fd=wake_fd)
         self.wake_fd = wake_fd
-        """can be read when weights have come"""
+        """readable when weights have arrived"""
 
     def find(self, session: int, versions: Collection[int]) -> Iterator[list[bytes]]:
-        """The messages with these versions, of the learner that has this session: those that are there."""
+        """The available messages with these versions, from the learner of this session."""
         self._wake.wait(0.0)
         if not versions:
             return

@@ -2,8 +2,8 @@
 
 Rule: when nobody calls `feed` for as long as the run allows, the process writes the stack of each of its threads to stderr
 and exits at once with exit code 1. Its supervisor ends it before that (`end_if_hung` in `supervise/worker_process.py`),
-unless the supervisor is dead or the worker hangs in our own code. The timer is a C thread of Python's faulthandler: it works
-also while C code holds the interpreter's lock. Setting it takes about 50 µs, so `feed` does so only now and then.
+unless the supervisor is dead or the worker hangs in millrace's own code. The timer is a C thread of Python's faulthandler:
+it works even while C code holds the interpreter's lock. Setting it takes about 50 µs, so `feed` does so only now and then.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pathlib import Path
 FAULTHANDLER_HEADER = "Timeout ("  # first words of its output
 LONGEST_S = 1e9  # faulthandler refuses a longer time, such as infinity
 OURS = f"{Path(__file__).parents[1]}/"
-LIBRARIES = ("<", f"{sysconfig.get_path('stdlib')}/", OURS)  # how paths begin that are not the user's
+LIBRARIES = ("<", f"{sysconfig.get_path('stdlib')}/", OURS)  # beginnings of paths of code that isn't the user's
 INSTALLED = "-packages/"  # in the path of site-packages, and of Debian's dist-packages
 
 
@@ -26,7 +26,7 @@ class Watchdog:
     """A watchdog timer. One for each process, because faulthandler has only one timer."""
 
     def __init__(self, timeout_s: Callable[[], float]) -> None:
-        """`timeout_s`: after how long it ends the process, which is another time in another run; infinity: never."""
+        """`timeout_s`: returns after how long it ends the process, which depends on the run; infinity: never."""
         self._timeout_s = timeout_s
         self._set_to_s = math.inf
         self._due_s = -math.inf
@@ -60,7 +60,7 @@ def where_it_hung(log: str) -> str | None:
 def deepest_frame(stacks: str) -> str:
     """Where the main thread is, from the stacks of all threads that faulthandler wrote; empty if it wrote none.
 
-    This is the newest call in code of the user's own, which may wait for a library; if there is none, the newest call.
+    This is the newest call in the user's own code, which may wait for a library; if there is none, the newest call.
     """
     # In each stack the newest call comes first. The last stack is that of the main thread.
     each = re.split(r"^(?:Current )?[Tt]hread .*$", stacks, flags=re.MULTILINE)

@@ -1,8 +1,8 @@
-"""Runs a session: connects it with the link, with what steps env copies, and with signals. All decisions are the session's.
+"""Runs a session: connects it with the link, the env copies and signals. The session makes all decisions.
 
 Rule: the worker reads all messages before a rollout or an evaluation starts, and again between env steps, so it answers
 while it works. Every failure of the environment is reported to the learner.
-A connection that only looks open is given up for another.
+A connection that only looks open is replaced.
 In a vector environment, where one step may take as long as the caller allows, a second thread sends the heartbeats.
 """
 
@@ -60,7 +60,7 @@ from millrace.workers.vector_env.stepper import Stepper
 log = logging.getLogger("millrace.worker")
 
 CONNECT_AGAIN_S = 20.0  # a learner that can be reached answers a Hello sooner
-PULSE_S = 0.05  # time between two looks for messages while environments are stepped
+PULSE_S = 0.05  # time between two checks for messages while environments are stepped
 IDLE_S = 0.5  # longest wait while idle, so that a signal or the end of the parent process is noticed
 AFTER_WAKE_UP_S = 0.02  # longest wait for a message after a wake-up, which is faster than the message
 STATM = Path("/proc/self/statm")  # pages: all, resident, …
@@ -88,17 +88,17 @@ class WorkerOptions:
     code: AllowedCode = AllowedCode.MODULES
     """Which code the learner may make the worker run."""
     stop_requests: Callable[[], int] = _no_stop_requests
-    """Returns the number of requests to leave."""
+    """Returns how often this worker was asked to leave."""
     feed_watchdog: Callable[[float], None] = _no_watchdog
     """Called regularly with the time, unless the environment hangs."""
     shared_memory: InheritedDescriptors | None = None
     """Shared memory and wake pipes, for a vector environment on this machine."""
     shared_weights: SharedWeightsReader | None = None
-    """The weights that the supervisor gets for all its workers."""
+    """The weights that the supervisor receives for all its workers."""
     exit_code: Callable[[int, str], int] = _same_exit_code
     """Exit code of the process, from that of the conversation and the reason for leaving."""
     make_actors: MakeActors = make_local_actors
-    """Makes what acts in a run."""
+    """Makes the actors of a run."""
 
 
 class Worker:
@@ -122,16 +122,16 @@ class Worker:
         if self._options.shared_weights is not None:
             link.watch(self._options.shared_weights.wake_fd)
         self._pulse_due_s = 0.0
-        self._unused_from_s = math.inf  # from then on the copy that was described is not kept
+        self._unused_from_s = math.inf  # from then on the described copy is not kept
         self._resident_bytes = 0
         self._left: Leave | None = None
         self._heartbeats = HeartbeatThread(lambda: self._do(self._session.heartbeat_if_due(self._clock())))
         self._waited_s = 0.0
-        self._statistics = self._earlier = Statistics()  # newest, and as the sessions before this one left them
-        self._unheard_from_s = 0.0  # what `_waited_s` was when it was heard last, or joining or the connection began
+        self._statistics = self._earlier = Statistics()  # the newest, and those at the end of the session before
+        self._unheard_from_s = 0.0  # `_waited_s` when the learner was last heard, or when joining or the connection began
 
     def run(self) -> Leave:
-        """Work until the conversation is over. Raises nothing that the environment raised."""
+        """Work until the conversation is over. Exceptions of the environment are never raised."""
         try:
             while self._left is None:
                 self._do(self._session.tick(self._clock()))
@@ -207,14 +207,14 @@ class Worker:
     def _take_shared_weights(self, shared: SharedWeightsReader) -> None:
         """Handle the weights that the supervisor got, as if the learner had sent them to this worker."""
         for frames in shared.find(self._session.session, self._session.missing_versions()):
-            with suppress(BadMessage):  # the learner will send them here, and be told
+            with suppress(BadMessage):  # the learner will send them to this worker, and learn of the error
                 self._do(self._session.handle(decode_to_worker(frames), self._clock()))
 
     def _connect_again_if_unheard(self) -> None:
-        """Something on the way (a proxy, a tunnel) may keep a connection open whose other end is gone.
+        """A proxy or a tunnel may keep a connection open whose other end is gone.
 
-        Without a connection, this drops the Hellos that have piled up for a learner that is not there yet. Only time spent
-        listening counts: while a simulator starts or is closed, nothing is read.
+        Without a connection, this drops the queued Hellos for a learner that isn't there yet. Only time spent listening
+        counts: while a simulator starts or is closed, nothing is read.
         """
         if self._session.state is not WorkerState.JOINING:
             self._unheard_from_s = self._waited_s
@@ -227,7 +227,10 @@ class Worker:
             self._link.connect_again()  # rule CONNECTION
 
     def _serve_shared_memory(self, timeout_s: float) -> float:
-        """Execute the orders in shared memory, if it is used, until a message may have arrived. How long to wait for it."""
+        """Execute the orders in shared memory, if it is used, until a message may have arrived.
+
+        Returns how long to wait for it.
+        """
         stepper = self._stepper
         orders = SharedOrders(self._session.session)
         if stepper is None or not stepper.uses_shared_memory:
@@ -264,7 +267,7 @@ class Worker:
                 raise _Abandoned
 
     def _pulse_from_env_code(self, work: Work | SharedOrders) -> None:
-        """As `_pulse`, but called by environment code while an order is executed."""
+        """Like `_pulse`, but called by environment code while an order is executed."""
         if self._clock() >= self._pulse_due_s:
             with self._heartbeats.lock_reacquired():
                 self._pulse(work)
@@ -277,7 +280,7 @@ class Worker:
             self._do([SendMessage(answer)])
 
     def _fail(self, error: Exception) -> None:
-        """The environment's code or the user's policy raised, or our code on their data: report it to the learner."""
+        """Report to the learner that the environment's or the user's code raised, or millrace's code on their data."""
         if isinstance(error, NoSlot) and self._session.state is not WorkerState.LEFT:
             self._decline(error)
             return
@@ -287,13 +290,13 @@ class Worker:
         self._do(self._session.fail(_line(error), detail, lane, of_policy=isinstance(error, PolicyFailed)))
 
     def _cannot_take_part(self, error: Exception, work: Work) -> TypeGuard[UsageError]:
-        """Whether this worker lacks the environment, or has another one. If its own code raised, it has it."""
+        """Whether this worker lacks the environment, or has another one. If the environment's own code raised, it has it."""
         if not isinstance(error, UsageError) or error.detail:
             return False
         return isinstance(work, Describe) or (isinstance(work, RolloutTask) and not self._statistics.steps)
 
     def _decline(self, error: UsageError) -> None:
-        """Leave the run. Without a slot, this process ends when there is room for a lane: then it is started again."""
+        """Leave the run. If it lacked a slot, this process ends when there is room for a lane, and is then restarted."""
         self._close_all()
         *said, leave = self._session.decline(_line(error), 1 if isinstance(error, NoSlot) else EXIT_UNSUITABLE)
         self._do(said)
@@ -336,13 +339,13 @@ class Worker:
     def _send(self, message: ToLearner) -> None:
         try:
             frames = encode(message, self._packing)
-        except ValueError as error:  # a rollout in which so many episodes ended that it fits no message
+        except ValueError as error:  # a rollout with too many episodes for a message
             self._fail(error)
         else:
             self._link.send(frames)
 
     def _begin(self, run: WaitSpec | RunSpec | StepSpec) -> None:
-        """Make what steps env copies in this run, unless it has yet to begin. Those of the last session were closed."""
+        """Make the actors or the stepper of this run, unless it has yet to begin. Those of the last session were closed."""
         activity().begin(WAITING)
         activity().limit(run.call_timeouts)
         self._options.feed_watchdog(self._clock())
@@ -386,7 +389,7 @@ class Worker:
             heartbeats.stop()
 
     def _close_unused(self) -> None:
-        """A worker that has no lane does not keep the copy that it has described."""
+        """Close the described copy if the worker has no lane."""
         if self._clock() > self._unused_from_s:
             self._unused_from_s = math.inf
             close_described()
@@ -412,7 +415,7 @@ def _line(error: Exception) -> str:
 
 
 def identity(name: str, process_nonce: int | None = None, *, evaluates: bool = False) -> WorkerIdentity:
-    """Identity of this process, or of a thread of it. `process_nonce`: its secret number; None: draw one.
+    """Identity of this process, or of one of its threads. `process_nonce`: its secret number; None: draw one.
 
     `evaluates`: whether it only plays evaluations.
     """

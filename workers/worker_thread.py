@@ -65,21 +65,21 @@ class WorkerThread:
         return Ending(self._left.exit_code, one_line(self._left.reason), on_purpose=True)
 
     def activity(self, now: float) -> WorkerActivity | None:
-        """What it does; None if it has ended."""
+        """What it is doing; None if it has ended."""
         if not self._thread.is_alive():
             return None
         page = self._reader.read(now)
         return WorkerActivity(self.name, self.process_nonce, page.doing, page.for_s, page.env_calls)
 
     def last_line(self) -> str:
-        """Nothing: a thread writes to this process's stderr."""
+        """Empty: a thread writes to this process's stderr."""
         return ""
 
     def end_if_hung(self, now: float) -> None:
-        """Nothing: a thread cannot be ended from outside."""
+        """Do nothing: a thread cannot be ended from outside."""
 
     def lower_priority(self) -> None:
-        """A thread keeps its priority."""
+        """Do nothing: a thread keeps its priority."""
 
     def stop(self) -> None:
         """Ask it to leave."""

@@ -240,7 +240,7 @@ def _line(event: LoggedEvent) -> str:
             parts = [f"{repeated:,} env steps are replayed first"] if repeated or not new else []
             if new:
                 parts.append(f"{new:,} env {'copies begin new episodes' if new > 1 else 'copy begins a new episode'}")
-            why = f"; the longest one has {longest:,} steps, more than --replay-limit allows to repeat" if longest else ""
+            why = f"; the longest one has {longest:,} steps, more than --replay-limit allows" if longest else ""
             return f"lane {lane} continues on worker {worker}: {', and '.join(parts)}{why}"
 
 

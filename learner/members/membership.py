@@ -92,6 +92,7 @@ class Membership(Generic[M]):
         is_spare: Callable[[M], bool] = lambda member: False,
     ) -> None:
         """`on_removed` is called with each member that was removed, and why: it takes back what that member held.
+
         `is_spare`: whether the run doesn't need a member's environments, so that its failures don't count.
         """
         self.members: dict[bytes, M] = {}

@@ -298,8 +298,9 @@ class EvaluationDealer:
         return Counter(member.peer for member in [*self.held.values(), *self.second.values()])
 
     def _who_may_play(self, members: Sequence[Member], plan: EvaluationPlan) -> list[Member]:
-        """The workers among these that may play: first those that only evaluate, and late ones only if there is no other. If
-        copies are limited, the first ones play, because a worker keeps its copies.
+        """The workers among these that may play: first those that only evaluate, and late ones only if there is no other.
+
+        If copies are limited, the first ones play, because a worker keeps its copies.
         """
         players = sorted(members, key=lambda member: not member.hello.evaluates)
         players = [member for member in players if member.session not in self._late] or players

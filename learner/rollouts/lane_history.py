@@ -204,8 +204,9 @@ class LaneHistories:
     """the pasts of lanes, from a checkpoint"""
 
     def of(self, lane: int) -> LaneHistory | None:
-        """The history of a lane when the run is resumed; None if it has no rollouts yet. If the number of copies has
-        changed, none of them continues.
+        """The history of a lane when the run is resumed; None if it has no rollouts yet.
+
+        If the number of copies has changed, none of them continues.
         """
         past = next((past for past in self.pasts if past.lane == lane), None)
         if past is None:

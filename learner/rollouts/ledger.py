@@ -54,8 +54,9 @@ class Ledger(msgspec.Struct, kw_only=True):
         return self.transitions_received - self.transitions_used - dropped
 
     def end_outstanding(self) -> None:
-        """The learner that dealt the outstanding tickets is gone: count them, and rollouts not yet used, as lost. Raises
-        `ValueError` for counts from a file that no run can have.
+        """The learner that dealt the outstanding tickets is gone: count them, and rollouts not yet used, as lost.
+
+        Raises `ValueError` for counts from a file that no run can have.
         """
         if min(self.outstanding, self.transitions_waiting) < 0:
             raise ValueError("ledger: expected at least as many tickets and transitions as were used or lost, got fewer")

@@ -40,8 +40,9 @@ def last_line(program: str, error: BaseException, hints: Sequence[str] = (), *, 
 
 
 def users_code(error: BaseException) -> str:
-    """FILE:LINE where user code that the learner calls, such as the loss of an algorithm, raised this; else empty. An error
-    in a library counts for the code that called it.
+    """FILE:LINE where user code that the learner calls, such as the loss of an algorithm, raised this; else empty.
+
+    An error in a library counts for the code that called it.
     """
     where = ""
     libraries = tuple(sysconfig.get_path(name) for name in ("stdlib", "purelib", "platlib"))

@@ -82,8 +82,9 @@ class Owner(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def decoded(content: bytes) -> Owner | None:
-    """The owner that this content names; None if the content was cut or is being written. Its address is kept only if valid:
-    a command connects to it, and a page shows it as a word to type.
+    """The owner that this content names; None if the content was cut or is being written.
+
+    Its address is kept only if valid: a command connects to it, and a page shows it as a word to type.
     """
     try:
         owner = msgspec.json.decode(content.strip(), type=Owner)

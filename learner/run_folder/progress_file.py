@@ -34,8 +34,7 @@ class ProgressFile:
         self._looked_s = 0.0
 
     def write(self, progress: Callable[[], RunProgress], now: float) -> None:
-        """Write how far the run is, if a second has passed since the last time, and something has changed or that was long
-        ago.
+        """Write how far the run is, if a second has passed and something has changed, or if the last time is long ago.
 
         `now`: seconds since 1970.
         """
@@ -53,8 +52,9 @@ class ProgressFile:
 
 
 def last_progress(run: Path, summary: Summary | None, total_steps: int = 0) -> RunProgress:
-    """How far a run is, or was when it ended, from its `summary`, or else from its progress.json. `total_steps`: from its
-    settings; nothing else is known if neither can be read.
+    """How far a run is, or was when it ended, from its `summary`, or else from its progress.json.
+
+    `total_steps`: from its settings; nothing else is known if neither can be read.
     """
     if summary is not None:
         return of_summary(summary, total_steps)

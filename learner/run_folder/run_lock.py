@@ -301,9 +301,11 @@ def learner_of_run(folder: Path) -> LearnerOfRun:
 
 
 def living_owner(folder: Path, now: float) -> Owner:
-    """Who seems to train the run in this folder, for display; `now` is wall-clock time. A process on this machine is looked
-    up by its number. Others, also in containers, rewrite the file every few seconds; if the clocks of two machines differ by
-    much, the answer is wrong, so no write depends on it. Raises `UsageError`, with a one-line message, if nobody seems to.
+    """Who seems to train the run in this folder, for display; `now` is wall-clock time.
+
+    A process on this machine is looked up by its number. Others, also in containers, rewrite the file every few seconds; if
+    the clocks of two machines differ by much, the answer is wrong, so no write depends on it. Raises `UsageError`, with a
+    one-line message, if nobody seems to.
     """
     path = folder / LOCK_FILE
     try:

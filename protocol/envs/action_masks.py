@@ -1,7 +1,7 @@
 """Where an environment's action masks are: under the key `action_mask` of a Dict observation, or of `info`.
 
-Rule: in a masked run, the key of an observation is a mask and no feature. The learner and the workers both decide it here,
-by the spaces alone.
+Rule: in a masked run, the key of an observation is a mask and not a feature. The learner and the workers both use this file,
+which decides only by the spaces.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from millrace.protocol.specs import Leaf
 
 
 def has_mask(observation: gymnasium.Space[Any], action: gymnasium.Space[Any]) -> bool:
-    """Whether an observation carries a mask of the allowed actions: at the key, with a bit for each choice."""
+    """Whether an observation contains a mask of the allowed actions: at the key, with a bit for each choice."""
     if not (isinstance(observation, spaces.Dict) and MASK in observation.spaces and len(observation.spaces) > 1):
         return False
     try:
@@ -52,5 +52,5 @@ def without_mask(observation: gymnasium.Space[Any], action: gymnasium.Space[Any]
 def seen_space(
     observation: gymnasium.Space[Any], action: gymnasium.Space[Any], *, masked: bool, critic_keys: Sequence[str]
 ) -> gymnasium.Space[Any]:
-    """The observation space as rows have it: without the mask of a masked run, and with the critic's keys at its end."""
+    """The observation space of rows: without the mask in a masked run, and with the critic's keys at its end."""
     return with_last(without_mask(observation, action) if masked else observation, critic_keys)

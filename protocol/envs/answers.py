@@ -1,7 +1,7 @@
-"""What `reset` and `step` of an environment return, read. What is not of gymnasium's form is a `WrongAnswer`.
+"""Reads what `reset` and `step` of an environment return. Anything but gymnasium's form is a `WrongAnswer`.
 
-Rule: an info that is None is empty. Anything else than a dict in its place means that the environment returned something
-else, perhaps an observation of as many elements, and nothing of it is used.
+Rule: None as the info means an empty info. Anything else but a dict means that the environment returned something else,
+perhaps an observation with as many elements, and none of it is used.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class WrongAnswer(Exception):
 
 def reset_answer(answer: Any) -> tuple[Any, Mapping[str, Any]]:
     """What `reset` returned: the observation and the info. Raises `WrongAnswer`."""
-    if type(answer) is tuple and len(answer) == 2 and type(answer[1]) is dict:  # what nearly all return is read fast
+    if type(answer) is tuple and len(answer) == 2 and type(answer[1]) is dict:  # fast path for nearly all environments
         return answer
     if isinstance(answer, tuple | list) and len(answer) == 2 and (answer[1] is None or isinstance(answer[1], Mapping)):
         return answer[0], answer[1] or {}
@@ -34,15 +34,15 @@ def reset_answer(answer: Any) -> tuple[Any, Mapping[str, Any]]:
 
 
 def wrong_step(answer: Any) -> WrongAnswer:
-    """The error for what `step` returned, if that is not five values with a dict at the end."""
+    """The error if `step` did not return five values with a dict at the end."""
     told = f"its step returned {in_words(answer)}; {OF_STEP}"
     if isinstance(answer, tuple | list) and len(answer) == 4:
-        return WrongAnswer(f"{told}, not the old form with `done`: truncated is True where a time limit ends the episode")
+        return WrongAnswer(f"{told}, not the old form with `done`: truncated is True if a time limit ends the episode")
     return WrongAnswer(told)
 
 
 def in_words(answer: Any) -> str:
-    """What was returned, by its form."""
+    """The form of what was returned, in words."""
     match answer:
         case tuple() | list():
             kinds = ", ".join(_kind(each) for each in answer[:6])

@@ -1,6 +1,6 @@
-"""An environment's description: made from an env copy by a worker, and read by the learner, which has no copy of its own.
+"""An environment's description: a worker makes it from an env copy, and the learner, which has no copy, reads it.
 
-Rule: what a worker sent is data. Reading it makes spaces and records; it imports nothing and runs no environment code.
+Rule: a description is only data. Reading it makes spaces and records, imports nothing and runs no environment code.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class DescribedEnv:
     """time limit of an episode in env steps; None if there is none"""
     render_mode: str | None = None
     wrappers: frozenset[str] = frozenset()
-    """as `class_name`, the classes of which its wrappers are instances"""
+    """the classes of its wrappers, by `class_name`"""
     seats: tuple[str, ...] = ()
     """the names of its agents, if it is an environment with seats; its spaces are those of each seat"""
     takes_turns: bool = False
@@ -50,7 +50,7 @@ class DescribedEnv:
 def describe_env(env: gymnasium.Env[Any, Any]) -> EnvDescription:
     """The description of an env copy. Raises `UsageError` if its spaces are not supported or too large to send.
 
-    Rule: what it returns, `read_description` takes.
+    Rule: `read_description` accepts every result.
     """
     try:
         observation = describe_space(env.observation_space, "observation space")
@@ -71,16 +71,17 @@ def describe_env(env: gymnasium.Env[Any, Any]) -> EnvDescription:
     )
     try:
         check_size(description)
-        read_description(description)  # what the learner would refuse is refused here, where the environment is known
+        read_description(description)  # if the learner would refuse it, refuse it here, where the environment is known
     except BadMessage as error:
         raise UsageError(str(error)) from error
     return description
 
 
 def read_description(description: EnvDescription) -> DescribedEnv:
-    """The properties that a description gives. Raises `BadMessage` if it describes no environment, and no other error.
+    """The properties that a description gives.
 
-    It must have passed `millrace.protocol.space_spec.check_size`, as what was decoded has.
+    Raises `BadMessage`, and no other error, if it doesn't describe an environment. It must have passed
+    `millrace.protocol.space_spec.check_size`, which decoding calls.
     """
     if description.metadata.nbytes > MAX_METADATA_BYTES or description.metadata.dtype != np.uint8:
         raise BadMessage(f"metadata: expected at most {MAX_METADATA_BYTES} bytes, got {description.metadata.nbytes}")
@@ -115,7 +116,7 @@ def _made_space(spec: SpaceSpec, name: str) -> gymnasium.Space[Any]:
 
 
 def agents_of(env: gymnasium.Env[Any, Any]) -> tuple[tuple[str, ...], bool]:
-    """The names of its agents in a description, none if it is gymnasium's, and whether they take turns."""
+    """The names of its agents for a description (none for a gymnasium environment), and whether they take turns."""
     if not isinstance(env, SeatedEnv):
         return (), False
     if len(env.seats) > MAX_SEATS:
@@ -142,7 +143,7 @@ def _wrappers(env: gymnasium.Env[Any, Any]) -> tuple[str, ...]:
 
 
 def _metadata(metadata: object) -> Array:
-    """Packed: the entries that are plain data, [bytes] uint8. Those that would make it too long are left out."""
+    """The entries that are plain data, packed, [bytes] uint8. Entries that would make it too long are left out."""
     kept: dict[str, Any] = {}
     packed = plain_values.pack(kept)
     for name, value in metadata.items() if isinstance(metadata, dict) else ():
@@ -161,7 +162,7 @@ def _spec_as_text(spec: GymnasiumSpec | None) -> str:
         text = "" if spec is None else spec.to_json()
         if text:
             GymnasiumSpec.from_json(text)
-    except Exception:  # an entry point or an argument that JSON cannot hold, or a specification of the user's own
+    except Exception:  # an entry point or an argument that JSON cannot hold, or a user-defined specification
         return ""
     return text if len(text) <= MAX_TEXT else ""
 

@@ -1,6 +1,6 @@
-"""Turns actions as the policy chooses them and rollouts store them into the environment's, and back. Pure.
+"""Converts actions between the form that the policy chooses and rollouts store, and the environment's form. Pure.
 
-Rule: what is stored is what was chosen; what the environment gets is shifted by `start`, or scaled, and clipped to the Box.
+Rule: the chosen action is stored; for the environment it is shifted by `start`, or scaled, and clipped to the Box.
 A mixed action is stored as a row; the environment gets its Dict or Tuple (`millrace.protocol.action_parts`).
 """
 
@@ -18,8 +18,8 @@ from millrace.protocol.specs import ActionSpec, PolicySpec
 def action_converter_of(policy: PolicySpec) -> Callable[[Array], Array]:
     """A function from the stored actions [..., *action] of this policy to actions of the environment.
 
-    Those of a Dict or Tuple are an array [...] of objects. Actions in [-1, 1] are scaled to the bounds of the Box, in
-    float64, and then converted as all others.
+    Actions of a Dict or Tuple are an array [...] of objects. Actions in [-1, 1] are scaled to the bounds of the Box, in
+    float64, and then converted like all others.
     """
     convert = make_action_converter(policy.action)
     spec = policy.action
@@ -34,7 +34,7 @@ def action_converter_of(policy: PolicySpec) -> Callable[[Array], Array]:
 def action_leaves_of(policy: PolicySpec) -> Callable[[Array], tuple[Array, ...]]:
     """A function from the stored actions [..., *action] of this policy to arrays [..., *part] of the environment's numbers.
 
-    They are those of the parts of a Dict or Tuple, in the order of the space, or the one array of another space.
+    There is one array for each part of a Dict or Tuple, in the order of the space, or one array for another space.
     """
     if policy.action.parts:
         return _make_leaves(policy.action)
@@ -43,7 +43,7 @@ def action_leaves_of(policy: PolicySpec) -> Callable[[Array], tuple[Array, ...]]
 
 
 def _make_leaves(spec: ActionSpec) -> Callable[[Array], tuple[Array, ...]]:
-    """The same for a mixed action."""
+    """See the public function; for a mixed action."""
     parts = parts_of(spec)
     converters = [make_action_converter(part.spec) for part in parts]
 
@@ -73,8 +73,8 @@ def _make_structures(spec: ActionSpec) -> Callable[[Array], Array]:
 def make_action_converter(spec: ActionSpec) -> Callable[[Array], Array]:
     """A function from stored actions [..., *action] to actions of the environment: shifted by `start`, or clipped (Box).
 
-    A Box action is clipped in the dtype of the space, in which the bounds are exact: the float32 next to a float64 bound may
-    lie outside of it.
+    A Box action is clipped in the dtype of the space, in which the bounds are exact: the float32 closest to a float64 bound
+    may lie outside.
     """
     if spec.parts:
         return _make_structures(spec)
@@ -91,7 +91,7 @@ def make_action_converter(spec: ActionSpec) -> Callable[[Array], Array]:
 def stored_actions_of(policy: PolicySpec) -> Callable[[Sequence[Array]], Array]:
     """The inverse of `action_leaves_of`: a function from the environment's arrays [..., *part] to stored actions.
 
-    An action outside of a Box that is scaled becomes one at its bounds.
+    If the Box is scaled, actions outside of it are clipped to its bounds.
     """
     spec = policy.action
     if spec.parts:
@@ -101,7 +101,7 @@ def stored_actions_of(policy: PolicySpec) -> Callable[[Sequence[Array]], Array]:
 
 
 def _make_rows(spec: ActionSpec) -> Callable[[Sequence[Array]], Array]:
-    """The same for a mixed action."""
+    """See the public function; for a mixed action."""
     parts = parts_of(spec)
     converters = [_stored(PolicySpec((), part.spec)) for part in parts]
 
@@ -117,7 +117,7 @@ def _make_rows(spec: ActionSpec) -> Callable[[Sequence[Array]], Array]:
 
 
 def _stored(policy: PolicySpec) -> Callable[[Array], Array]:
-    """A function from the environment's arrays [..., *action] of a space that is not mixed to stored actions."""
+    """A function from the environment's arrays [..., *action] to stored actions, for a space that isn't mixed."""
     spec = policy.action
     if spec.kind != "box":
         start = np.reshape(np.asarray(spec.start or 0), spec.shape if spec.start else ())
@@ -127,5 +127,5 @@ def _stored(policy: PolicySpec) -> Callable[[Array], Array]:
     low, high = (np.reshape(bound, spec.shape) for bound in (spec.low, spec.high))
     middle = (low + high) / 2
     half = (high - low) / 2
-    half = np.where(half > 0, half, 1)  # an element with one value alone is stored as 0
+    half = np.where(half > 0, half, 1)  # an element with only one value is stored as 0
     return lambda action: np.clip((action - middle) / half, -1, 1).astype(spec.stored_dtype)

@@ -1,8 +1,7 @@
-"""Names of functions and classes of the user's: whether another process finds them, and what a run remembers of them.
+"""Names of user-defined functions and classes: whether another process finds them, and how a run remembers them.
 
-Rule: `module:qualname` is what an import finds again, in any process. `__main__:name` is an attribute of the program's own
-script or notebook, and only that program finds it. `<name>` is found by nobody: a lambda, a function in a function,
-an object.
+Rule: `module:qualname` can be imported in any process. `__main__:name` is an attribute of the program's own script or
+notebook, and only that program finds it. `<name>` can't be found anywhere: a lambda, a function in a function, an object.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ MAIN = "__main__"
 
 
 def name_of(made: object) -> str:
-    """The name under which `made` is found again, or one that says that it is not."""
+    """The name under which `made` can be found again, or a name in `<>` if it can't."""
     module = attribute(made, "__module__")
     qualname = attribute(made, "__qualname__")
     if not isinstance(module, str) or not isinstance(qualname, str):
@@ -34,37 +33,37 @@ def found_by_others(name: str) -> bool:
 
 
 def in_main(name: str) -> object:
-    """What this program's script or notebook has under `__main__:name`; None if nothing."""
+    """The object that `__main__:name` names in this program's script or notebook; None if there is none."""
     module, _, qualname = name.partition(":")
     return attribute(sys.modules.get(MAIN), qualname) if module == MAIN else None
 
 
 def moved(before: str, now: str) -> bool:
-    """Whether `now` may be what had the name `before`: it has a module where it had none, and the rest is the same."""
+    """Whether `now` may be a new name of `before`: it has a module where it had none, and the rest is the same."""
     without_module = not found_by_others(before) or ":" not in before
     return before == now or (without_module and last_part(before) == last_part(now))
 
 
 def last_part(name: str) -> str:
-    """The name without its module, and without what it stands in: `Clip` of `mine:Outer.Clip(0.5)` and of `<Clip>`."""
+    """The name without its module and outer classes: `Clip` of `mine:Outer.Clip(0.5)` and of `<Clip>`."""
     name = name.strip("<>").partition("(")[0].rpartition(":")[2]
     return name if "/" in name else name.rpartition(".")[2]
 
 
 def attribute(module: object, qualname: str) -> object:
-    """What a module, or an object, has under this dotted name; None if nothing."""
+    """The attribute of a module, or an object, with this dotted name; None if there is none."""
     value = module
     for part in qualname.split("."):
         try:
             value = getattr(value, part, None)
-        except Exception:  # of a module that imports its names when they are asked for, such as supersuit, or of a property
+        except Exception:  # of a module that imports its names lazily, such as supersuit, or of a property
             return None
     return value
 
 
 def importable(module: str) -> bool:
-    """Whether another process that has our search path could import this module."""
+    """Whether another process with the same search path could import this module."""
     try:
         return importlib.util.find_spec(module) is not None
-    except Exception:  # the package that it is in is imported for it
+    except Exception:  # this imports its parent package
         return False

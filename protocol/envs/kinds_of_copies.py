@@ -1,8 +1,9 @@
 """The kinds of env copies: how the N copies of a lane are stepped (`--vector`).
 
-Rule: a kind is named as `module:name`, and imported when a run asks for it. Ours stand in `KINDS`. Other packages install
-theirs as entry points of the group `millrace.copies`, which are read only for a name that isn't ours. A learner imports a
-kind, too, but for `loop`, which can do all: the module of a kind may import a simulator in functions only.
+Rule: a kind is named as `module:name`, and imported when a run asks for it. Built-in kinds are in `KINDS`. Other packages
+install theirs as entry points of the group `millrace.copies`, which are read only for a name that isn't built in. A learner
+also imports a kind, except `loop`, which can do everything: the module of a kind may import a simulator only inside
+functions.
 """
 
 from __future__ import annotations
@@ -32,22 +33,22 @@ class CopiesKind(NamedTuple):
     """A way to step the env copies of a lane."""
 
     open: Callable[[RunSpec, EnvCopy, Callable[[], None]], Any]
-    """Makes the copies of a lane, as `millrace.workers.copies.env_copies.EnvCopies`. The `EnvCopy` says which copy the first
-    one is; the last argument is called between two calls of the environment, and may raise. Raises `UsageError` if the
-    environment has no such copies.
+    """Makes the copies of a lane, as `millrace.workers.copies.env_copies.EnvCopies`. The `EnvCopy` identifies the first
+    copy; the last argument is called between two calls of the environment, and may raise. Raises `UsageError` if the
+    environment doesn't support such copies.
     """
     spaces: Callable[[EnvSpec], tuple[gymnasium.Space[Any], gymnasium.Space[Any]]] | None = None
-    """Observation and action space of one copy: a worker refuses them if the environment itself has others. None: they are
-    those of the environment. Raises `UsageError`, as `open` does.
+    """Observation and action space of one copy: a worker refuses them if the environment itself has others. None: the spaces
+    of the environment. Raises `UsageError`, like `open`.
     """
     has_masks: bool = True
-    """Whether its copies report masks of the allowed actions, where the environment does."""
+    """Whether its copies report masks of the allowed actions if the environment does."""
     has_attributes: bool = True
     """Whether attributes of its copies can be set."""
 
 
 def copies_kind(name: str) -> CopiesKind:
-    """Import a kind. Raises `UsageError` if it is neither ours nor installed, or can't be imported."""
+    """Import a kind. Raises `UsageError` if it is neither built in nor installed, or can't be imported."""
     what = f"vector {name}"
     module, _, qualname = _place(name).partition(":")
     kind = attribute(import_own(module, what), qualname)
@@ -57,17 +58,20 @@ def copies_kind(name: str) -> CopiesKind:
 
 
 def has_masks(name: str) -> bool:
-    """Whether copies of this kind report masks of the allowed actions. `loop` can do all, and is not imported to ask."""
+    """Whether copies of this kind report masks of the allowed actions.
+
+    `loop` can do everything, and isn't imported for this.
+    """
     return name == DEFAULT or copies_kind(name).has_masks
 
 
 def has_attributes(name: str) -> bool:
-    """Whether attributes of copies of this kind can be set. `loop` is not imported to ask, either."""
+    """Whether attributes of copies of this kind can be set. `loop` isn't imported for this, either."""
     return name == DEFAULT or copies_kind(name).has_attributes
 
 
 def check_kind(name: str) -> None:
-    """Raise `UsageError` if a kind is neither ours nor installed. Imports nothing."""
+    """Raise `UsageError` if a kind is neither built in nor installed. Imports nothing."""
     _place(name)
 
 

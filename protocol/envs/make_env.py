@@ -1,4 +1,4 @@
-"""Makes an environment: by `gymnasium.make`, or by what a user's callable returns; and says in one line why it cannot."""
+"""Makes an environment with `gymnasium.make` or a user-defined callable, or says in one line why that failed."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from millrace.protocol.errors import UsageError, first_line, joined, words_an_er
 
 
 def names_a_function(env_id: str) -> bool:
-    """Whether a worker looks for a function or a class of this name: `module:name`, where the name has no version.
+    """Whether this names a function or a class: `module:name`, where the name has no version.
 
     Also `package.module_v1`, as PettingZoo names its environments: modules with a function `parallel_env` or `env`.
     """
@@ -41,7 +41,7 @@ def _names_a_module(env_id: str) -> bool:
 
 @words_an_error
 def _newer_or_older(module: str) -> str:
-    """Which module of the same package was perhaps meant, as the end of a line; empty if none is similar."""
+    """The end of a line: which module of the same package may have been meant; empty if none is similar."""
     package, _, name = module.rpartition(".")
     beside = [each.name for each in pkgutil.iter_modules(getattr(sys.modules.get(package), "__path__", []))]
     return "".join(f"; did you mean {package}.{close}?" for close in difflib.get_close_matches(name, beside, 1, cutoff=0.75))
@@ -63,7 +63,7 @@ def made_by_id(env_id: str, kwargs: dict[str, Any]) -> Any:
 def made_without_checker(env: str | GymnasiumSpec, kwargs: dict[str, Any]) -> gymnasium.Env[Any, Any]:
     """Made without gymnasium's checker: it costs a tenth of a CartPole step, and `rollout_checks.validate` checks rows.
 
-    Its spec says what was registered, so that a dataset's environment equals the one that gymnasium makes.
+    Its spec is the registered one, so that a dataset's environment equals the one that gymnasium makes.
     """
     made = gymnasium.make(env, disable_env_checker=True, **kwargs)
     if (spec := made.spec) is not None:
@@ -73,9 +73,9 @@ def made_without_checker(env: str | GymnasiumSpec, kwargs: dict[str, Any]) -> gy
 
 
 def made_by_callable(name: str, factory: Callable[..., object], kwargs: dict[str, Any]) -> Any:
-    """What a user's callable returns: a `gymnasium.Env`, or an environment of PettingZoo.
+    """What a user-defined callable returns: a `gymnasium.Env`, or a PettingZoo environment.
 
-    Raises `UsageError` if that is no environment, or it asks for an unknown id.
+    Raises `UsageError` if it returns anything else, or asks for an unknown id.
     """
     parameter = takes_copy(factory, kwargs)
     copy = [being_made() or FIRST_COPY] if parameter else []
@@ -104,11 +104,11 @@ def made_by_callable(name: str, factory: Callable[..., object], kwargs: dict[str
 
 @words_an_error
 def _what_to_return(made: object) -> str:
-    """What a callable should return instead of something that is no environment."""
+    """What a callable should return instead of something that isn't an environment."""
     if is_of_old_gym(made):
         return instead_of_object(made)
     if hasattr(made, "num_envs"):
-        return "it is a vector environment: return one copy, of which millrace makes as many as it needs"
+        return "it is a vector environment: return one copy; millrace makes as many as it needs"
     return what_it_lacks(made)
 
 
@@ -122,15 +122,15 @@ def why_not_made(
 
 @words_an_error
 def _why_not_made(env_id: str, error: Exception, failed: Sequence[str], why_not: Callable[[str], str]) -> str:
-    """One line for an environment that is not known, or whose package is missing.
+    """One line for an unknown environment, or one whose package is missing; empty for other errors.
 
-    `failed`: lines about installed packages that could not register their environments. `why_not`: as of `what_to_write`.
+    `failed`: lines about installed packages that could not register their environments. `why_not`: see `what_to_write`.
     """
     if instead := module_of_file(env_id, "MyEnv"):
         return f"environment {env_id}: {instead}"
     module, colon, name = env_id.partition(":")
     while isinstance(error, ModuleNotFoundError) and isinstance(error.__cause__, ModuleNotFoundError):
-        error = error.__cause__  # gymnasium raises one of its own, which names the module of the id whatever is missing
+        error = error.__cause__  # gymnasium raises its own error, which names the module of the id whatever is missing
     says = first_line(error)
     match error:
         case gymnasium.error.NamespaceNotFound() if env_id.startswith("ALE/"):
@@ -150,7 +150,7 @@ def _why_not_made(env_id: str, error: Exception, failed: Sequence[str], why_not:
                 f"environment {env_id} has no vectorized form of its own (gymnasium's vector_entry_point); use --vector loop"
             )
         case gymnasium.error.UnregisteredEnv() if env_id.rpartition(":")[2] in gymnasium.registry:
-            return f"environment {env_id} cannot be made: {says}"  # it is registered, and makes another one that is not
+            return f"environment {env_id} cannot be made: {says}"  # it is registered, and makes another one that isn't
         case gymnasium.error.UnregisteredEnv() if ours := preprocessed(env_id):
             return f"environment {env_id} is not registered: write {ours}"
         case gymnasium.error.UnregisteredEnv() if not colon:
@@ -163,13 +163,13 @@ def _why_not_made(env_id: str, error: Exception, failed: Sequence[str], why_not:
             there = vars(sys.modules.get(module, object))
             names = [f"{module}:{each}" for each, value in there.items() if callable(value)]
             hint = most_similar(name, names, why_not)
-            return f"environment {env_id}: module {module} neither registers {name} nor has a class or function so named" + (
+            return f"environment {env_id}: module {module} neither registers {name} nor has such a class or function" + (
                 f"; {hint}" if hint else ""
             )
         case TypeError() if "missing" in says and "argument" in says:
             return (
                 f"environment {env_id} cannot be made: {says}; give numbers and text as --env-kwargs NAME VALUE; for "
-                "anything else, name a function of yours that makes the environment: my_module:make_env"
+                "anything else, name a function of your own that makes the environment: my_module:make_env"
             )
         case _:
             return f"environment {env_id} cannot be made: {says}"

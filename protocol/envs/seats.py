@@ -5,8 +5,8 @@ only now and then, leave before the others, or come later.
 
 Rule: a row of a seat is the span from one of its actions to its next observation, in which it has the move again or which
 is its last. `SeatStep.complete` marks the step in which that observation comes. Until then the seat waits, and shows the
-observation in which it acted. Rewards belong to the row in which they fall; those outside of any count in the return alone.
-An agent whose part has ended is out until the reset, whatever `agents` says.
+observation in which it acted. Rewards belong to the row in which they occur; rewards outside of any row only count in the
+return. An agent whose part has ended is out until the reset, whatever `agents` says.
 """
 
 from __future__ import annotations
@@ -31,21 +31,21 @@ STATE = "state"
 MAX_AGENT_NAME = MAX_NAME - len("return_")  # characters, so that the name of an agent's return is not cut
 _NO_INFO: Mapping[str, Any] = {}
 RETURNED_WRONGLY = AttributeError, KeyError, TypeError, ValueError, OverflowError
-"""What dicts without an agent, and what are no dicts and no numbers, raise where they are read."""
+"""Exceptions from reading dicts without an agent, or values that aren't dicts or numbers."""
 
 
 class SeatStep(NamedTuple):
     """What one step of a copy means for each of its A seats. The lists are new each time."""
 
     observations: list[Any]
-    """what each seat saw last; a value of the space before it has seen anything"""
+    """the last observation of each seat; a value of the space before its first one"""
     infos: list[Mapping[str, Any]]
-    """of the seats that got an observation in this step; empty for the others"""
+    """infos of the seats that got an observation in this step; empty for the others"""
     reward: list[float]
-    """of the rows that are complete, the sum since the seat acted; 0 for the others"""
+    """for complete rows, the sum since the seat acted; 0 for the others"""
     terminated: list[bool]
     truncated: list[bool]
-    """of the rows that are complete, whether the seat's part of the episode ends with it"""
+    """for complete rows, whether the seat's part of the episode ends with it"""
     complete: list[bool]
     """whether a row of the seat is complete"""
     acts: list[bool]
@@ -55,12 +55,12 @@ class SeatStep(NamedTuple):
 
 
 def side_by_side(copies: Iterable[SeatStep]) -> SeatStep:
-    """What a step means for the seats of several copies, as one `SeatStep`."""
+    """The result of a step for the seats of several copies, as one `SeatStep`."""
     return SeatStep(*([seat for of_copy in of_copies for seat in of_copy] for of_copies in zip(*copies, strict=True)))
 
 
 def columns_of(copies: Sequence[int], seats: int) -> Sequence[int]:
-    """The columns of these env copies, of which each has so many seats, side by side."""
+    """The columns of these env copies, each with this many seats side by side."""
     return copies if seats == 1 else [n * seats + seat for n in copies for seat in range(seats)]
 
 
@@ -105,7 +105,7 @@ class SeatedEnv(gymnasium.Env[SeatStep, Sequence[Any]]):
         ]
 
     def _seen(self, seat: int, observation: Any, state: Any = None) -> Any:
-        """What a seat sees, with its number if it is to know it, and the environment's state if its critic is to."""
+        """A seat's observation, with its number if `seat_id` is set, and the environment's state if its critic gets it."""
         if not self._tells_seats and self._state_space is None:
             return observation
         named = dict(observation) if isinstance(observation, dict) else {"observation": observation}
@@ -116,7 +116,7 @@ class SeatedEnv(gymnasium.Env[SeatStep, Sequence[Any]]):
         return named
 
     def _nothing(self) -> SeatStep:
-        """A step in which nothing has happened yet."""
+        """An empty `SeatStep` to fill."""
         A = len(self.seats)
         return SeatStep(
             list(self._before), [_NO_INFO] * A, [0.0] * A, [False] * A, [False] * A, [False] * A, [False] * A, [0.0] * A
@@ -146,16 +146,16 @@ class SeatedEnv(gymnasium.Env[SeatStep, Sequence[Any]]):
                 raise WrongAnswer(f"{what}: expected some of possible_agents, got {unknown[0]}")
 
     def pending(self) -> list[float]:
-        """[A] rewards that seats which wait for the move have got, and that no step has returned yet."""
+        """[A] rewards of seats that wait for the move, which no step has returned yet."""
         return [0.0] * len(self.seats)
 
     @abstractmethod
     def _begin(self, step: SeatStep, keywords: Mapping[str, Any]) -> None:
-        """Reset the environment, and write into `step` what follows."""
+        """Reset the environment, and write the result into `step`."""
 
     @abstractmethod
     def _advance(self, actions: Sequence[Any], step: SeatStep) -> bool:
-        """Step the environment, and write into `step` what follows. Returns whether the episode is over."""
+        """Step the environment, and write the result into `step`. Returns whether the episode is over."""
 
     def owner(self, name: str) -> Any:
         """The outermost of PettingZoo's wrappers that has this attribute itself; the environment if none has."""
@@ -174,13 +174,13 @@ class SeatedEnv(gymnasium.Env[SeatStep, Sequence[Any]]):
         return getattr(owner if hasattr(owner, name) else self, name)
 
     def set_wrapper_attr(self, name: str, value: Any, *, force: bool = True) -> bool:
-        """Set the attribute of PettingZoo's environment or of one of its wrappers; without `force`, only if it is there."""
+        """Set the attribute of PettingZoo's environment or of one of its wrappers; without `force`, only if it exists."""
         if there := force or hasattr(self.owner(name), name):
             setattr(self.owner(name), name, value)
         return there
 
     def render(self) -> Any:
-        """What the environment renders."""
+        """The environment's rendered frame."""
         return self.env.render()
 
     def close(self) -> None:
@@ -254,7 +254,7 @@ class ParallelSeats(SeatedEnv):
         return not self._present
 
     def _explain(self, error: Exception, agents: Collection[Any], **returned: Any) -> None:
-        """Raise what is wrong with what the environment returned, if that caused the error."""
+        """Raise a `WrongAnswer` if something that the environment returned caused the error."""
         self._check_agents()
         for what, by_agent in returned.items():
             if not isinstance(by_agent, Mapping):
@@ -271,7 +271,7 @@ class ParallelSeats(SeatedEnv):
 
 
 class TurnSeats(SeatedEnv):
-    """One agent acts at a time (`pettingzoo.AECEnv`): a step is its action, and the departure of those whose part ended."""
+    """One agent acts at a time (`pettingzoo.AECEnv`): a step is its action, and the departure of agents whose part ended."""
 
     takes_turns = True
 
@@ -309,7 +309,7 @@ class TurnSeats(SeatedEnv):
             except RETURNED_WRONGLY:
                 _check_numbers(agent, reward=reward, terminated=terminated, truncated=truncated)
                 raise
-            if observation is not None:  # a copy: the seat shows it until it has the move again
+            if observation is not None:  # copied, because the seat keeps it until it has the move again
                 step.observations[seat] = self._seen(seat, deepcopy(observation))
             elif not terminated and (self._waits[seat] or not truncated):  # it acts on it, or learns from its value
                 raise WrongAnswer(f"agent {agent}: expected an observation unless it is terminated, got None")
@@ -334,7 +334,7 @@ class TurnSeats(SeatedEnv):
         )
 
     def pending(self) -> list[float]:
-        """[A] what agents have got since they moved who do not have the move, as far as PettingZoo's base class sums it."""
+        """[A] rewards since their last move of agents without the move, as far as PettingZoo's base class sums them."""
         earned = getattr(self.env, "_cumulative_rewards", {})
         waits = set(self.env.agents) - self._gone - {self.env.agent_selection}
         return [float(earned.get(agent, 0.0)) if agent in waits else 0.0 for agent in self.agents]
@@ -348,7 +348,7 @@ def _info(agent: Any, info: Any) -> Mapping[str, Any]:
 
 
 def _check_numbers(agent: Any, **numbers: Any) -> None:
-    """Raise `WrongAnswer` for what is no number."""
+    """Raise `WrongAnswer` for a value that isn't a number."""
     for what, value in numbers.items():
         try:
             float(value) if what == "reward" else bool(value)
@@ -375,9 +375,9 @@ def seat_id(env: Any) -> Any:
 
 
 def with_state(env: Any) -> Any:
-    """A wrapper: observations of a PettingZoo environment hold its `state()`, under the key `state`.
+    """A wrapper: observations of a PettingZoo environment contain its `state()`, under the key `state`.
 
-    It must come after all wrappers of PettingZoo's. Environments of gymnasium's stay as they are.
+    It must come after all PettingZoo wrappers. Gymnasium environments stay as they are.
     """
     if has_seats(env):
         env.shows_state = True
@@ -385,7 +385,10 @@ def with_state(env: Any) -> Any:
 
 
 def _state_space(env: Any, name: str) -> gymnasium.Space[Any]:
-    """That of `env.state()`. Raises `UsageError` if it has none, and none follows from what it returns."""
+    """The space of `env.state()`.
+
+    Raises `UsageError` if the environment doesn't define it and it can't be derived from a state.
+    """
     try:
         space: gymnasium.Space[Any] | None = getattr(env, "state_space", None)
         if space is not None:
@@ -393,7 +396,7 @@ def _state_space(env: Any, name: str) -> gymnasium.Space[Any]:
         env.reset()
         state = np.asarray(env.state())
     except (NotImplementedError, AttributeError) as error:
-        raise UsageError(f"environment {name}: critic_keys state: expected a method state(), and it has none") from error
+        raise UsageError(f"environment {name}: critic_keys state: expected a method state(), got none") from error
     if state.dtype.kind not in "fi":  # bytes, for example, may be brightnesses, flags or counts
         raise UsageError(
             f"environment {name}: critic_keys state: expected state() to return an array of floats or signed integers, got "
@@ -423,7 +426,7 @@ def seated(made: Any, name: str) -> SeatedEnv:
 
 
 def _names(agents: Iterable[Any]) -> tuple[str, ...]:
-    """The names of agents, as the learner, metrics and errors have them."""
+    """The names of agents for the learner, metrics and errors."""
     return tuple(one_line(str(agent), MAX_AGENT_NAME) for agent in agents)
 
 

@@ -1,7 +1,7 @@
 """The random generators of gymnasium spaces as text, so that a seeded space draws the same samples in another process. Pure.
 
-Rule: only a generator that a space has is described. A space without one, which was never seeded, makes its own when it is
-first sampled. One that is not PCG64, gymnasium's own, stays behind.
+Rule: only existing generators are described. A space that was never seeded has none, and makes one when it is first sampled.
+Generators other than PCG64, which gymnasium uses, are left out.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from millrace.protocol.errors import BadMessage
 
 
 def generator_states(*given: gymnasium.Space[Any]) -> tuple[str, ...]:
-    """The state of the generator of each of these spaces and the spaces inside them; nothing if none has one."""
+    """The state of the generator of each of these spaces and the spaces inside them; empty if none has one."""
     states = [_state(space) for outer in given for space in _with_inner(outer)]
     return tuple(states) if any(states) else ()
 
@@ -40,7 +40,10 @@ def _with_inner(space: gymnasium.Space[Any]) -> Iterator[gymnasium.Space[Any]]:
 
 
 def _state(space: gymnasium.Space[Any]) -> str:
-    """As `millrace.protocol.space_spec.GeneratorState`. Not by `space.np_random`, which would seed a space that is not."""
+    """As `millrace.protocol.space_spec.GeneratorState`.
+
+    It isn't read from `space.np_random`, which would seed an unseeded space.
+    """
     generator: np.random.Generator | None = space._np_random
     if generator is None or not isinstance(generator.bit_generator, np.random.PCG64):
         return ""

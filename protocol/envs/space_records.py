@@ -1,7 +1,7 @@
 """gymnasium spaces <-> plain records, with exact bounds. Pure.
 
 Rule: `make_space(describe_space(space))` equals `space`, with the same order of keys, the same dtypes and the same bounds
-bit for bit. A record that describes no space raises `BadMessage`, and nothing else.
+bit for bit. A record that doesn't describe a space raises `BadMessage`, and nothing else.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def make_space(spec: SpaceSpec) -> gymnasium.Space[Any]:
         return _make(spec)
     except BadMessage:
         raise
-    except Exception as error:  # gymnasium raises several types for bounds that make no space
+    except Exception as error:  # gymnasium raises several types for invalid bounds
         raise BadMessage(f"{type(spec).__name__}: {type(error).__name__}: {one_line(first_line(error), 200)}") from error
 
 
@@ -111,7 +111,7 @@ def _make(spec: SpaceSpec) -> gymnasium.Space[Any]:
     match spec:
         case DictSpace(keys, inside):
             if len(set(keys)) != len(inside) or len(keys) != len(inside):
-                raise BadMessage(f"Dict space: expected a key of its own for each of {len(inside)} spaces, got {len(keys)}")
+                raise BadMessage(f"Dict space: expected a different key for each of {len(inside)} spaces, got {len(keys)}")
             return spaces.Dict([(key, _make(inner)) for key, inner in zip(keys, inside, strict=True)])
         case TupleSpace(inside):
             return spaces.Tuple([_make(inner) for inner in inside])

@@ -21,7 +21,7 @@ from millrace.protocol.specs import ActionSpec, Leaf
 
 OBSERVATIONS = "Box, Discrete, MultiBinary, MultiDiscrete, and Dict and Tuple of these"
 ACTIONS = "Discrete, MultiDiscrete, MultiBinary and Box (of floats), and Dict and Tuple of these"
-MOST_CHOICES = 2**24  # of a part of a mixed action: float32 tells no more whole numbers apart
+MOST_CHOICES = 2**24  # of a part of a mixed action: float32 can't represent more whole numbers
 STORED_KINDS = "biuf"  # bool, integers, floats: the dtypes that a message can carry
 
 
@@ -57,7 +57,7 @@ def make_unflatten(space: gymnasium.Space[Any]) -> Callable[[Sequence[Any]], Any
 def make_batched(space: gymnasium.Space[Any]) -> Callable[[Array], Any]:
     """A function from the actions of N copies, as `action_converter_of` gives them, to what a vector environment takes.
 
-    Those of a Dict or Tuple become a Dict or Tuple of arrays [N, *part].
+    Actions of a Dict or Tuple become a Dict or Tuple of arrays [N, *part].
     """
     if not isinstance(space, spaces.Dict | spaces.Tuple):
         return lambda actions: actions
@@ -94,7 +94,7 @@ def _leaf(path: str, space: gymnasium.Space[Any]) -> Leaf:
 
 
 def _has_all_bytes(space: spaces.Box) -> bool:
-    """Whether values are bytes from 0 to 255. Of other bounds, such as those of flags, a byte is a number as any other."""
+    """Whether values are bytes from 0 to 255. With other bounds, such as those of flags, a byte is an ordinary number."""
     return space.dtype == np.uint8 and bool((space.low == 0).all() and (space.high == 255).all())
 
 
@@ -110,7 +110,7 @@ def action_spec(space: gymnasium.Space[Any]) -> ActionSpec:
     if not isinstance(space, spaces.Dict | spaces.Tuple):
         return _single_action(space, "")
     if _has_nothing(space):
-        raise UsageError(f"action space {space}: expected at least one space in each Dict and Tuple, got one of none")
+        raise UsageError(f"action space {space}: expected at least one space in each Dict and Tuple, got an empty one")
     found = mixed([(path, _single_action(inner, "/".join(map(str, path)))) for path, inner in _walk(space, ())])
     if max(found.sizes, default=0) > MOST_CHOICES:
         raise UsageError(f"action space {space}: expected at most {MOST_CHOICES:,} choices, got {max(found.sizes):,}")
@@ -118,7 +118,7 @@ def action_spec(space: gymnasium.Space[Any]) -> ActionSpec:
 
 
 def _has_nothing(space: gymnasium.Space[Any]) -> bool:
-    """Whether it is, or holds, a Dict or Tuple without a space."""
+    """Whether it is, or contains, a Dict or Tuple without a space."""
     match space:
         case spaces.Dict(spaces=inside):
             return not inside or any(map(_has_nothing, inside.values()))
@@ -129,7 +129,7 @@ def _has_nothing(space: gymnasium.Space[Any]) -> bool:
 
 
 def _single_action(space: gymnasium.Space[Any], path: str) -> ActionSpec:
-    """The action of a space that is no Dict and no Tuple. `path`: where it stands, if inside one."""
+    """The action of a space that isn't a Dict or Tuple. `path`: its position, if inside one."""
     where = f" at {path}" if path else ""
     if space.shape is not None and 0 in space.shape:
         expected = f"expected at least one number to choose, got shape {list(space.shape)}"

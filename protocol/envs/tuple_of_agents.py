@@ -18,13 +18,13 @@ from millrace.protocol.errors import UsageError, safe_repr
 
 
 def agents_in_tuples(observation: gymnasium.Space[Any], action: gymnasium.Space[Any]) -> int:
-    """How many agents these spaces may be of: that of the elements, if both are Tuples of equal length; else 0."""
+    """How many agents these spaces may belong to: the number of elements, if both are Tuples of equal length; else 0."""
     count = len(_elements(action))
     return count if count == len(_elements(observation)) else 0
 
 
 def _elements(space: gymnasium.Space[Any]) -> tuple[gymnasium.Space[Any], ...]:
-    """Those of a Tuple; none of another space."""
+    """The elements of a Tuple; empty for another space."""
     return space.spaces if isinstance(space, spaces.Tuple) else ()
 
 
@@ -116,7 +116,7 @@ class TupleOfAgents:
         return dict(zip(self.possible_agents, values, strict=True))
 
     def render(self) -> Any:
-        """What the environment renders."""
+        """The environment's rendered frame."""
         return self.env.render()
 
     def close(self) -> None:

@@ -54,7 +54,7 @@ def load_plugins(env_id: str) -> list[str]:
 
 @contextlib.contextmanager
 def _quietly(module: str, failed: list[str]) -> Iterator[None]:
-    """Within it, another package prints nothing; what it raises becomes a line of `failed`."""
+    """While it is entered, another package's output is suppressed, and its errors become lines of `failed`."""
     try:
         with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
             warnings.simplefilter("ignore")
@@ -70,7 +70,7 @@ def plugin_modules() -> set[str]:
 
 
 def registered_by_plugins(env_id: str) -> bool:
-    """Whether it is a plugin that registers this id, which is registered here. Anybody may have registered it."""
+    """Whether a plugin registers this id, which is registered here, possibly by someone else."""
     here = gymnasium.registry.pop(env_id)
     try:
         load_plugins(env_id)
@@ -80,7 +80,7 @@ def registered_by_plugins(env_id: str) -> bool:
 
 
 def _plugins() -> Iterator[Plugin]:
-    """The plugins. The namespace is the name of the entry point, or stands in the name of its group."""
+    """The plugins. The namespace is the name of the entry point, or part of the name of its group."""
     entry_points = metadata.entry_points()
     for entry_point in (one for group in entry_points.groups for one in entry_points.select(group=group)):
         if (entry_point.group == GROUP or entry_point.group.startswith(f"{GROUP}.")) and _is_whole(entry_point):
@@ -109,7 +109,10 @@ def is_registered(env_id: str) -> bool:
 
 @cache
 def ids_of_gymnasium() -> frozenset[str]:
-    """The ids that gymnasium itself registers. Its registry doesn't tell them from those of others, but its module does."""
+    """The ids that gymnasium itself registers.
+
+    Its registry doesn't distinguish them from others' ids, but its module does.
+    """
     return frozenset(_REGISTERED.findall(Path(gymnasium.envs.__file__).read_text("utf-8")))
 
 
@@ -117,7 +120,7 @@ def ids_of_gymnasium() -> frozenset[str]:
 def what_to_write(env_id: str, why_not: Callable[[str], str]) -> str:
     """What to write instead of an id that is not registered, as the end of a line.
 
-    `why_not` makes an environment, and returns the line that says why it cannot be made, or nothing.
+    `why_not` makes an environment, and returns the line that says why it can't be made, or an empty string.
     """
     return most_similar(env_id, (), why_not) or (
         f"write module:{env_id} with the module that registers it, as in minigrid:MiniGrid-Empty-5x5-v0; one of a client in "
@@ -126,7 +129,7 @@ def what_to_write(env_id: str, why_not: Callable[[str], str]) -> str:
 
 
 def most_similar(env_id: str, examples: Iterable[str], why_not: Callable[[str], str]) -> str | None:
-    """Which of the registered ids and of these `examples` was perhaps meant, as the end of a line; None if none is similar.
+    """The end of a line: which registered id, or which of these `examples`, may have been meant; None if none is similar.
 
     It can be made, or the line says what to install first.
     """

@@ -1,6 +1,6 @@
 """Which env copy is being made, and the arguments and factories that depend on it.
 
-Rule: all but the slot is the same in every run, on every machine and after a resume, so results may depend on it.
+Rule: everything but the slot is the same in every run, on every machine and after a resume, so results may depend on it.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _OPERATORS: dict[type[ast.operator], Callable[[int, int], int]] = {
 
 @dataclass(frozen=True)
 class EnvCopy:
-    """One copy of the environment: which one it is in the run, and which place it takes on its machine.
+    """One copy of the environment: its numbers in the run, and its slot on its machine.
 
     A factory with one argument gets it, `millrace.env_copy()` returns it, and texts among the keyword arguments of the
     environment may use its integers, as in `{5000 + slot}`.
@@ -40,7 +40,8 @@ class EnvCopy:
 
     number: int = 0
     """The copy's place among all copies of the run, from 0: `lane` times the copies of a lane, plus `copy`. A copy that
-    plays evaluations counts among `--eval-copies` instead, and one that is only described has 0."""
+    plays evaluations counts among `--eval-copies` instead, and a copy that is only described has 0.
+    """
     lane: int = 0
     """The lane to which it belongs; 0 for a copy that plays evaluations."""
     copy: int = 0
@@ -48,8 +49,9 @@ class EnvCopy:
     evaluation: bool = False
     """Whether it plays evaluations or recordings."""
     slot: int = 0
-    """The lowest number, from 0, that no other live copy on this machine has: for ports, folders and displays. It may be
-    another one after a resume, and is free again when the copy is closed or its process has ended."""
+    """The lowest number, from 0, that no other live copy on this machine has: for ports, folders and displays. It may differ
+    after a resume, and is free again when the copy is closed or its process has ended.
+    """
 
 
 FIRST_COPY = EnvCopy()
@@ -70,7 +72,7 @@ _making: ContextVar[Making | None] = ContextVar("making", default=None)
 
 @contextmanager
 def making(copy: EnvCopy) -> Iterator[Making]:
-    """Within it, this thread makes this copy."""
+    """While it is entered, this thread makes this copy."""
     under_way = Making(copy)
     token = _making.set(under_way)
     try:
@@ -80,7 +82,7 @@ def making(copy: EnvCopy) -> Iterator[Making]:
 
 
 def being_made() -> EnvCopy | None:
-    """The copy that this thread makes now, if it does: its environment asks."""
+    """The copy that this thread is making now, if any: its environment asks for it."""
     under_way = _making.get()
     if under_way is None:
         return None
@@ -89,7 +91,7 @@ def being_made() -> EnvCopy | None:
 
 
 def filled(kwargs: Mapping[str, Any], env: str) -> dict[str, Any]:
-    """The keyword arguments for the copy that is being made: what its texts have in braces is computed.
+    """The keyword arguments for the copy that is being made: expressions in braces in texts are evaluated.
 
     A text that is one expression becomes an integer. Braces around anything but integers, `+ - * // %` and at least one of
     the names stay as they are. `env` names the environment in the `UsageError` for a division by zero.
@@ -120,7 +122,7 @@ def filled(kwargs: Mapping[str, Any], env: str) -> dict[str, Any]:
 
 
 def _value(node: ast.expr, names: Mapping[str, int]) -> int:
-    """The value of an expression. Raises `LookupError` for one that has anything else in it."""
+    """The value of an expression. Raises `LookupError` if it contains anything else."""
     match node:
         case ast.Name(name):
             return names[name]
@@ -134,7 +136,10 @@ def _value(node: ast.expr, names: Mapping[str, int]) -> int:
 
 
 def takes_copy(factory: Callable[..., object], kwargs: Mapping[str, Any]) -> str:
-    """The parameter of a factory that gets the copy: its first one, if it alone must still be given. Empty if none is."""
+    """The parameter of a factory that gets the copy: its first one, if it is the only one still required.
+
+    Empty if there is none.
+    """
     try:
         parameters = list(inspect.signature(factory).parameters.values())
     except (TypeError, ValueError):  # a callable that has no signature

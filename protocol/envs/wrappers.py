@@ -23,12 +23,12 @@ from millrace.protocol.own_module import own_callable
 
 Wrapper = Callable[..., Any]
 WrapperLike = str | Wrapper
-"""`module:Class`, with or without plain arguments, or what takes an environment and returns one."""
+"""`module:Class`, with or without plain arguments, or a callable that takes an environment and returns one."""
 MAX_WRAPPER_NAME = 1000
 
 
 class NamedWrapper(NamedTuple):
-    """A wrapper's name, read."""
+    """A parsed name of a wrapper."""
 
     module: str
     qualname: str
@@ -63,7 +63,7 @@ def read_wrapper(text: str) -> NamedWrapper:
 
 
 def wrapper_name(wrapper: WrapperLike) -> str:
-    """The name of a wrapper, as a run remembers it. Raises `UsageError` for text that is no name."""
+    """The name of a wrapper, as a run remembers it. Raises `UsageError` for text that isn't a name."""
     if isinstance(wrapper, str):
         if found_by_others(wrapper):
             read_wrapper(wrapper)
@@ -89,7 +89,7 @@ def wrapper_names(wrappers: Sequence[WrapperLike]) -> tuple[str, ...]:
 
 
 def not_named(wrapper: WrapperLike) -> Wrapper | None:
-    """The wrapper itself, if other processes cannot find it by its name; else None. Raises `UsageError`."""
+    """The wrapper itself, if other processes can't find it by its name; else None. Raises `UsageError`."""
     name = wrapper_name(wrapper)
     if found_by_others(name):
         return None
@@ -106,7 +106,7 @@ def not_named(wrapper: WrapperLike) -> Wrapper | None:
 
 
 def wrap(env: Any, wrapper: WrapperLike) -> Any:
-    """The environment in this wrapper: one of gymnasium, or of PettingZoo for its environments.
+    """The environment in this wrapper: a gymnasium wrapper, or a PettingZoo wrapper for PettingZoo environments.
 
     Raises `UsageError`; its `detail` is the traceback if the wrapper itself raised.
     """

@@ -37,13 +37,13 @@ log = logging.getLogger("millrace.authenticator")
 DOMAIN = b"millrace"
 ZAP = "inproc://zeromq.zap.01"
 LIST_CHECK_INTERVAL_S = 1.0  # the list of clients is read again if its file has changed
-MAX_BATCH = 100  # requests, or events, that are handled before the other sockets get their turn
+MAX_BATCH = 100  # requests, or events, handled before the other sockets get their turn
 
 Socket = zmq.Socket[bytes]
 
 
 def serve_with(socket: Socket, key: Key) -> None:
-    """Make this socket a CURVE server that asks ZAP about each client, and refuses all while ZAP does not answer."""
+    """Make this socket a CURVE server that asks ZAP about each client, and refuses all clients while ZAP doesn't answer."""
     socket.curve_server = True
     socket.curve_secretkey = key.secret
     socket.zap_domain = DOMAIN
@@ -62,7 +62,7 @@ def answer(request: Sequence[bytes], keyring: Keyring) -> tuple[list[bytes], str
     number = request[1] if len(request) > 1 else b""
     refused = [b"1.0", number, b"400", b"refused", b"", b""]
     if len(request) != 7 or request[0] != b"1.0":
-        return refused, "the question was not understood"
+        return refused, "the request was not understood"
     _, _, domain, _, _, mechanism, key = request
     if domain != DOMAIN or mechanism != b"CURVE" or len(key) != KEY_BYTES:
         return refused, f"expected CURVE, got {mechanism[:20]!r}"

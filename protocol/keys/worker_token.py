@@ -1,7 +1,7 @@
 """Where a worker's join token comes from: a file that `--token` names, or an environment variable.
 
-Rule: a token never stands on a command line, which other users of the machine can see, and no environment that a worker
-starts inherits it.
+Rule: a token is never on a command line, which other users of the machine can see, and environments that a worker starts
+don't inherit it.
 """
 
 from __future__ import annotations

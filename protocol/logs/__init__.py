@@ -1,1 +1,1 @@
-"""Logging on both sides: how many lines a peer may cause, and notices, which are no warnings."""
+"""Logging on both sides: how many lines a peer may cause, and notices, which aren't warnings."""

@@ -1,6 +1,6 @@
 """Limits what peers can write to the log: how often a line is repeated, and how much each source may log. Pure.
 
-Rule: a peer that causes log lines can neither cause many of them, nor long ones without end, nor make these tables grow.
+Rule: a peer can't cause many log lines, unlimited long ones, or growth of these tables.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from millrace.protocol.token_bucket import TokenBucket
 
 
 class LogRateLimiter:
-    """Says whether a line may be logged now."""
+    """Decides whether a line may be logged now."""
 
     def __init__(self, every_s: float = 60.0, most: int = 20) -> None:
         """Allow one line for each key in `every_s` seconds, for at most `most` keys in that time."""
@@ -57,7 +57,7 @@ class LogBudget:
         return all(covered)
 
     def spend(self, size: int) -> int:
-        """A line of this size is logged. Returns the number of lines that were suppressed since the last one."""
+        """Count a logged line of this size. Returns the number of lines that were suppressed since the last one."""
         self._lines.spend(1)
         self._bytes.spend(size)
         suppressed = self._suppressed
@@ -65,7 +65,7 @@ class LogBudget:
         return suppressed
 
     def suppress(self) -> None:
-        """A line was not logged."""
+        """Count a line that was not logged."""
         self._suppressed += 1
 
 

@@ -1,4 +1,4 @@
-"""When the log tells of a wait: after `FIRST_S`, and then every `AGAIN_S`. Pure."""
+"""When the log mentions a wait: after `FIRST_S`, and then every `AGAIN_S`. Pure."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ class LongWait:
         self._due_s = began_s + FIRST_S
 
     def due(self, now: float) -> bool:
-        """Whether the log is to tell of it now."""
+        """Whether to log it now."""
         if now < self._due_s:
             return False
         self._due_s = now + AGAIN_S
         return True
 
     def seconds(self, now: float) -> float:
-        """How long it lasts."""
+        """How long it has lasted."""
         return now - self._began_s

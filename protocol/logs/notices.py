@@ -1,7 +1,7 @@
-"""Notices: log lines that a person must see and that are no warnings, such as the command that starts a worker.
+"""Notices: log lines that the user must see but that aren't warnings, such as the command that starts a worker.
 
-Rule: a notice has the level WARNING, because a program that sets up no logging shows only warnings. Our own displays of the
-log show it without the word "warning".
+Rule: a notice has the level WARNING, because a program that doesn't set up logging shows only warnings. Millrace itself
+shows it without the word "warning".
 """
 
 from __future__ import annotations

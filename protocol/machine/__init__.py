@@ -1,1 +1,1 @@
-"""What this machine, or the job or container on it, leaves to a process."""
+"""The resources that this machine, or the job or container on it, leaves to a process."""

@@ -1,7 +1,7 @@
 """Imported before PyTorch, it lets PyTorch's threads sleep while they wait for one another.
 
-By default they spin, and hold the core that the slowest of them needs: beside other busy processes, a pass takes up to sixty
-times as long. The library reads the variable only when it is loaded.
+By default they spin, and occupy the core that the slowest of them needs: if other processes are busy, a pass takes up to
+sixty times as long. The library reads the variable only when it is loaded.
 """
 
 from __future__ import annotations
@@ -11,6 +11,6 @@ import sys
 
 VARIABLE = "OMP_WAIT_POLICY"
 SPIN = "torch" in sys.modules and VARIABLE not in os.environ
-"""Whether the threads spin: PyTorch was imported before, and nobody has set the variable."""
+"""Whether the threads spin because PyTorch was imported before the variable was set."""
 
 os.environ.setdefault(VARIABLE, "PASSIVE")

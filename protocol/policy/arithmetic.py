@@ -1,7 +1,7 @@
-"""The work of a policy: multiply-adds of a forward pass of one row. Each weight counts once for each place where it is used.
+"""The work of a policy: multiply-adds of a forward pass of one row.
 
-An activation, a normalization or an addition costs little beside them, and a backward pass costs twice as much as a forward
-pass, so this number alone says how much work a pass is.
+Each weight counts once for each place where it is used. Activations, normalizations and additions cost little in comparison,
+and a backward pass costs twice as much as a forward pass, so this number alone describes the work of a pass.
 """
 
 from __future__ import annotations

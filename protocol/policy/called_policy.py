@@ -5,15 +5,15 @@ The callable `factory(**kwargs)` returns an object with
     load(arrays)             {name: float32 array} as declared; called for each version of the weights
     act(obs, state, rng)     -> action, state, extras
 
-for N env copies. All arrays are its own to change. `obs` is an array [N, *shape]; for a Dict or Tuple observation it is a
+for N env copies. It may change all arrays. `obs` is an array [N, *shape]; for a Dict or Tuple observation it is a
 dict of such arrays, by path. `state` [N, S] float32 is zeros when an episode begins. `rng` is the numpy `Generator` of
 these copies. `action` [N, *action] is stored as it is returned: whole numbers that count from 0, or float32 before clipping.
 `extras` has one array [N, *shape] for each name that was declared. If there is `act_greedy(obs, state, rng)`, evaluations
 call it in place of `act`. In a run with action masks, both are called with `mask=` [N, choices] bool: which actions are
 allowed.
 
-Rule: `act` is called once for each lane and step, with exactly the copies of that lane. So if it keeps nothing between its
-calls but `state`, a rollout has the same bits whatever else the worker does.
+Rule: `act` is called once for each lane and step, with exactly the copies of that lane. So if `state` is all that it keeps
+between calls, a rollout has the same bits whatever else the worker does.
 """
 
 from __future__ import annotations
@@ -48,10 +48,10 @@ class Acted(NamedTuple):
 
 
 class CalledPolicy:
-    """The user's policy. Everything that goes wrong in it is raised as `PolicyFailed`."""
+    """A user-defined policy. All its errors are raised as `PolicyFailed`."""
 
     def __init__(self, spec: PolicySpec, extras: tuple[ExtraArray, ...], called: str = "policy") -> None:
-        """Make it. `extras` are those of the run. `called`: what errors call it."""
+        """Make it. `extras`: the extras of the run. `called`: how errors refer to it."""
         assert spec.own is not None
         self._called = called
         self._spec = spec
@@ -68,7 +68,7 @@ class CalledPolicy:
                 raise self._wrong(f"{expected}, got {type(self._made).__name__} without {name}")
 
     def load(self, parameters: Floats, buffers: Floats) -> None:
-        """Give it these weights, if it has any."""
+        """Load these weights, if it has any."""
         self._guarded("load", lambda: self._made.load(named_views(parameters.copy(), self._fields)))
 
     def act(

@@ -6,12 +6,12 @@ and a comparison. The log-probabilities of a whole rollout are computed in one c
     Categorical   P = Σ sizes   logits; action = argmax(logits + Gumbel noise)               (Gumbel-max trick)
     Bernoulli     P = K         logits; action = logits + logistic noise > 0
     Gaussian      P = 2 D       mean, log standard deviation; action = mean + exp(log_std) · normal noise, not clipped
-    Product       their sum     independent factors: params, noise and actions of one stand behind those of the other
+    Product       their sum     independent factors, whose params, noise and actions are concatenated
 
 A mixed action has at most three factors, because a stored row has the choices of all its parts, then all bits, then all
 numbers (`millrace.protocol.action_parts`).
 
-Those of DQN, SAC and TD3, which explore by numbers that the learner sends, stand in `exploration.py`.
+The distributions of DQN, SAC and TD3, which explore by numbers that the learner sends, are in `exploration.py`.
 
 `millrace.protocol.policy.torch_distributions` computes the same log-probabilities in torch, and entropies; a test compares
 them.
@@ -156,7 +156,7 @@ class Factor(NamedTuple):
 
 
 class Product:
-    """Independent distributions, whose actions [k] each are one row [D] float32 together (Dict, Tuple)."""
+    """Independent distributions, whose actions [k] together form one row [D] float32 (Dict, Tuple)."""
 
     def __init__(self, factors: Sequence[tuple[Categorical | Bernoulli | Gaussian, int]]) -> None:
         """`factors`: each with k, the size of its actions."""

@@ -23,7 +23,7 @@ from millrace.protocol.policy.features import feature_size
 from millrace.protocol.random_streams import Purpose, torch_seed
 from millrace.protocol.specs import ActionSpec, EncoderSpec, Leaf, NamedShape, PolicySpec
 
-ROWS = 2  # observations of a trial pass: with one, a module that mixes up rows would not be noticed
+ROWS = 2  # observations of a trial pass: with only one, a module that mixes up rows would go unnoticed
 
 
 def describe_encoder(factory: str, observation: tuple[Leaf, ...], action: ActionSpec) -> EncoderSpec:
@@ -55,7 +55,7 @@ def make_encoder(spec: PolicySpec, seed: int) -> torch.nn.Module:
 def multiply_adds_of_encoder(spec: PolicySpec) -> int:
     """Multiply-adds of a pass of one observation: for each module, its weights times the places of its output.
 
-    Exact for linear layers and convolutions. A cell of an LSTM or attention uses its weights more often than this.
+    Exact for linear layers and convolutions. LSTM cells and attention use their weights more often than this.
     """
     assert spec.encoder is not None
     encoder = _make(spec.encoder.factory, spec, seed=0)
@@ -91,7 +91,7 @@ def _make(factory: str, spec: PolicySpec, seed: int) -> torch.nn.Module:
     if not isinstance(module, torch.nn.Module):
         raise UsageError(f"encoder {factory}: expected it to return a torch.nn.Module, got {type(module).__name__}")
     if kept := [name for name, _ in module.named_buffers()]:
-        raise UsageError(f"encoder {factory}: expected parameters alone, got the buffer {kept[0]}; use LayerNorm, say")
+        raise UsageError(f"encoder {factory}: expected only parameters, got the buffer {kept[0]}; use LayerNorm, say")
     usual = (torch.float32, torch.get_default_dtype())  # the latter is the program's own choice, or an environment's
     if strange := [name for name, parameter in module.named_parameters() if parameter.dtype not in usual]:
         raise UsageError(f"encoder {factory}: expected float32 parameters, got another dtype in {strange[0]}")

@@ -24,7 +24,7 @@ from millrace.protocol.arrays import Array, Floats
 
 LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
 TINY = np.float32(1e-30)
-"""the smallest number of which a logarithm is taken"""
+"""lower bound of arguments of a logarithm"""
 
 
 class ActionValues(NamedTuple):
@@ -149,9 +149,9 @@ class SquashedGaussian(_Bounded):
         return self._uniform_in_warm_up(warm_up, uniform, np.tanh(mean + np.exp(log_std) * normal))
 
     def log_prob(self, params: Floats, action: Array, noise: Floats | None = None) -> Floats:
-        """Log-density [...] in [-1, 1]^D: of the normal distribution, less log(1 − tanh²), summed; −D log 2 in the warm-up.
+        """Log-density [...] in [-1, 1]^D: of the normal distribution, minus log(1 − tanh²), summed; −D log 2 in the warm-up.
 
-        It is computed from the noise: an action near ±1 does not tell where in the normal distribution it came from.
+        It is computed from the noise: an action near ±1 doesn't determine where in the normal distribution it came from.
         Raises ValueError without noise.
         """
         if noise is None:

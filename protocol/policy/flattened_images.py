@@ -1,6 +1,6 @@
-"""Says of observations that look like images, but are flattened, how the convolutions get them. Pure.
+"""Advice for observations that look like images but are flattened: how to pass them to the convolutions. Pure.
 
-Rule: what an image is decides `Leaf.is_image` alone. This file only recognizes what a user may have taken for one.
+Rule: only `Leaf.is_image` decides what an image is. This file only recognizes arrays that the user may have meant as one.
 """
 
 from __future__ import annotations
@@ -10,14 +10,14 @@ from collections.abc import Iterator
 
 from millrace.protocol.specs import Leaf, PolicySpec
 
-LEAST_SIDE = 36  # pixels, from which on an image goes through three convolutions
+LEAST_SIDE = 36  # pixels from which on an image goes through three convolutions
 COLORS = (1, 3, 4)
 GRAY = "gymnasium.wrappers:GrayscaleObservation"
 STACKED = '"gymnasium.wrappers:FrameStackObservation(stack_size=4)"'
 
 
 def flattened_images(policy: PolicySpec) -> Iterator[str]:
-    """A line for each array of the observation that perhaps holds images, and goes straight into a layer of `net`."""
+    """A line for each array of the observation that may contain images but goes straight into a layer of `net`."""
     if policy.encoder is not None or policy.own is not None:
         return
     for leaf in policy.observation:

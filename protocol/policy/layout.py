@@ -68,7 +68,8 @@ def convolutions(leaf: Leaf) -> tuple[tuple[Conv, ...], tuple[int, int, int], in
 def parameter_layout(spec: PolicySpec) -> tuple[tuple[Field, ...], tuple[Field, ...]]:
     """The fields that are needed to act, and then those of the critic. Linear weights are [out, in].
 
-    Of actions in [-1, 1], the encoder stands last among those that act, beside the critics, whose losses alone train it.
+    For actions in [-1, 1], the encoder is last among the acting ones, next to the critics, because only their losses train
+    it.
     """
     if spec.own is not None:
         return tuple(Field(array.name, array.shape, 0) for array in spec.own.arrays), ()
@@ -100,9 +101,9 @@ def parameter_layout(spec: PolicySpec) -> tuple[tuple[Field, ...], tuple[Field, 
 
 
 def encoder_layout(spec: PolicySpec) -> tuple[list[Field], int]:
-    """The fields of what comes before the hidden layers, and how many features it gives.
+    """The fields before the hidden layers, and the number of features that they output.
 
-    That is: for each image its convolutions, or the user's own module; then the recurrent core, if there is one.
+    These are, for each image, its convolutions, or the user-defined module; then the recurrent core, if there is one.
     """
     fields: list[Field] = []
     width = feature_size(spec)
@@ -195,7 +196,7 @@ EXPLORATION = ("epsilon", "noise_scale", "warm_up")
 
 
 def appended_params(spec: PolicySpec, buffers: Mapping[str, Array]) -> Array | None:
-    """The numbers [K] that stand behind a network's output in the distribution params; None if there are none."""
+    """The numbers [K] that follow a network's output in the distribution params; None if there are none."""
     appended = [buffers[field.name] for field in buffer_layout(spec) if field.name in EXPLORATION]
     return np.concatenate(appended) if appended else None
 

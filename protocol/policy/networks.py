@@ -52,19 +52,19 @@ class RecurrentInput(NamedTuple):
     advances: Tensor | None = None  # [T, C] bool: False where the row leaves the state as it was; None: it never does
 
     def part(self, steps: int, columns: Tensor | slice, output_rows: Tensor | None = None) -> RecurrentInput:
-        """That of the first steps of some columns."""
+        """The input for the first steps of some columns."""
         advances = None if self.advances is None else self.advances[:steps, columns]
         return RecurrentInput(self.initial_state[columns], self.keep_state[:steps, columns], output_rows, advances)
 
 
 @contextmanager
 def defaults_of_thread() -> Iterator[None]:
-    """PyTorch's own defaults, of those that each thread has for itself: gradients, no autocast, tensors on the CPU."""
+    """PyTorch's own values of its thread-local defaults: gradients, no autocast, tensors on the CPU."""
     with ExitStack() as stack:
         stack.enter_context(torch.inference_mode(False))
         stack.enter_context(torch.enable_grad())
         if torch.get_default_device().type != "cpu":
-            stack.enter_context(torch.device("cpu"))  # else not entered: every call of torch takes longer in it
+            stack.enter_context(torch.device("cpu"))  # otherwise not entered, because it slows every call of torch
         for device in ("cpu", "cuda"):
             if torch.is_autocast_enabled(device):
                 stack.enter_context(torch.autocast(device, enabled=False))
@@ -72,7 +72,7 @@ def defaults_of_thread() -> Iterator[None]:
 
 
 def refuse_second_derivatives() -> None:
-    """Raise `RuntimeError` in a backward pass with `create_graph`, whose result would lack what depends on hidden layers."""
+    """Raise `RuntimeError` in a backward pass with `create_graph`, whose result would lack the terms of hidden layers."""
     if torch.is_grad_enabled():
         raise RuntimeError("millrace's networks have no second derivatives; call backward without create_graph")
 
@@ -117,7 +117,7 @@ class MLPNode(torch.autograd.Function):
 
 
 class StackedMLP(torch.autograd.Function):
-    """K networks of one form on the same input, as one node: `MLPNode` with batched matrix products, [B, D] -> [K, B, O]."""
+    """K networks of one shape on the same input, as one node: `MLPNode` in batched products, [B, D] -> [K, B, O]."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, relu: bool, flat: Tensor, layers_of: Callable[[Tensor], list[Tensor]]) -> Tensor:
@@ -136,7 +136,7 @@ class StackedMLP(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *outputs: Tensor) -> tuple[Tensor | None, ...]:
-        """Gradients of x and of `flat`, of those that are wanted."""
+        """Gradients of x and of `flat`, where wanted."""
         refuse_second_derivatives()
         (g,) = outputs
         half = len(ctx.saved_tensors) // 2
@@ -168,7 +168,7 @@ class Convolutions(NamedTuple):
     bfloat16: bool = False  # parameters are bfloat16, and the first weight is divided by `divisor`
 
     def in_bfloat16(self) -> Convolutions:
-        """The same with bfloat16 copies of the parameters, in channels-last format, which takes half the time of others."""
+        """A copy with bfloat16 parameters, in channels-last format, which takes half the time of other formats."""
         (first, bias), *others = ((weight.to(torch.bfloat16), bias.to(torch.bfloat16)) for weight, bias in self.parameters)
         *convs, out = [(first / self.divisor, bias), *others]
         channels_last = [(weight.contiguous(memory_format=torch.channels_last), bias) for weight, bias in convs]
@@ -203,10 +203,10 @@ def named_leaves(values: Tensor, gradient: Tensor, fields: Sequence[Field]) -> d
 
 
 class Encoder:
-    """What comes before the MLPs: the convolutions of each image or the user's own module, then the recurrent core."""
+    """The layers before the MLPs: the convolutions of each image or the user-defined module, then the recurrent core."""
 
     def __init__(self, spec: PolicySpec, parameters: dict[str, Tensor], device: str | torch.device, *, seed: int) -> None:
-        """`parameters`: leaves of the graph, by name. Those of the user's own module take their places."""
+        """`parameters`: leaves of the graph, by name. The user-defined module's parameters replace them."""
         self._spec = spec
         self._parameters = parameters
         self._module = None if spec.encoder is None else self._adopt(make_encoder(spec, seed).to(device))
@@ -222,7 +222,7 @@ class Encoder:
     def __call__(self, x: Tensor, images: Sequence[Tensor], recurrent: RecurrentInput | None = None) -> Tensor:
         """Features [B, D] and images [B, *leaf] uint8 -> input of the MLPs [B, D + IMAGE_FEATURES per image].
 
-        With the user's own module, the input of the MLPs is the module's output [B, K].
+        With a user-defined module, the input of the MLPs is the module's output [B, K].
 
         With a core, it is the core's output [B, H], for x and images of [T · C, …]. `recurrent` says where episodes begin
         and which B rows to return. None: each observation is the first of its episode.
@@ -369,7 +369,7 @@ class ActorCriticNetwork(FlatNetwork):
         return self.hidden(self.encode(x[:, : self._acting_features], images, recurrent), self._trunk)
 
     def _value(self, h: Tensor, x: Tensor, recurrent: RecurrentInput | None) -> Tensor:
-        """V [B] of what the actor sees, `h`, and the features behind it."""
+        """V [B] of the actor's input `h`, and of the critic's extra features in `x`."""
         if self.spec.critic:
             more = x[:, self._acting_features :]
             rows = None if recurrent is None else recurrent.output_rows
@@ -381,7 +381,7 @@ class ActorCriticNetwork(FlatNetwork):
     ) -> tuple[Tensor, Tensor]:
         """Features [B, D] float32 and images [B, *leaf] uint8 -> distribution params [B, P], value [B].
 
-        Behind the D features come those that only the critic sees, if there are any.
+        The D features are followed by those that only the critic sees, if any.
 
         With a core, x and images are [T · C, …], and `recurrent` says where episodes begin and which B rows to return.
         """
@@ -411,7 +411,7 @@ class ActorCriticNetwork(FlatNetwork):
         """
         params, value = self.forward(x, images, recurrent)
         if mask is not None:
-            others = params.shape[-1] - mask.shape[-1]  # those of bits and numbers, which come behind the choices
+            others = params.shape[-1] - mask.shape[-1]  # params of bits and numbers, which follow the choices
             params = params.masked_fill(F.pad(~mask, (0, others)), FORBIDDEN)
         return *log_prob_and_entropy(self.spec.action, params, action), value
 
@@ -453,8 +453,8 @@ class ActorAndCritics(FlatNetwork):
     """An actor of actions in [-1, 1] and two critics, which value an observation with an action. Each has its own MLPNode.
 
     `actor` and `critics` are the two parts of the flat tensor, with their parts of the gradients: one for each optimizer.
-    The encoder, if there is one, is learned with the critics, and the actor takes what it gives (Yarats et al. 2022). So
-    losses are written in the encoder's outputs h [B, H], which are the features where nothing is encoded.
+    The encoder, if there is one, is trained with the critics, and the actor takes its output (Yarats et al. 2022). So losses
+    are written in the encoder's outputs h [B, H], which are the features if there is no encoder.
     """
 
     def __init__(self, spec: PolicySpec, device: str | torch.device = "cpu", *, seed: int = 0) -> None:
@@ -487,7 +487,7 @@ class ActorAndCritics(FlatNetwork):
         return views
 
     def params(self, x: Tensor, images: Sequence[Tensor] = ()) -> Tensor:
-        """As `actor_params`, for features [B, D] float32 and images [B, *leaf] uint8: to act."""
+        """Like `actor_params`, for features [B, D] float32 and images [B, *leaf] uint8, for acting."""
         return self.actor_params(self.encode(x, images))
 
     def head(self, h: Tensor) -> Tensor:
@@ -497,7 +497,7 @@ class ActorAndCritics(FlatNetwork):
     def actor_params(self, h: Tensor) -> Tensor:
         """The actor's output before the tangent: [B, D′] (deterministic) or [B, 2 D′].
 
-        Of a squashed Gaussian, the second half is the logarithm of the standard deviations, clipped to [-20, 2].
+        For a squashed Gaussian, the second half is the logarithm of the standard deviations, clipped to [-20, 2].
         """
         out = self.mlp(h, self._actor)
         if self.spec.head == "deterministic":

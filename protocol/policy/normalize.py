@@ -12,6 +12,6 @@ CLIP = np.float32(10.0)  # normalized observations are clipped to ±10
 def normalize(x: Floats | Doubles, mean: Floats, std: Floats) -> Floats:  # rule NORMALIZED
     """(x − mean) / std, clipped to ±10, float32. It is computed in the dtype of x.
 
-    So a wide observation keeps the digits by which it differs from the mean, however large both are.
+    So a wide observation keeps the digits in which it differs from the mean, however large both are.
     """
     return np.asarray(np.clip((x - mean) / std, -CLIP, CLIP)).astype(np.float32, copy=False)

@@ -51,7 +51,7 @@ def _factors(spec: ActionSpec) -> list[_TorchFactor]:
 
 
 def policy_log_prob(policy: PolicySpec, params: Tensor, action: Tensor) -> Tensor:
-    """Log π(action) [B] of an actor's params [B, P] and stored actions [B, *action], from wherever these come.
+    """Log π(action) [B] of an actor's params [B, P] and stored actions [B, *action] from any source.
 
     A squashed action is taken to be at most `SQUASHED_BOUND` in size: the density of ±1 itself is zero or infinite. A
     deterministic actor gets normal noise of standard deviation 1 around its action.
@@ -69,7 +69,7 @@ def policy_log_prob(policy: PolicySpec, params: Tensor, action: Tensor) -> Tenso
 def squashed_sample(params: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
     """Actions [B, D] = tanh(mean + std · noise) and their log-densities [B], for params [B, 2 D] and normal noise [B, D].
 
-    The log-density is computed from the noise (`exploration.SquashedGaussian`), so that it is exact also near ±1.
+    The log-density is computed from the noise (`exploration.SquashedGaussian`), so that it is exact even near ±1.
     """
     mean, log_std = params.chunk(2, -1)
     latent = mean + log_std.exp() * noise
@@ -78,19 +78,19 @@ def squashed_sample(params: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _categorical(logits: Tensor, choice: Tensor) -> tuple[Tensor, Tensor]:
-    """Of logits [B, n], and the choice [B, 1] among them."""
+    """Log-probability and entropy for logits [B, n] and the choice [B, 1] among them."""
     log_probs = F.log_softmax(logits, -1)
     return log_probs.gather(-1, choice.long())[:, 0], -(log_probs.exp() * log_probs).sum(-1)
 
 
 def _bernoulli(logits: Tensor, bits: Tensor) -> tuple[Tensor, Tensor]:
-    """Of logits [B, k], and as many bits."""
+    """Log-probability and entropy for logits [B, k] and as many bits."""
     softplus = F.softplus(logits)
     return (bits.to(logits.dtype) * logits - softplus).sum(-1), (softplus - logits * torch.sigmoid(logits)).sum(-1)
 
 
 def _gaussian(params: Tensor, numbers: Tensor) -> tuple[Tensor, Tensor]:
-    """Of means and log standard deviations [B, 2 k], and numbers [B, k]."""
+    """Log-probability and entropy for means and log standard deviations [B, 2 k], and numbers [B, k]."""
     mean, log_std = params.chunk(2, -1)
     z = (numbers - mean) * torch.exp(-log_std)
     return (-0.5 * z * z - log_std - LOG_SQRT_2PI).sum(-1), (log_std + (0.5 + LOG_SQRT_2PI)).sum(-1)

@@ -1,1 +1,1 @@
-"""What the arrays of rows must be."""
+"""Checks of the arrays of rows."""

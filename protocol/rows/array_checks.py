@@ -1,6 +1,6 @@
-"""Checks of arrays from elsewhere: of shape and dtype, and that their values are finite and of their space. Pure.
+"""Checks arrays from elsewhere: shape, dtype, and that values are finite and in their space. Pure.
 
-Each check returns what is wrong, as one line; an empty one if nothing is. A line names the first wrong value and its place:
+Each check returns an error of one line; empty if nothing is wrong. A line names the first wrong value and its place:
 `axes` names the leading dimensions of an array, so that ("step", "copy") leads to "at step 3, copy 1". The names of a copy's
 seats in place of "copy" say that it has a column for each: ("step", ("black", "white")) leads to "at step 3, copy 1, white".
 """
@@ -27,7 +27,7 @@ class Expected(NamedTuple):
     shape: tuple[int, ...]
     dtype: str
     space: Leaf | ActionSpec | None = None
-    """None: any finite numbers. Of an action, which is stored: choices from 0."""
+    """None: any finite numbers. For an action: as stored, with choices from 0."""
 
 
 def wrong_arrays(expected: Iterable[Expected], axes: Axes | None = STEP_AND_COPY) -> str:
@@ -50,9 +50,9 @@ def wrong_observation(
 
 
 def wrong_values(array: Array, space: Leaf | ActionSpec | None = None, axes: Axes = STEP_AND_COPY, first: int = 0) -> str:
-    """What is wrong with values [..., *shape]: one is not finite, or is not of its `space`, if that counts its values.
+    """What is wrong with values [..., *shape]: one is not finite, or not in its `space`, if that has countable values.
 
-    The bounds of a Box are not checked: many environments leave theirs. `first`: the number of row 0.
+    The bounds of a Box are not checked, because many environments exceed theirs. `first`: the number of row 0.
     """
     # `count_nonzero` takes a third of the time of `all` and `any`.
     if array.dtype.kind == "f" and np.count_nonzero(finite := np.isfinite(array)) != array.size:
@@ -94,7 +94,7 @@ def _first(array: Array, wrong: Bools, axes: Axes, first: int) -> str:
 
 
 def place_of(index: Iterable[int], axes: Axes) -> str:
-    """Where an entry of an array stands, in words."""
+    """The position of an entry of an array, in words."""
     words = []
     for axis, number in zip(axes, index, strict=False):
         copy, seat = (number, None) if isinstance(axis, str) else divmod(number, len(axis))

@@ -1,8 +1,8 @@
-"""What a rollout must be: arrays of the run's shapes and dtypes, values of its spaces, and the law of a row. Pure.
+"""Checks a rollout: arrays of the run's shapes and dtypes, values in its spaces, and the row law. Pure.
 
-Rule: whatever an environment can break is found by the worker that has the environment, before it sends: values by
-`workers/copies/value_checks.py`, the law of seats by `protocol/envs/seats.py`. The learner checks it all again, because a
-worker may be hostile.
+Rule: the worker that has the environment finds everything that an environment can break, before it sends: values by
+`workers/copies/value_checks.py`, the law of seats by `protocol/envs/seats.py`. The learner checks everything again, because
+a worker may be hostile.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from millrace.protocol.specs import ActionSpec, RunSpec
 
 LARGEST_REWARD = float(np.finfo(np.float32).max) * (1 + 2**-25)
 """No larger number is finite as a float32: returns are sums of rewards before they are rounded."""
-OF_SAVED_BYTES = 1_000  # that a saved state takes besides itself
+OF_SAVED_BYTES = 1_000  # overhead of a saved state
 
 
 def validate(rollout: Rollout, run: RunSpec, most_steps: int = LARGEST) -> None:
     """Check a rollout. Raises `BadRollout`, with a one-line message, if it does not fit the run or breaks the row format.
 
-    `most_steps`: that an episode can have.
+    `most_steps`: the longest that an episode can be.
     """
     T = run.rollout_steps
     N = run.sent_columns
@@ -77,7 +77,7 @@ def validate(rollout: Rollout, run: RunSpec, most_steps: int = LARGEST) -> None:
     begun = [each.copy for each in rollout.begun]
     if len(set(begun)) < len(begun) or max(begun, default=0) >= run.copies:
         raise BadRollout(f"begun: expected each of the copies 0 to {run.copies - 1} at most once, got {begun[:100]}")
-    if (start := max((each.start for each in rollout.begun), default=0)) > LARGEST // 2:  # the next ones are natural, too
+    if (start := max((each.start for each in rollout.begun), default=0)) > LARGEST // 2:  # the next ones must fit, too
         raise BadRollout(f"begun: expected starts up to {LARGEST // 2}, got {start}")
     if len(set(rollout.saved)) < len(rollout.saved) or max(rollout.saved, default=0) >= run.copies:
         raise BadRollout(f"saved: expected copies 0 to {run.copies - 1}, each at most once, got {rollout.saved[:100]}")
@@ -109,7 +109,7 @@ def _check_seats(valid: Array, ended: Array, resets: Array, run: RunSpec) -> Non
 
 
 def _check_mask(mask: Array, rollout: Rollout, action: ActionSpec, axes: Axes) -> None:
-    """Raise `BadRollout` if a mask allows no choice, or forbids what was done."""
+    """Raise `BadRollout` if a mask allows no choice, or forbids the chosen action."""
     if (empty := no_choice(mask, action)).any():
         raise BadRollout(f"mask: expected an allowed choice at {place_of(np.argwhere(empty)[0], axes)}, got none")
     if (wrong := rollout.valid & not_allowed(rollout.action, mask[:-1], action)).any():
@@ -119,7 +119,7 @@ def _check_mask(mask: Array, rollout: Rollout, action: ActionSpec, axes: Axes) -
 
 
 def wrong_episode(episode: Episode, run: RunSpec, most_steps: int) -> str:
-    """What is wrong with an episode of at most so many steps; empty if it can be one of the run."""
+    """What is wrong with an episode of at most this many steps; empty if it can belong to the run."""
     whole = 0 < episode.length <= most_steps and 0 <= episode.seconds < math.inf
     if not (whole and abs(episode.reward) <= episode.length * run.seats_of_copy * LARGEST_REWARD):  # false for NaN too
         return f"expected a finite return of 1 to {most_steps} float32 rewards and a duration, got {episode}"

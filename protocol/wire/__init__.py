@@ -1,1 +1,1 @@
-"""Frames, arrays and sockets: how messages travel."""
+"""Frames, arrays and sockets: how messages are sent."""

@@ -1,7 +1,7 @@
 """Message <-> frames. Pure: bytes in, records out; bounded; no pickle.
 
 Frame 0 is the head, msgpack: [type's name, field, field, …] in the order of the record, each array in its place as [dtype,
-shape, index of its frame]. Only `Hello` and `Refuse` are maps: fields by name, and the type's name under `type`, because
+shape, index of its frame]. Only `Hello` and `Refuse` are maps (fields by name, and the type's name under `type`), because
 every version must understand them. Frames 1… are the arrays' raw bytes, C-ordered, little-endian. Everything that a peer
 sends is checked before it is used: the number of frames and bytes, the head's size and nesting, every type, every shape. A
 received array is a read-only view of its frame, not a copy.
@@ -185,7 +185,7 @@ def _decode(frames: Sequence[Buffer], kinds: MessageTypes, packed_bytes_limit: i
         raise BadMessage(one_line(str(error), 500)) from error  # it may quote the peer
     except Exception as error:  # msgpack and msgspec raise a dozen types for invalid bytes
         reason = one_line(" ".join(_explain_validation_error(str(error), head, by_position).split()), 200)  # quotes the peer
-        raise BadMessage(f"head is not a message of ours: {type(error).__name__}: {reason}") from error
+        raise BadMessage(f"head is not a message of millrace: {type(error).__name__}: {reason}") from error
     if isinstance(message, Described):
         check_size(message.description)
     if len(used) != len(frames) - 1:
@@ -228,7 +228,7 @@ def _described(frames: Sequence[Buffer], value: object) -> _DescribedArray:
         raise BadMessage(f"array expected [dtype, shape, index], got {str(value)[:80]}")
     dtype = DTYPES.get(name)
     if dtype is None:
-        raise BadMessage(f"array dtype expected one of ours, got {name[:20]!r}")
+        raise BadMessage(f"array dtype expected a supported one, got {name[:20]!r}")
     size = dtype.itemsize
     for side in shape:
         if not (type(side) is int and 0 <= side <= MAX_FRAME_BYTES and len(shape) <= MAX_DIMENSIONS):

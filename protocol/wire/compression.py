@@ -100,18 +100,18 @@ def _decompressed(frame: Frame, least: int, most: int) -> bytes:
     try:
         import zstandard
     except ImportError:
-        raise BadMessage("zstd was not asked for, and cannot be read here") from None
+        raise BadMessage("zstd was not requested, and cannot be read here") from None
     try:
         held = zstandard.frame_content_size(frame)  # -1: not declared
         if not least <= held <= most:
-            raise BadMessage(f"zstd: expected a frame that says it holds {least} to {most} bytes, got {held}")
+            raise BadMessage(f"zstd: expected a frame that declares {least} to {most} bytes, got {held}")
         return zstandard.ZstdDecompressor().decompress(frame, allow_extra_data=False)
     except zstandard.ZstdError as error:
         raise BadMessage(f"zstd: {' '.join(str(error).split())[:200]}") from error
 
 
 def pack_stack(array: Array) -> Bytes | None:
-    """The payload of a frame stack; None if the array is no frame stack or packing saves too little."""
+    """The payload of a frame stack; None if the array isn't a frame stack or packing saves too little."""
     if not _may_be_stack(array.dtype, array.shape):
         return None
     steps, copies, k = array.shape[:3]

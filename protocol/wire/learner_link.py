@@ -47,7 +47,7 @@ class LearnerLink:
         self.received = Traffic()
         self.sent = Traffic()
         self.refused_messages = 0
-        """messages under keys that are not allowed any more"""
+        """messages with keys that are not allowed any more"""
         self.packed_bytes_limit = 0
         """most bytes that the packed arrays of one message may unpack to; 0: no array may be packed"""
         self._last_keys: dict[bytes, str] = {}  # routing id -> key of its last message
@@ -94,7 +94,7 @@ class LearnerLink:
     def receive(self) -> Iterator[tuple[bytes, ToLearner | Inquire | BadMessage]]:
         """Messages that have arrived, each with its sender; at most MAX_MESSAGES. An unreadable one comes as its error."""
         sender_keys: list[str] | None = None if self.keyring is None else []
-        for _ in range(MAX_MESSAGES):  # a flood must not block the learner
+        for _ in range(MAX_MESSAGES):  # so that a flood can't block the learner
             frames = receive_frames(self._socket, sender_keys)
             if frames is None:
                 return
@@ -114,23 +114,23 @@ class LearnerLink:
         return "" if self.keyring is None else self.keyring.allowed.rejection_reason(_key_of(peer))
 
     def name_for_log(self, peer: bytes) -> str:
-        """The name for log lines about this peer: that of its key, or without keys the one it gave itself."""
+        """The name for log lines about this peer: the name of its key, or without keys its own name."""
         return name_for_people(peer) if self.keyring is None else self.keyring.allowed.name_of(_key_of(peer))
 
     def source(self, peer: bytes) -> str:
-        """Who answers for this peer: the name of its key. Empty without keys, for a name proves nothing there."""
+        """The name of this peer's key. Empty without keys, because names prove nothing then."""
         return "" if self.keyring is None else self.name_for_log(peer)
 
     def _peer(self, routing_id: bytes, key: str) -> bytes:
         """The peer that uses this routing id now."""
-        self._last_keys.pop(routing_id, None)  # so that the routing id of the oldest message stands first
+        self._last_keys.pop(routing_id, None)  # so that the routing id of the oldest message is first
         self._last_keys[routing_id] = key
         if len(self._last_keys) > MAX_REMEMBERED_KEYS:
             del self._last_keys[next(iter(self._last_keys))]
         return b"%s\0%s" % (routing_id, key.encode())
 
     def _refuse_key(self, peer: bytes) -> bool:
-        """Count and answer a message if its key is not allowed any more; whether it was not."""
+        """Count and answer a message if its key is not allowed any more. Returns whether that was so."""
         why = self.rejection_reason(peer)
         if why:
             self.refused_messages += 1

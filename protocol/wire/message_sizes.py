@@ -9,5 +9,5 @@ from __future__ import annotations
 MAX_FRAME_BYTES = 1 << 30
 MAX_FRAMES = 256  # a description has two for each array of a space
 MAX_HEAD_BYTES = 1 << 20
-MAX_ITEMS = 1 << 16  # in a list or map of a worker's message; of the learner's, its head bounds them
+MAX_ITEMS = 1 << 16  # in a list or map of a worker's message; the learner's messages are bounded by the head
 MAX_DIMENSIONS = 8

@@ -40,7 +40,7 @@ def pack(value: object, use_repr: bool = False) -> bytes:
 def unpack(data: bytes | memoryview) -> Any:
     """The value of these bytes. Raises `BadMessage` for invalid bytes, and no other error.
 
-    What it returns can be walked recursively: it has at most `MAX_DEPTH` levels.
+    The result can be walked recursively: it has at most `MAX_DEPTH` levels.
     """
     try:
         value = _unpack(data, 0)
@@ -177,13 +177,13 @@ def _from_extension(code: int, data: bytes, inner: Callable[[bytes], Any]) -> An
         case 8:  # _REPR
             return ReprString(data.decode())
         case _:
-            raise BadMessage(f"plain value: expected one of ours, got extension {code}")
+            raise BadMessage(f"plain value: expected a known extension, got {code}")
 
 
 def _dtype(name: object) -> np.dtype[Any]:
     kind = np.dtype(str(name))
     if kind.kind not in DTYPE_KINDS:
-        raise BadMessage(f"array dtype: expected one of plain data, got {str(name)[:20]!r}")
+        raise BadMessage(f"array dtype: expected one for plain data, got {str(name)[:20]!r}")
     return kind
 
 
@@ -194,7 +194,7 @@ def _check_characters(raw: bytes, kind: np.dtype[Any]) -> None:
 
 
 def repr_paths(value: object, where: str = "") -> list[str]:
-    """The paths inside the value at which a `ReprString` stands."""
+    """The paths inside the value that lead to a `ReprString`."""
     match value:
         case ReprString():
             return [where]

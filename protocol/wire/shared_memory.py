@@ -3,7 +3,7 @@
 Rule: each counter of a lane has one writer. The learner writes the actions and then raises `ordered`; the worker writes
 the results of the step and then raises `answered` to the same number; only then does the other side read. The memory is an
 unlinked file and the wake-up pipes have no names: child processes inherit the descriptors, so nothing is left behind when a
-process dies. Linux only; elsewhere everything travels as messages.
+process dies. Linux only; elsewhere everything is sent as messages.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from millrace.protocol.arrays import Array
 from millrace.protocol.specs import StepSpec
 
 SUPPORTED = hasattr(os, "memfd_create") and hasattr(os, "pipe2")
-CACHE_LINE_BYTES = 64  # each counter of a lane has a cache line of its own
+CACHE_LINE_BYTES = 64  # each counter of a lane has its own cache line
 WORDS = CACHE_LINE_BYTES // 8
-MIN_INFO_BYTES = 1 << 20  # space for the infos of a lane, at least; longer infos travel as a message
-INFOS_IN_MESSAGE = -1  # in place of the number of bytes: the infos of this step travel as a message
+MIN_INFO_BYTES = 1 << 20  # least space for the infos of a lane; longer infos are sent as a message
+INFOS_IN_MESSAGE = -1  # in place of the number of bytes: the infos of this step are sent as a message
 
 
 class InheritedDescriptors(NamedTuple):
@@ -122,7 +122,7 @@ class SharedMemory:
         return numbers
 
     def wakes(self, lane: int) -> bool:
-        """Whether the learner is to be woken when the lane's newest order is done, whatever the other lanes do."""
+        """Whether to wake the learner when the lane's newest order is done, even if other lanes are not."""
         return bool(self._words[2 * WORDS * lane + 1])
 
     def answered(self, lane: int) -> int:
@@ -148,7 +148,7 @@ class SharedMemory:
             return int(np.count_nonzero(self._ordered != self._answered))
 
     def infos(self, lane: int) -> bytes | None:
-        """The packed infos of the lane's newest answer; None if they travel as a message."""
+        """The packed infos of the lane's newest answer; None if they are sent as a message."""
         if not (size := self._words[2 * WORDS * lane + WORDS + 1]):
             return b""
         return None if size == INFOS_IN_MESSAGE else bytes(self.lanes[lane].infos[:size])

@@ -1,7 +1,7 @@
 """Options of the sockets of both sides, and the routing id of a worker. Imports no numpy.
 
-An experiment taught us each option. MAXMSGSIZE bounds a frame before a byte of it is read. TCP_MAXRT and keepalive close a
-connection whose other end has vanished; the worker makes a new one within seconds. There are no ZMTP heartbeats: while a
+Each option was found by an experiment. MAXMSGSIZE bounds a frame before a byte of it is read. TCP_MAXRT and keepalive close
+a connection whose other end has vanished; the worker makes a new one within seconds. There are no ZMTP heartbeats: while a
 reader is stopped by its high-water mark, they lose and reorder messages. Our own heartbeats detect silence, and tickets keep
 queues short.
 """
@@ -19,7 +19,7 @@ from millrace.protocol.keys.keys import Token
 from millrace.protocol.wire.message_sizes import MAX_FRAME_BYTES
 
 LINGER_MS = 2000
-UNACKNOWLEDGED_MS = 5000  # TCP doubles its retry interval: after a cut it may need as long again as the cut lasted
+UNACKNOWLEDGED_MS = 5000  # TCP doubles its retry interval: after an outage it may need as long again as the outage lasted
 QUEUE = 1000  # messages that wait for a peer that does not read
 RECONNECT_MS = 100
 RECONNECT_MOST_MS = 2000
@@ -28,11 +28,11 @@ TAG_CHARACTERS = 32
 
 
 class Limits(NamedTuple):
-    """What the other end may have us keep."""
+    """Limits of what this end keeps for the other end."""
 
     frame_bytes: int
     messages: int
-    """that wait to be read or sent"""
+    """messages that wait to be read or sent"""
 
 
 def set_options(socket: zmq.Socket[bytes], address: str, curve: bool, limits: Limits | None = None) -> None:
@@ -54,7 +54,7 @@ def set_options(socket: zmq.Socket[bytes], address: str, curve: bool, limits: Li
 
 
 def routing_id(name: str, token: Token | None) -> bytes:  # rule ROUTING_ID
-    """The name. With a key, a tag follows that nobody else can compute."""
+    """The worker's name; with a key, followed by a tag that nobody else can compute."""
     if token is None:
         return name.encode()
     tag = hashlib.blake2b(name.encode(), key=token.client.secret, digest_size=TAG_CHARACTERS // 2)

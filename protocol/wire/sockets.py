@@ -46,13 +46,13 @@ def send_frames(socket: zmq.Socket[bytes], frames: Sequence[Buffer]) -> None:
 def _user(frame: zmq.Frame) -> str:
     try:
         return str(frame.get("User-Id"))
-    except zmq.ZMQError:  # no key is present, which must not happen; no client has this key
+    except zmq.ZMQError:  # no key is present, which should never happen; no client has this key
         return ""
 
 
 @dataclass
 class Traffic:
-    """Traffic in one direction. Bytes count all frames before encryption, the worker's name included."""
+    """Traffic in one direction. Bytes count all frames before encryption, including the worker's name."""
 
     messages: int = 0
     bytes: int = 0

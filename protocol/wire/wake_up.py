@@ -1,6 +1,6 @@
 """How a learner and its worker processes wait for each other's steps: a pipe that wakes a sleeper, and spinning before that.
 
-Linux only; elsewhere everything travels as messages.
+Linux only; elsewhere everything is sent as messages.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class WakePipe:
             os.write(self.write_fd, _BYTES[reason])
 
     def wait(self, timeout_s: float) -> WakeReason:
-        """Sleep until woken, at most `timeout_s`. Of several reasons, `MESSAGE` is returned before `STEP`.
+        """Sleep until woken, at most `timeout_s`. If there are several reasons, `MESSAGE` takes precedence over `STEP`.
 
         If the reader noticed a step without sleeping, its byte is still in the pipe, and the next `wait` returns at once.
         """
@@ -74,7 +74,7 @@ _BYTES = {reason: bytes([reason]) for reason in WakeReason}
 
 
 class SpinWait:
-    """Spins for a short time before a sleep. Each time that spinning was in vain, more of the next waits skip it.
+    """Spins for a short time before a sleep. Each time that spinning fails, more of the next waits skip it.
 
     Linux may ignore `sched_yield` for a while; only a sleeping process surely frees its core. So spinning ends at the first
     turn that takes long because another process wanted this core.
@@ -84,7 +84,7 @@ class SpinWait:
         self._skipped = self._to_skip = 0
 
     def wait(self, seen: Callable[[], bool], seconds: float) -> bool:
-        """Spin until `seen` returns true, at most `seconds`; whether it did."""
+        """Spin until `seen` returns true, at most `seconds`. Returns whether it did."""
         if seen():
             return True
         if not CAN_SPIN or seconds <= 0:

@@ -46,7 +46,7 @@ class WorkerLink:
     ) -> None:
         """With a token (only over tcp) the link connects only to the learner of that token. `limits`: if not a worker's.
 
-        `context`: that of the learner, over inproc; closing the link leaves it open.
+        `context`: over inproc, the learner's context; closing the link leaves it open.
         """
         check_address(address)
         check_worker_name(name)
@@ -55,7 +55,7 @@ class WorkerLink:
         self.problem: ConnectionProblem | None = None
         """why there is no connection, if known"""
         self.connected = False
-        """whether there seems to be a connection; known of tcp only"""
+        """whether there seems to be a connection; known only for tcp"""
         far = token is not None or not is_local(address)
         self.packing = Packing(stack=far, zstd=far and has_zstd())
         """how rollouts may be packed: only if the connection is encrypted or leaves this machine"""
@@ -81,7 +81,7 @@ class WorkerLink:
             self.close(linger_s=0.0)
             raise UsageError(f"address {address}: cannot connect ({error.strerror})") from error
         if not resolves(address):
-            self._report(ConnectionProblem(f"the host of {address} is not known here; is it spelt right?"))
+            self._report(ConnectionProblem(f"the host of {address} is not known here; is it spelled right?"))
 
     def watch(self, fd: int) -> None:
         """From now on `poll` returns early when this file descriptor can be read."""
@@ -148,12 +148,12 @@ class WorkerLink:
                 yield error
 
     def send(self, frames: Sequence[Buffer]) -> None:
-        """Send, or queue while the learner is out of reach (the conversation repairs what is lost)."""
+        """Send, or queue while the learner is out of reach (the conversation repairs losses)."""
         with suppress(zmq.Again):
             send_frames(self._socket, frames)
 
     def connect_again(self) -> None:
-        """Give up the connection and make another. What was queued is lost (the conversation repairs that)."""
+        """Give up the connection and make another. Queued messages are lost (the conversation repairs that)."""
         self._socket.disconnect(self.address)
         self._socket.connect(self.address)
 

@@ -305,7 +305,7 @@ FOUND_BY_THE_WORKER: dict[str, tuple[Case, ...]] = {
         ),
     ),
     "frames: expected the size of the first ones, got {}": (
-        Case(filmed, lambda **_: One(sizes=(4, 5)), f"{EVALUATED} copy 0, render: expected pictures of one size"),
+        Case(filmed, lambda **_: One(sizes=(4, 5)), f"{EVALUATED} copy 0, render: expected frames of one size"),
     ),
     "frames: expected uint8[{}, H, W, 3], got {}{}": (
         Case(filmed, lambda **_: One(sizes=(0,)), f"{EVALUATED} copy 0, render: expected an array [H, W, 3]"),

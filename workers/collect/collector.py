@@ -2,8 +2,8 @@
 
 Lanes that are collected together are stepped in lock-step, with one forward pass for all of them [L, N, ·]. The rollout of
 a lane depends on the run's seed, the lane, the round, the weights and what the lane did before, and on nothing else: not on
-the other lanes, and not on who collected the rollouts before it.
-The arrays of a rollout are new each time and are never written again, so they can be sent without a copy.
+the other lanes, and not on which worker collected the rollouts before it. The arrays of a rollout are new each time and are
+never written again, so they can be sent without a copy.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class Collector:
     ) -> None:
         """`step_all`: steps the env copies of all lanes at once, if one vector environment holds them all."""
         self.note = ""
-        """what whoever trains should know of the environment, once a lane has seen it"""
+        """what the user should know about the environment, once a lane has seen it"""
         self.env_attributes = b""
         """attributes that each env copy gets before its next rollout (`Weights.env_attributes`)"""
         self.lanes = OpenLanes[Lane]()
@@ -72,7 +72,7 @@ class Collector:
         self._open_copies = open_copies
         self._opponents = KnownOpponents(run)
         self._action_streams = cache(lambda lane: RoundStreams(run.seed, Purpose.ACTIONS, lane))
-        self._ended_steps = 0  # of rollouts that are whole or were dropped
+        self._ended_steps = 0  # env steps of rollouts that are complete or were dropped
         self._under_way: Rows | None = None
 
     @property
@@ -82,7 +82,7 @@ class Collector:
 
     @property
     def steps(self) -> int:
-        """Number of env steps made, also of rollouts that are under way. A step that only resets a copy is none."""
+        """Number of env steps made, including those of running rollouts. A step that only resets a copy doesn't count."""
         return self._ended_steps + (0 if self._under_way is None else self._under_way.env_steps())
 
     def load(self, parameters: Floats, buffers: Floats) -> None:
@@ -99,9 +99,9 @@ class Collector:
     ) -> list[Rollout]:
         """Collect one rollout for each assignment. Returns them in the order of the assignments.
 
-        Each assignment must name a different lane. `held`: the weights of opponents that may be new, by version. `pulse` is
-        called at every step and may raise. If `pulse` raises, or an environment does (`EnvironmentFailed`), these lanes are
-        closed and the unfinished rollouts are dropped.
+        Each assignment must name a different lane. `held`: the available weights, by version, among them those of new
+        opponents. `pulse` is called at every step and may raise. If `pulse` raises, or an environment does
+        (`EnvironmentFailed`), these lanes are closed and the unfinished rollouts are dropped.
         """
         if len({assignment.lane for assignment in assignments}) < len(assignments):
             raise ValueError(f"collect: expected one assignment for each lane, got {assignments}")
@@ -135,7 +135,7 @@ class Collector:
         ]
 
     def _lane_for(self, assignment: Assignment, pulse: Pulse) -> Lane:
-        """The lane in this incarnation. It is opened if it does not exist."""
+        """The lane in this incarnation, which is opened if it isn't open."""
         number = assignment.lane
         incarnation = assignment.incarnation
         if (lane := self.lanes.here(number, incarnation)) is not None:
@@ -161,7 +161,7 @@ class Collector:
         return lane
 
     def _meet(self, lane: Lane, assignment: Assignment, opponents: Opponents) -> None:
-        """The episodes that begin in the next rollout are played against the opponent that it names, if it names one."""
+        """Set the opponent of the episodes that begin in the next rollout, if the assignment names one."""
         if assignment.opponent is None:
             return
         run = self._run
@@ -174,7 +174,7 @@ class Collector:
     def _rollout(
         self, rows: RowsOfLane, state: Floats, acted: ActedRows, assignment: Assignment, version: int, session: int
     ) -> Rollout:
-        """The rollout of a lane, made of views of its rows. `state`: that of the policy before them."""
+        """The rollout of a lane, made of views of its rows. `state`: the policy's state before them."""
         lane = rows.lane
         masked = self._run.masked
         axes = self._run.row_axes

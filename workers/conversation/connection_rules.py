@@ -1,4 +1,4 @@
-"""To which learner a worker connects, with which token, and how long it waits: after that, `Session.tick` leaves.
+"""Whether a worker connects with or without a token, and how long it waits: after that, `Session.tick` leaves.
 
 Rule: over TCP to another machine, a worker connects without a token only with --insecure. Pure; imports neither numpy nor
 gymnasium.
@@ -14,13 +14,13 @@ from millrace.protocol.keys.keys import Token
 from millrace.protocol.keys.worker_token import TOKEN_VARIABLE
 
 REJOIN_TIMEOUT_S = 600.0
-"""How long, at least, a worker that had joined waits for its learner to come back."""
+"""How long, at least, a worker that has joined waits for its learner to come back."""
 LEARNER_STARTED_IT_S = math.inf
-"""How long a worker waits that its learner has started: it ends with the learner, which may be stopped (Ctrl-Z) or busy."""
+"""How long a worker that its learner started waits: it ends with the learner, which may be stopped (Ctrl-Z) or busy."""
 
 
 def wait_limits_s(join_timeout_s: float, *, stay: bool) -> tuple[float, float]:
-    """How long a worker waits for its first learner, and for one that it had joined. With `stay`, another follows it."""
+    """How long a worker waits for its first learner, and for one that it had joined. With `stay`, another one may follow."""
     return math.inf if stay else join_timeout_s, max(join_timeout_s, REJOIN_TIMEOUT_S)
 
 
@@ -32,7 +32,7 @@ def checked_token(address: str, token: Token | None, *, insecure: bool) -> Token
     if token is None and not insecure and not is_local(address):
         raise UsageError(
             f"address {address} is on another machine: expected --token FILE (or {TOKEN_VARIABLE}), made there by "
-            "`millrace keys new NAME`; --insecure connects without, and trusts whoever answers"
+            "`millrace keys new NAME`; --insecure connects without a token, and trusts anyone who answers"
         )
     if token is not None and insecure:
         raise UsageError("a token or --insecure: expected one, got both")

@@ -1,9 +1,9 @@
 """Heartbeats from a second thread while the first thread runs the environment's code, where a step may take minutes.
 
-Rule: only one thread at a time uses the link and the session. The first thread holds their lock, and releases it only
-while it runs the environment's code; meanwhile the second thread acquires it now and then, for a moment.
+Rule: only one thread at a time uses the link and the session. The first thread holds their lock, and releases it only while
+it runs the environment's code; during that time the second thread acquires it now and then.
 
-This file decides only how often the second thread looks. When a Heartbeat is due: `Session.heartbeat_if_due` (session.py).
+This file decides only how often the second thread checks. When a Heartbeat is due: `Session.heartbeat_if_due` (session.py).
 How many seconds lie between two: `RolloutConfig.heartbeat_s` (learner/config/rollout_config.py) for a run, and `HEARTBEAT_S`
 (protocol/specs.py) for a vector environment.
 """
@@ -14,16 +14,16 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-CHECK_EVERY_S = 0.25  # how often the second thread looks: a Heartbeat that is due is late by at most this time
+CHECK_EVERY_S = 0.25  # how often the second thread checks: a Heartbeat is late by at most this time
 
 
 class HeartbeatThread:
     """The second thread, and the lock between the two threads."""
 
     def __init__(self, heartbeat: Callable[[], None]) -> None:
-        """`heartbeat` sends the Heartbeat that is due. The second thread calls it, once `start` was called."""
+        """`heartbeat` sends a Heartbeat if one is due. The second thread calls it after `start`."""
         self._heartbeat = heartbeat
-        self._lock = threading.Lock()  # its holder may use link and session
+        self._lock = threading.Lock()  # whoever holds it may use link and session
         self._lock.acquire()
         self._stopped = threading.Event()
         self._thread = threading.Thread(target=self._run, name="heartbeat", daemon=True)
@@ -35,7 +35,7 @@ class HeartbeatThread:
 
     @contextmanager
     def lock_released(self) -> Iterator[None]:
-        """The first thread runs the environment's code and does not use the link or the session."""
+        """While it is entered, the first thread runs the environment's code and doesn't use the link or the session."""
         self._lock.release()
         try:
             yield

@@ -1,7 +1,7 @@
-"""What a worker holds: what it is asked for and has not done, and the answers that the learner may not have received. Pure.
+"""What a worker holds: requests that it has not finished, and answers that the learner may not have received. Pure.
 
-Rule: what is asked has a ticket, and is done once. The answer is kept, and sent again when the learner asks again, because
-the answer was lost. How long it is kept bounds the memory of a worker:
+Rule: each request has a ticket, and is executed once. The answer is kept, and sent again if the learner repeats the request
+because the answer was lost. How long answers are kept bounds the memory of a worker:
 
 - a rollout: until the learner says that it has received it. So a worker holds at most what the learner has outstanding.
 - the result of an evaluation: until there are `KEPT_RESULTS` later ones. If its rows were sent too, it is not kept: rows are
@@ -39,20 +39,20 @@ AnsweredT = TypeVar("AnsweredT", bound=Rollout | Evaluated | Described | Answer)
 
 @dataclass
 class Held(Generic[AskedT, AnsweredT]):
-    """What is asked and not yet done, and the answers that are kept, by ticket."""
+    """Unfinished requests, and the answers that are kept, by ticket."""
 
     asked: dict[int, AskedT] = field(default_factory=dict, init=False)
     answered: dict[int, AnsweredT] = field(default_factory=dict, init=False)  # oldest first
 
     # rules ROLLOUT_ONCE, ORDER_ONCE, EVALUATE_ONCE, DESCRIBE_AGAIN
     def take(self, ticket: int, asked: AskedT) -> AnsweredT | None:
-        """Take what is asked. Returns an answer to send again, if any."""
+        """Take a request. Returns an answer to send again, if any."""
         if ticket not in self.answered:
             self.asked.setdefault(ticket, asked)
         return self.answered.get(ticket)
 
     def keep(self, answer: AnsweredT) -> bool:
-        """Keep an answer; False if it is no longer asked for."""
+        """Keep an answer; False if it is not wanted any more."""
         if self.asked.pop(answer.ticket, None) is None:
             return False
         self.answered[answer.ticket] = answer
@@ -60,26 +60,26 @@ class Held(Generic[AskedT, AnsweredT]):
 
 
 class HeldEvaluations(Held[Evaluate, Evaluated]):
-    """Evaluations. They belong to no lane. One evaluation is of one version, and has higher tickets than those before it."""
+    """Evaluations, which belong to no lane. One evaluation uses one version, and has higher tickets than earlier ones."""
 
     def take(self, ticket: int, asked: Evaluate) -> Evaluated | None:  # rule EVALUATE_ENDS
-        """Take an order. The evaluations before that of the highest ticket are over: what is left of them is dropped."""
+        """Take an order. Earlier evaluations than that of the highest ticket are over: the rest of them is dropped."""
         answer = super().take(ticket, asked)
         newest = max(self.asked, default=ticket)
         self.asked = {n: order for n, order in self.asked.items() if order.version == self.asked[newest].version}
         return answer
 
     def next(self, versions: Collection[int]) -> Evaluate | None:  # rules EVALUATE_VERSION, OPPONENTS
-        """The oldest whose weights are held."""
+        """The oldest order whose weights this worker has."""
         due = [ticket for ticket, order in self.asked.items() if order.versions.issubset(versions)]
         return self.asked[min(due)] if due else None
 
     def versions(self) -> set[int]:
-        """The versions that are asked for."""
+        """The requested versions."""
         return {version for order in self.asked.values() for version in order.versions}
 
     def keep(self, answer: Evaluated) -> bool:
-        """Keep a result, unless rows belong to it; False if it is no longer asked for."""
+        """Keep a result, unless it has rows; False if it is not wanted any more."""
         order = self.asked.get(answer.ticket)
         kept = super().keep(answer)
         if order is not None and (order.send_rows or order.send_frames):
@@ -103,7 +103,7 @@ class HeldDescriptions(Held[Describe, Described]):
         return super().take(ticket, asked)
 
     def next(self) -> Describe | None:
-        """The order that is not yet executed."""
+        """The order that has not been executed yet."""
         return next(iter(self.asked.values()), None)
 
 
@@ -116,7 +116,7 @@ LaneT = TypeVar("LaneT", bound=_HeldLane[Any, Any])
 
 
 class _HeldLanes(Generic[LaneT]):
-    """What is held in one session, lane by lane. A later incarnation of a lane begins with nothing."""
+    """What is held in one session, by lane. A later incarnation of a lane begins empty."""
 
     _kind: type[LaneT]
 
@@ -131,12 +131,12 @@ class _HeldLanes(Generic[LaneT]):
         return lane if lane.incarnation == incarnation else None
 
     def keep(self, answer: Rollout | Answer) -> bool:
-        """Keep an answer; False if its lane was released in the meantime, or it is no longer asked for."""
+        """Keep an answer; False if its lane was released meanwhile, or it is not wanted any more."""
         lane = self._lanes.get(answer.lane)
         return lane is not None and lane.keep(answer)
 
     def tickets(self) -> tuple[int, ...]:
-        """Tickets of what is not yet done."""
+        """The tickets of unfinished requests."""
         return tuple(ticket for lane in self._lanes.values() for ticket in lane.asked)
 
     def lanes(self) -> tuple[LaneIncarnation, ...]:
@@ -144,7 +144,7 @@ class _HeldLanes(Generic[LaneT]):
         return tuple(LaneIncarnation(number, lane.incarnation) for number, lane in self._lanes.items())
 
     def release(self, lanes: Sequence[LaneIncarnation]) -> list[LaneIncarnation]:
-        """Drop these lanes. Returns those that were here, in this or an earlier incarnation."""
+        """Drop these lanes. Returns those that this worker had, in this or an earlier incarnation."""
         released = []
         for old in lanes:
             lane = self._lanes.get(old.lane)
@@ -166,9 +166,9 @@ class Assignment:
     round: int
     """Decides the random numbers of the actions."""
     opponent: int | None = None
-    """Who plays the other teams in the episodes that begin in it."""
+    """The opponent that plays the other teams in the episodes that begin in it."""
     past: LanePast | None = None
-    """What a lane continues that is not open in this incarnation; None: it begins its first episodes."""
+    """The past that the lane continues if it isn't open in this incarnation; None: it begins its first episodes."""
 
 
 class Permitted(NamedTuple):
@@ -176,11 +176,11 @@ class Permitted(NamedTuple):
 
     sequence: int
     version: int
-    """of the weights to act under"""
+    """version of the weights to act with"""
     round: int
     opponent: int | None
     past: LanePast | None
-    """as in the `Permit`, these three"""
+    """`round`, `opponent` and `past`: as in the `Permit`"""
 
     def assignment(self, ticket: int, lane: int, incarnation: int) -> Assignment:
         """What to collect on this lane."""
@@ -188,7 +188,7 @@ class Permitted(NamedTuple):
 
     @property
     def versions(self) -> set[int]:
-        """Those of the weights that it needs."""
+        """The versions of the weights that it needs."""
         return versions_of(self.version, [self.opponent])
 
 
@@ -196,7 +196,7 @@ class Permitted(NamedTuple):
 class RolloutLane(_HeldLane[Permitted, Rollout]):
     """A ticket asks for a rollout. They are collected in the order of their sequence."""
 
-    sequence: int = 0  # of the next rollout
+    sequence: int = 0  # sequence number of the next rollout
 
     def keep(self, answer: Rollout) -> bool:
         """Keep a collected rollout; False if its ticket was withdrawn in the meantime."""
@@ -211,7 +211,7 @@ class HeldRollouts(_HeldLanes[RolloutLane]):
     _kind = RolloutLane
 
     def take(self, permit: Permit, version: int) -> Rollout | None:  # rule RECEIVED
-        """Take a ticket to collect under this version. Returns a rollout to send again, if any."""
+        """Take a ticket to collect with this version. Returns a rollout to send again, if any."""
         lane = self._opened(permit.lane, permit.incarnation)
         if lane is None or (permit.sequence < lane.sequence and permit.ticket not in lane.answered):
             return None  # a late repeat: the learner has this rollout
@@ -220,9 +220,10 @@ class HeldRollouts(_HeldLanes[RolloutLane]):
 
     # rules IN_ORDER, VERSION, LOWEST_VERSION_FIRST
     def startable(self, versions: Collection[int]) -> tuple[int, tuple[Assignment, ...]]:
-        """The next rollouts of the lanes whose weights are held: the lowest version of them, and those under it.
+        """The next rollouts of lanes whose weights are available.
 
-        They are in the order of the lanes. If nothing can be collected, there are none.
+        Returns the lowest version among them, and the rollouts with this version in lane order; none if nothing can be
+        collected.
         """
         startable: dict[int, list[Assignment]] = {}
         for number, lane in sorted(self._lanes.items()):
@@ -233,7 +234,7 @@ class HeldRollouts(_HeldLanes[RolloutLane]):
         return version, tuple(startable.get(version, ()))
 
     def versions(self) -> set[int]:
-        """The versions that are asked for."""
+        """The requested versions."""
         return {version for lane in self._lanes.values() for asked in lane.asked.values() for version in asked.versions}
 
     def forget_received(self, received: Sequence[Received]) -> None:  # rule ROLLOUT_ONCE
@@ -269,6 +270,6 @@ class HeldOrders(_HeldLanes[OrderLane]):
         return lane.take(order.ticket, order)
 
     def next(self) -> Order | None:
-        """The oldest order that is not yet executed."""
+        """The oldest order that has not been executed yet."""
         waiting = [order for lane in self._lanes.values() for order in lane.asked.values()]
         return min(waiting, key=lambda order: order.ticket, default=None)

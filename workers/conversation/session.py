@@ -1,10 +1,10 @@
-"""The worker's half of the conversation. Pure: messages and `now` in, effects out; no socket, clock, thread or environment.
+"""The worker's side of the conversation. Pure: messages and `now` in, effects out; no socket, clock, thread or environment.
 
-Rule: a rollout and an evaluation start only under the weights that they name. A message that is lost does no harm, because
-the next Heartbeat lists all tickets and versions that this worker holds, and the learner sends again what is missing. What
-a worker holds is in `held.py`. A worker that was welcomed before there is a run waits in its session: it describes
-environments on order, and a second Welcome brings the run. Each order lists the weights to keep: those that it does not
-list and no ticket names are dropped.
+Rule: a rollout or an evaluation starts only with the weights that it names. A lost message does no harm, because the next
+Heartbeat lists all tickets and versions that this worker holds, and the learner sends what is missing again. `held.py` keeps
+what a worker holds. A worker that was welcomed before there is a run waits in its session: it describes environments on
+order, and a second Welcome brings the run. Each order lists the weights to keep: others are dropped, unless a ticket names
+them.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ class StartSession:
 
 @dataclass(frozen=True)
 class BeginRun:
-    """Effect: the run that this session has waited for begins."""
+    """Effect: begin the run that this session has waited for."""
 
     run: RunSpec | StepSpec
 
@@ -103,33 +103,33 @@ WorkerEffect = SendMessage | StartSession | BeginRun | CloseLanes | Leave
 
 @dataclass(frozen=True)
 class RolloutTask:
-    """Rollouts to collect together, all under these weights."""
+    """Rollouts to collect together, all with these weights."""
 
     session: int
     weights: Weights
     assignments: tuple[Assignment, ...]
     held: Mapping[int, Weights]
-    """All weights that are held, by version: those of opponents are among them."""
+    """All available weights, by version, including those of opponents."""
 
 
 @dataclass(frozen=True)
 class EvaluationTask:
-    """Episodes to play under these weights."""
+    """Episodes to play with these weights."""
 
     weights: Weights
     order: Evaluate
     held: Mapping[int, Weights]
-    """All weights that are held, by version."""
+    """All available weights, by version."""
 
     @property
     def session(self) -> int:
-        """That of the order."""
+        """The session of the order."""
         return self.order.session
 
 
 @dataclass(frozen=True)
 class SharedOrders:
-    """Orders of a vector environment that come through shared memory, and not with messages."""
+    """Orders of a vector environment that arrive through shared memory, not as messages."""
 
     session: int
 
@@ -146,13 +146,16 @@ class WorkerIdentity:
     host: str
     pid: int
     process_nonce: int
-    """random number that tells this process, or thread, from any other of the same name"""
+    """random number that distinguishes this process, or thread, from any other with the same name"""
     software: str
     evaluates: bool = False
     """whether it only plays evaluations"""
 
     def hello(self, attempt: int) -> Hello:  # rules HELLO, PROTOCOL
-        """The Hello of this attempt to join. Attempts are counted from the nonce: no two processes have the same one."""
+        """The Hello of this attempt to join.
+
+        Attempts are counted from the nonce, so that no two processes have the same number.
+        """
         return Hello(
             PROTOCOL_VERSION,
             worker=self.worker,
@@ -177,23 +180,23 @@ class Statistics:
     resident_bytes: int = 0
     """resident memory of this process"""
     note: str = ""
-    """what whoever trains should know of the environment"""
+    """what the user should know about the environment"""
 
 
 @dataclass
 class _SessionState:
-    """All that belongs to one session. A new session starts with a new one."""
+    """The state of one session. Each session starts with a new one."""
 
     descriptions: HeldDescriptions = field(default_factory=HeldDescriptions)
     rollouts: HeldRollouts = field(default_factory=HeldRollouts)
     evaluations: HeldEvaluations = field(default_factory=HeldEvaluations)
     orders: HeldOrders = field(default_factory=HeldOrders)
     weights: dict[int, Weights] = field(default_factory=dict)  # by version
-    in_progress: bool = False  # whether a piece of work is
+    in_progress: bool = False  # whether a piece of work is in progress
     replies: int = 0  # number of the last HeartbeatReply
 
     def unfinished(self) -> tuple[int, ...]:  # rule HEARTBEAT_TICKETS
-        """Tickets that are not yet collected or executed."""
+        """Tickets that have not been collected or executed yet."""
         return (*self.descriptions.asked, *self.rollouts.tickets(), *self.evaluations.asked, *self.orders.tickets())
 
     def lanes(self) -> tuple[LaneIncarnation, ...]:
@@ -216,16 +219,16 @@ class _SessionState:
         return self.rollouts.versions() | self.evaluations.versions()
 
     def missing_versions(self) -> set[int]:
-        """Versions that are asked for and not held."""
+        """Versions that are requested but not available."""
         return self.asked_versions().difference(self.weights)
 
     def keep_weights(self, listed: Sequence[int]) -> None:  # rule HOLDS_WEIGHTS
-        """Drop the weights that an order does not list. A late copy of an order drops none that are asked for."""
+        """Drop the weights that an order does not list. A late copy of an order doesn't drop requested ones."""
         kept = self.asked_versions().union(listed)
         self.weights = {version: weights for version, weights in self.weights.items() if version in kept}
 
     def keep(self, answer: WorkAnswer) -> bool:
-        """Keep what work has led to; False if it is no longer wanted, for example because its lane was released."""
+        """Keep the answer that work produced; False if it isn't wanted any more, such as after the release of its lane."""
         match answer:
             case Rollout():
                 return self.rollouts.keep(answer)
@@ -243,14 +246,14 @@ class _SessionState:
     def release_unlisted(self, received: Sequence[Received]) -> list[WorkerEffect]:  # rule UNLISTED
         """Drop the lanes that the learner does not list: their Release was lost.
 
-        Only a new HeartbeatReply may do so: a copy of an old message does not list the lanes that came after it.
+        Only a new HeartbeatReply may do so: a copy of an old message doesn't list lanes that were added later.
         """
         listed = {of_lane.lane for of_lane in received}
         return self.release([lane for lane in self.lanes() if lane.lane not in listed])
 
 
 class Session:
-    """State machine of one worker, from its first Hello until it leaves. Call `tick` at `due_s`, at the latest."""
+    """State machine of one worker, from its first Hello until it leaves. Call `tick` no later than at `due_s`."""
 
     def __init__(
         self,
@@ -268,7 +271,7 @@ class Session:
         self._join_timeout_s = join_timeout_s
         self._rejoin_timeout_s = rejoin_timeout_s
         self._attempt = identity.process_nonce
-        self._unanswered_s = math.inf  # when the first Heartbeat was sent since the learner was heard
+        self._unanswered_s = math.inf  # time of the first Heartbeat since the learner was last heard
         self.due_s = self._joining_s = now
         self._backoff_s = HELLO_FIRST_S
         self._reason = ""
@@ -279,7 +282,7 @@ class Session:
 
     def handle(self, message: ToWorker, now: float) -> list[WorkerEffect]:
         """Handle a message of the learner."""
-        if isinstance(message, Drain):  # a Drain also answers the heartbeats of a worker that drains already
+        if isinstance(message, Drain):  # a Drain also answers the heartbeats of a worker that is already draining
             self._unanswered_s = math.inf
         if type(message) not in TABLE[self.state]:
             return []
@@ -338,7 +341,7 @@ class Session:
         return self.heartbeat_if_due(now)
 
     def heartbeat_if_due(self, now: float) -> list[WorkerEffect]:  # rule HEARTBEAT
-        """A Heartbeat, if one is due. It changes nothing else, so it may be sent at any moment."""
+        """A Heartbeat, if one is due. This changes nothing else, so it is allowed at any moment."""
         if self.run is None or self.state not in (WorkerState.READY, WorkerState.DRAINING) or now < self.due_s:
             return []
         self.due_s = now + self.run.heartbeat_s
@@ -359,7 +362,7 @@ class Session:
         return [SendMessage(heartbeat)]
 
     def update_statistics(self, statistics: Statistics) -> None:
-        """The next Heartbeat reports these."""
+        """Set the figures that the next Heartbeat reports."""
         self._statistics = statistics
 
     # ---------------------------------------------------------------- leaving
@@ -375,11 +378,11 @@ class Session:
         return self._leave(WorkerFailed(), 1, error, failure)
 
     def decline(self, reason: str, exit_code: int = EXIT_UNSUITABLE) -> list[WorkerEffect]:  # rule DECLINED
-        """Leave a run in which this worker cannot take part, or (with another exit code) not now."""
+        """Leave a run in which this worker can't take part at all, or, with another exit code, not now."""
         return self._leave(WorkerFailed(), exit_code, reason, Goodbye(self.session, one_line(reason), ()))
 
     def refused(self, reason: str) -> list[WorkerEffect]:  # rules REFUSE, AFTER_REFUSE
-        """Leave, because the learner, or its endpoint, rejects this worker for good."""
+        """Leave, because the learner, or its endpoint, permanently rejects this worker."""
         return self._leave(Refuse(reason), 2, reason)
 
     # ---------------------------------------------------------------- working
@@ -393,11 +396,14 @@ class Session:
         return work
 
     def missing_versions(self) -> set[int]:
-        """Versions of the weights that this worker is asked to act under, and does not hold."""
+        """Versions of the weights that this worker should act with, and doesn't have."""
         return self._current.missing_versions()
 
     def work_ended(self, answers: Sequence[WorkAnswer]) -> list[WorkerEffect]:
-        """The work in progress has ended with these answers; with none, it was abandoned. A worker that drains leaves."""
+        """Take the answers of the work in progress, which has ended; none: it was abandoned.
+
+        A draining worker then leaves.
+        """
         current = self._current
         # The session may have ended, or the lane may have been released, in the meantime.
         kept = [each for each in answers if each.session == self.session and current.keep(each)]
@@ -405,7 +411,7 @@ class Session:
         return [*map(SendMessage, kept), *self._leave_if_drained()]
 
     def is_unwanted(self, work: Work | SharedOrders) -> bool:
-        """True when this work is no longer wanted. A worker that drains finishes a rollout, but not an evaluation."""
+        """True if this work is not wanted any more. A draining worker finishes a rollout, but not an evaluation."""
         goes_on = (WorkerState.READY,) if isinstance(work, EvaluationTask) else (WorkerState.READY, WorkerState.DRAINING)
         return self.state not in goes_on or work.session != self.session
 
@@ -434,13 +440,13 @@ class Session:
 
     # rules REPEATED_WELCOME, BEGINS
     def _welcome_again(self, run: WaitSpec | RunSpec | StepSpec, now: float) -> list[WorkerEffect]:
-        """The session goes on. The run may have begun, for which this worker waits; else it is a repeat."""
+        """Handle another Welcome of this session: the run that this worker waits for has begun, or it is a repeat."""
         if not isinstance(self.run, WaitSpec) or isinstance(run, WaitSpec):
             return []
         self.run = run
         self._unanswered_s = math.inf
         self.due_s = min(self.due_s, now + run.heartbeat_s)
-        self._current.descriptions = HeldDescriptions()  # those that are still asked for are not wanted any more
+        self._current.descriptions = HeldDescriptions()  # unfinished descriptions are not wanted any more
         return [BeginRun(run)]
 
     def _rejoin(self, event: object, reason: str, now: float) -> list[WorkerEffect]:
@@ -464,7 +470,7 @@ class Session:
 
     # rule AFTER_GOODBYE
     def _leave(self, event: object, exit_code: int, reason: str, last: ToLearner | None = None) -> list[WorkerEffect]:
-        """Leave, once. The last message is said only within a session."""
+        """Leave, once. The last message is sent only within a session."""
         if self.state is WorkerState.LEFT:
             return []
         said = [] if last is None or self.state is WorkerState.JOINING else [SendMessage(last)]

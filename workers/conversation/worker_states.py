@@ -1,4 +1,4 @@
-"""A worker's states in the conversation, as a table: the next one for each state and each message or event. Plain data."""
+"""A worker's states in the conversation, and a table of the next state for each state and message or event. Plain data."""
 
 from __future__ import annotations
 

@@ -52,7 +52,7 @@ class SeatColumns(NamedTuple):
     """[N] whether the copy's episode is over: its next step only resets it"""
 
     def first(self, copies: int, columns: int) -> SeatColumns:
-        """Those of the first copies."""
+        """The columns of the first copies."""
         return SeatColumns(
             complete=self.complete[:columns],
             acts=self.acts[:columns],
@@ -69,12 +69,13 @@ class StepResult(NamedTuple):
     terminated: Any
     truncated: Any
     lost: Array | None = None
-    """[N] bool, copies that were lost with their worker: their step was not made, and the next step starts an episode on
-    new copies"""
+    """[N] bool, copies that were lost with their worker: this step was not made on them, and the next one starts an episode
+    on new copies
+    """
     facts: Facts = {}
-    """of the episodes that ended in this step, if the run asks for facts"""
+    """facts of the episodes that ended in this step, if the run has facts"""
     columns: SeatColumns | None = None
-    """of copies with seats; the arrays above have N · A entries then"""
+    """with seats; the arrays above then have N · A entries"""
 
     def first(self, copies: int, columns: int) -> StepResult:
         """The result of the first copies alone, which have the first columns."""
@@ -96,7 +97,7 @@ class EnvCopies(Protocol):
     action_space: gymnasium.Space[Any]
     """Action space of one copy."""
     note: str
-    """What whoever trains should know of the environment, as the first reset shows; empty if nothing."""
+    """What the user should know about the environment after its first reset; empty if nothing."""
 
     def reset(self, seeds: Sequence[int], pulse: Pulse) -> Leaves:
         """Start episodes in all copies, with a seed for each."""
@@ -116,24 +117,24 @@ class EnvCopies(Protocol):
 
 
 class EvaluationCopies(EnvCopies, Protocol):
-    """Env copies of which those are stepped whose episodes run; no step resets a copy."""
+    """Env copies of an evaluation: only copies with running episodes are stepped, and no step resets a copy."""
 
     count: int
 
     def step(self, actions: Array, pulse: Pulse, copies: Sequence[int] | None = None) -> StepResult:
-        """Step these copies, with an action for each of them. The result has a row for every copy.
+        """Step these copies, with an action for each.
 
-        That of a copy which is not stepped is its last one.
+        The result has a row for every copy; a copy that isn't stepped keeps its last row.
         """
         ...
 
     def render(self, copy: int) -> Any:
-        """What the environment renders. Raises `ValueError` if it cannot."""
+        """The rendered frame of this copy. Raises `ValueError` if it can't be rendered."""
         ...
 
 
 def check_spaces(run: RunSpec, copies: EnvCopies) -> None:  # rule OTHER_AGENTS
-    """Raise `UsageError` unless the copies have the spaces of the run's policy, and its agents."""
+    """Raise `UsageError` unless the copies have the spaces and the agents of the run's policy."""
     observation = copies.observation_space
     action = copies.action_space
     policy = run.policy
@@ -151,7 +152,7 @@ def check_spaces(run: RunSpec, copies: EnvCopies) -> None:  # rule OTHER_AGENTS
 
 
 def copy_seed(seed: int, lane: int, start: int, copy: int) -> int:  # rule INDEPENDENT
-    """The reset seed of a copy of a lane, at its start of this number."""
+    """The reset seed of a lane's copy, at the start with this number."""
     return env_seed(seed, Purpose.COPIES, lane, start, copy)
 
 
@@ -170,8 +171,8 @@ class LoopedCopies:
     ) -> None:
         """`facts`: names of the numbers in `info` that belong to an episode. `masked`: read masks of the allowed actions.
 
-        `critic_keys`: those of a Dict observation whose arrays come last.
-        `first`: which copy the first one is. In an evaluation, no step resets a copy.
+        `critic_keys`: keys of a Dict observation whose arrays come last. `first`: identifies the first copy. In an
+        evaluation, no step resets a copy.
         """
         self._facts = facts
         self._activity = activity()
@@ -181,7 +182,7 @@ class LoopedCopies:
         self._loop = EnvLoop(makes, pulse, autoreset, first=first, stepping=stepping, dress=without_order_check)
         self.envs = self._loop.envs
         self.count = len(self._loop.envs)
-        with self._activity.during(MAKING):  # to read an attribute of the environment may run code of its own
+        with self._activity.during(MAKING):  # reading an attribute may run code of the environment
             self.observation_space = self.envs[0].observation_space
             self.action_space = self.envs[0].action_space
         self._masks = MaskReader(self.observation_space, self.action_space) if masked else None
@@ -205,11 +206,11 @@ class LoopedCopies:
         return leaves
 
     def step(self, actions: Array, pulse: Pulse, copies: Sequence[int] | None = None) -> StepResult:
-        """Step each copy, or reset it if its episode has ended. `copies`: only these, which have these actions.
+        """Step each copy, or reset it if its episode has ended.
 
-        The result of a copy that is not stepped is its last one.
+        `copies`: step only these, with these actions. A copy that isn't stepped keeps its last row in the result.
         """
-        copies = None if copies is not None and len(copies) == self.count else copies  # all are stepped faster
+        copies = None if copies is not None and len(copies) == self.count else copies  # stepping all is faster
         loop = self._loop
         infos = loop.step(actions, self._observations, pulse, copies)
         leaves = self._leaves() if self._nested else (self._observations,)
@@ -221,13 +222,13 @@ class LoopedCopies:
         return StepResult(leaves, loop.reward, loop.terminated, loop.truncated, facts=facts)
 
     def reset_some(self, copies: Sequence[int], seeds: Sequence[int | None], pulse: Pulse) -> StepResult:
-        """Begin episodes in these copies alone, with a seed for each, or without. The result has a row for each copy."""
+        """Begin episodes in only these copies, with or without a seed for each. The result has a row for each copy."""
         infos = self._loop.reset(copies, seeds, self._observations, pulse)
         self._fill_in(copies)
         return self._after_reset(copies, infos)
 
     def _fill_in(self, copies: Sequence[int]) -> None:
-        """A copy that was never reset shows what another one shows, because every row must show something."""
+        """Fill the row of a copy that was never reset with another copy's observation, because no row may be empty."""
         for n, observation in enumerate(self._observations):
             if observation is None:
                 self._observations[n] = self._observations[copies[0]]
@@ -240,7 +241,7 @@ class LoopedCopies:
 
     @contextmanager
     def repeating(self) -> Iterator[None]:
-        """Within it, steps repeat what other copies have done."""
+        """While it is entered, steps count as replayed ones."""
         stepping = self._loop.stepping
         self._loop.stepping = REPEATING
         try:
@@ -249,16 +250,16 @@ class LoopedCopies:
             self._loop.stepping = stepping
 
     def end(self, copies: Sequence[int]) -> None:
-        """The episodes of these copies are over: the next step resets them."""
+        """End the episodes of these copies: the next step resets them."""
         for n in copies:
             self._loop.truncated[n] = True
 
     def set_random_state(self, copy: int, packed: bytes) -> bool:
-        """Set the state of a copy's random generator. False if it has none that this state fits."""
+        """Set the state of a copy's random generator. False if it has no generator that this state fits."""
         return self._loop.set_random_state(copy, packed)
 
     def save(self) -> list[SavedCopy]:
-        """The state of each copy. Raises `CopyFailed`; and `CannotSave` if it is not one that is kept."""
+        """The state of each copy. Raises `CopyFailed`, and `CannotSave` for a state that can't be kept."""
         states = []
         with self._activity.during(STEPPING):
             for n, env in enumerate(self.envs):
@@ -271,17 +272,17 @@ class LoopedCopies:
         return states
 
     def load(self, copy: int, state: SavedCopy) -> str:
-        """Give this copy, which was reset, a state. Returns why that is not possible; empty if it is done."""
+        """Load a state into this copy, after a reset. Returns why that failed; empty if it succeeded."""
         try:
             with self._activity.during(STEPPING):
                 load(self.envs[copy], state)
-        except Exception as error:  # it may be of another version of the environment, and nothing is lost by it
+        except Exception as error:  # the state may be from another version of the environment; this costs only the replay
             return f"load_state raised {type(error).__name__}: {first_line(error, 'no message')}"
         return ""
 
     def begun(self, over: Sequence[int]) -> dict[int, bytes | None]:
-        """From which random numbers the newest episode began of each copy that a step has reset since this was last asked;
-        or will begin, of those that are `over`. None: the copy has no generator that can be read.
+        """For each copy that a step has reset since the last call, the random state from which its newest episode began; for
+        copies that are `over`, the state from which the next one will begin. None: the copy has no readable generator.
         """
         loop = self._loop
         states = loop.random_states | {n: loop.random_state(n) for n in over}
@@ -289,10 +290,10 @@ class LoopedCopies:
         return {n: pack_random_state(state) for n, state in states.items()}
 
     def assign(self, name: str, packed: bytes, pulse: Pulse) -> None:
-        """Set an attribute of every copy; of its wrappers, the outermost one that has it gets it."""
+        """Set an attribute of every copy, on the outermost wrapper that has it."""
         with self._activity.during(STEPPING):
             for n, env in enumerate(self.envs):
-                set_attribute(n, env, name, unpack(packed))  # each its own value: they may change it
+                set_attribute(n, env, name, unpack(packed))  # a separate value for each, because they may change it
 
     def render(self, copy: int) -> Any:
         """What this copy renders."""
@@ -316,7 +317,7 @@ class LoopedCopies:
 
 
 def without_order_check(env: gymnasium.Env[Any, Any], which: EnvCopy = FIRST_COPY) -> gymnasium.Env[Any, Any]:
-    """The environment without `OrderEnforcing`, which only checks that a reset comes before the first step.
+    """The environment without `OrderEnforcing`, which only checks that the first step follows a reset.
 
     The collector always resets first, and the wrapper costs a twentieth of a CartPole step.
     """
@@ -333,7 +334,7 @@ def set_attribute(copy: int | None, env: Any, name: str, value: Any) -> None:
     while not hasattr(owner, name) and isinstance(owner, gymnasium.Wrapper | VectorWrapper):
         if isinstance(owner, ResetAhead):
             for instance in owner.instances():
-                set_attribute(copy, instance, name, deepcopy(value))  # each its own value: they may change it
+                set_attribute(copy, instance, name, deepcopy(value))  # a separate value for each, because they may change it
             return
         owner = owner.env
     if name.startswith("_") or not hasattr(owner, name) or callable(getattr(owner, name)):

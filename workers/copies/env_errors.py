@@ -1,4 +1,4 @@
-"""Errors of an environment, as a worker names them: what an env copy did, then whose copy it is. Pure.
+"""Errors of an environment, in a worker's words: the lane and copy, and what the copy did. Pure.
 
 Rule: the line of an error names the lane, or the evaluation, once, at its beginning. The learner puts the worker before it.
 """
@@ -15,10 +15,10 @@ from millrace.protocol.errors import EnvironmentFailed, first_line
 
 
 class CopyFailed(Exception):
-    """An env copy raised, and the environment's own exception is the cause; or it returned what it must not.
+    """An env copy raised (the environment's own exception is the cause), or returned something invalid.
 
-    `copy` is its number within the lane, or None where a vector environment does not say which one it was.
-    `doing` says what it did: "make", "reset" or a step. `line` says what was expected and what it was, if it did not raise.
+    `copy` is its number within the lane, or None if a vector environment doesn't say which one it was. `doing` says what it
+    did: "make", "reset" or a step. `line` says what was expected and what it returned, if it did not raise.
     """
 
     def __init__(self, copy: int | None, doing: str = "reset", line: str = "") -> None:
@@ -31,7 +31,7 @@ class CopyFailed(Exception):
 def environment_failed(lane: int | None, what: CopyFailed | str, doing: str = "") -> EnvironmentFailed:
     """The error of a lane, or of an evaluation (None): one line, with the traceback as its detail if an env copy raised.
 
-    `doing`: what the copy did, where that is known better than by the copy.
+    `doing`: what the copy did, if the caller knows it better than the copy.
     """
     whose = "while the policy was evaluated: " if lane is None else f"lane {lane}, "
     detail = ""
@@ -47,7 +47,7 @@ def environment_failed(lane: int | None, what: CopyFailed | str, doing: str = ""
 
 @contextmanager
 def environment_failures(lane: int | None, doing: str = "") -> Iterator[None]:
-    """Within it, what an env copy of this lane, or of an evaluation, raises becomes its `environment_failed`."""
+    """While it is entered, errors of env copies of this lane, or of an evaluation, become `environment_failed`."""
     try:
         yield
     except CopyFailed as error:
@@ -55,7 +55,7 @@ def environment_failures(lane: int | None, doing: str = "") -> Iterator[None]:
 
 
 def _what_it_did(cause: BaseException) -> str:
-    """What the environment did, as a line: it raised an exception, of which we know more in some cases."""
+    """What the environment did, in one line: it raised an exception, in some cases with advice."""
     if isinstance(cause, WrongAnswer):
         return str(cause)
     frames = extract_tb(cause.__traceback__)
@@ -66,7 +66,7 @@ def _what_it_did(cause: BaseException) -> str:
 
 
 def _about_action(says: str, raised_by: str) -> str:
-    """What to write if the environment wants an action to be an int of Python, as the end of a line; else nothing.
+    """The end of a line: what to write if the environment needs a Python int as its action; else empty.
 
     It gets a numpy integer, as from gymnasium's vector environments and from `Discrete.sample`.
     """
@@ -79,7 +79,7 @@ def _about_action(says: str, raised_by: str) -> str:
 
 
 def _about_answer(says: str, raised_by: str) -> str:
-    """What a wrapper expected that could not unpack what `reset` or `step` returned, as the end of a line; else nothing."""
+    """The end of a line: what a wrapper expected if it could not unpack the result of `reset` or `step`; else empty."""
     called = re.search(r"= .*\b(reset|step)\(", raised_by) if "unpack" in says else None
     if called is None:
         return ""

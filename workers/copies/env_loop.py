@@ -1,4 +1,4 @@
-"""The loop that calls `env.step`: of rollouts and evaluations (`LoopedCopies`), and of a vector environment (`SteppedLane`).
+"""The loop that calls `env.step`, for rollouts and evaluations (`LoopedCopies`) and vector environments (`SteppedLane`).
 
 Autoreset is gymnasium's (`gymnasium.vector.AutoresetMode`). NextStep: the step after an episode's end ignores the action and
 resets that copy. SameStep: the step that ends an episode resets the copy, and returns the last observation and info inside
@@ -38,16 +38,16 @@ from millrace.workers.copy_slots import Dress, as_made, close_copy, make_copy
 
 Autoreset = Literal["NextStep", "SameStep", "Disabled"]
 CopyInfos = list[tuple[int, dict[str, Any]]]
-"""(number of the copy, its info), where the info is not empty; a copy of its dicts and arrays, see `_kept`"""
+"""(number of the copy, its info) for each info that isn't empty, with copies of its dicts and arrays, see `_kept`"""
 Pulse = Callable[[], None]
 """Called now and then during long work, so that the worker can answer the learner. It may raise to end the work."""
 
-CHECKED_STEPS = 2  # in which an environment shows what it returns as numbers; the first may be a reset
+CHECKED_STEPS = 2  # the first steps, in which the returned numbers are checked; the first one may be a reset
 PULSE_S = 0.05  # a loop over slow copies calls `pulse` this often
 
 
 class EnvLoop:
-    """N environments that are stepped one after the other. Whatever they raise arrives as `CopyFailed`."""
+    """N environments that are stepped one after the other. All their exceptions are raised as `CopyFailed`."""
 
     def __init__(
         self,
@@ -60,10 +60,11 @@ class EnvLoop:
         stepping: int = STEPPING,
         dress: Dress[gymnasium.Env[Any, Any]] = as_made,
     ) -> None:
-        """Make the copies, and reset none. `ended`: they count as truncated, so the first step with NextStep resets them.
+        """Make the copies, without a reset.
 
-        `first` says which copy the first one is; the others follow it. `stepping`: what the worker does during a step.
-        `dress`: takes each copy, and returns what to step in its place, as of `make_copy`.
+        `ended`: they count as truncated, so the first step with NextStep resets them. `first` identifies the first copy; the
+        others follow it. `stepping`: the worker's activity during a step. `dress`: takes each copy, and returns what to step
+        in its place; see `make_copy`.
         """
         self.envs: list[gymnasium.Env[Any, Any]] = []
         self._activity = activity()
@@ -76,7 +77,7 @@ class EnvLoop:
             except UsageError:
                 self.close()
                 raise
-            except BaseException as error:  # also SystemExit: the environment must not end the worker in silence
+            except BaseException as error:  # also SystemExit: the environment must not silently end the worker
                 self.close()
                 raise CopyFailed(n, "make") from error
         self.steps = 0
@@ -88,11 +89,11 @@ class EnvLoop:
         self.truncated: list[Any] = [ended] * len(self.envs)
         """[N] of the last step"""
         self.random_states: dict[int, dict[str, Any] | None] = {}
-        """by copy: state of its environment's random generator before the last reset that a step made"""
+        """by copy: state of its environment's random generator before the last reset in a step"""
         self._step_functions = [env.step for env in self.envs]
         self._inner = [repeatable(env) for env in self.envs]
         self.stepping = stepping
-        """what the worker does during a step"""
+        """the worker's activity during a step"""
         self._all = range(len(self.envs))
         # rules NEXT_STEP, SAME_STEP, DISABLED
         self._next_step = autoreset == "NextStep"
@@ -124,7 +125,7 @@ class EnvLoop:
         return infos
 
     def step(self, actions: Iterable[Any], into: list[Any], pulse: Pulse, copies: Sequence[int] | None = None) -> CopyInfos:
-        """Step every copy, or these alone, each with its action, or reset it.
+        """Step, or reset, every copy or only these, each with its action.
 
         The rest of the result is in `reward`, `terminated`, `truncated`.
         """
@@ -140,8 +141,8 @@ class EnvLoop:
         next_step = self._next_step
         same_step = self._same_step
         infos: CopyInfos = []
-        # What the worker does is written here in full, because this loop must be fast: once per step of the lane, when a
-        # copy is reset, and every `PULSE_S`.
+        # The worker's activity is written inline, because this loop must be fast: once per step of the lane, at each reset
+        # of a copy, and every `PULSE_S`.
         numbers = self._activity.numbers
         seconds = self._activity.seconds
         begin = self._activity.begin
@@ -199,15 +200,15 @@ class EnvLoop:
         return infos
 
     def random_state(self, copy: int) -> dict[str, Any] | None:
-        """State of the copy's random generator now; None if it has none that can be read."""
+        """The current state of the copy's random generator; None if it has no readable one."""
         return state_of(self._inner[copy])
 
     def set_random_state(self, copy: int, packed: bytes) -> bool:
-        """Set it. False if the copy has none that this state fits."""
+        """Set that state. False if the copy has no generator that it fits."""
         return set_state(self._inner[copy], packed)
 
     def _check_numbers(self, copies: Iterable[int]) -> None:
-        """Raise `CopyFailed` for a text as a number, and for no reward: numpy would take them for True, 1 or NaN."""
+        """Raise `CopyFailed` for text and for a missing reward, which numpy would read as True, 1 or NaN."""
         for n in copies:
             if why := self._rewards_of_agents(n):
                 raise CopyFailed(n, f"step {self.steps}", why)
@@ -221,7 +222,7 @@ class EnvLoop:
                     raise CopyFailed(n, f"step {self.steps}", f"{wrong}; its step must return ({STEP})")
 
     def _rewards_of_agents(self, n: int) -> str:
-        """What to do if copy `n` rewards each element of its Tuple spaces, as a line; empty if it does not."""
+        """Advice, in one line, if copy `n` returns a reward for each element of its Tuple spaces; else empty."""
         reward = self.reward[n]
         if not isinstance(reward, list | tuple | np.ndarray):
             return ""
@@ -240,7 +241,7 @@ class EnvLoop:
 
 
 def _kept(info: Any) -> Any:
-    """The info with copies of its dicts and arrays, as gymnasium keeps it. Not every other value can be copied."""
+    """The info with copies of its dicts and arrays, as gymnasium keeps it. Other values may not be copyable."""
     if isinstance(info, dict):
         return {key: value if type(value) in _IMMUTABLE else _kept(value) for key, value in info.items()}
     return info.copy() if isinstance(info, np.ndarray) else info

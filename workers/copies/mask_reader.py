@@ -1,8 +1,9 @@
 """Reads the masks of allowed actions that env copies report, in their observations or in `info`.
 
-Rule: where an action will be chosen, a mask is there, has a bit for each choice, and allows at least one choice of each
-entry of the action; else the environment is wrong (`CopyFailed`). After an episode's end no action is chosen. If the episode
-was truncated, the mask is kept, because the value of the last observation counts; if there is none, all actions are allowed.
+Rule: wherever an action will be chosen, there must be a mask with a bit for each choice that allows at least one choice of
+each entry of the action; otherwise the environment is wrong (`CopyFailed`). No action is chosen after an episode's end. If
+the episode was truncated, its mask is kept, because the value of the last observation is used; if it has none, all actions
+are allowed.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ _NONE: Mapping[str, Any] = {}
 
 
 def unused_mask(infos: Iterable[Mapping[str, Any]], action: gymnasium.Space[Any]) -> str:
-    """A line for whoever trains, if there is a mask in one of these infos of resets, which the run does not use."""
+    """A line for the user if one of these infos of resets contains a mask that the run does not use."""
     if not action_spec(action).choices or not any(isinstance(info, Mapping) and MASK in info for info in infos):
         return ""
     return f"the environment's info has an {MASK}, which this run does not use; --action-masks info does"
@@ -54,7 +55,7 @@ class MaskReader:
     def read_all(self, observation: Any, infos: Mapping[str, Any], terminated: Bools, truncated: Bools) -> Bools:
         """The masks [N, choices] of all copies of a vector environment. Raises `CopyFailed`.
 
-        A copy that gets no action needs none: `terminated` says so.
+        A copy that gets no action, as `terminated` says, needs no mask.
         """
         count = len(terminated)
         given = (observation if self._in_observation else infos).get(MASK)
@@ -73,7 +74,7 @@ class MaskReader:
         truncated: Sequence[Any],
         stepped: Sequence[int] | None = None,
     ) -> list[Bools]:
-        """The masks of all copies of a loop. `stepped`: only these got one, and the others need none."""
+        """The masks of all copies of a loop. `stepped`: only these copies have new masks, and the others need none."""
         by_copy = dict(infos)
         of = range(len(observations)) if stepped is None else stepped
         return [
@@ -105,7 +106,7 @@ class MaskReader:
 
 
 def _as_array(value: Any) -> Array | None:
-    """A mask as one array: those of several entries are joined."""
+    """A mask as one array: the masks of several entries are concatenated."""
     try:
         if isinstance(value, tuple | list) and value and np.ndim(value[0]):
             return np.concatenate([np.asarray(part).reshape(-1) for part in value])
@@ -120,7 +121,7 @@ def _rows(given: Any, count: int) -> Sequence[Any]:
         return list(zip(*given, strict=True))
     if isinstance(given, np.ndarray | list) and len(given) == count:
         return list(given)
-    return [given] * count  # none, or what `_mask` refuses
+    return [given] * count  # no mask, or a value that `_mask` refuses
 
 
 def _shown(value: Any, array: Array | None) -> str:

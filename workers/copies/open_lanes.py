@@ -1,7 +1,7 @@
 """The lanes whose env copies are open in this process.
 
-Rule: a lane that is closed while environment code runs, or while its own copies are made, is closed when that code has
-returned: its copies may be in the middle of a step.
+Rule: a lane that is closed while environment code runs, or while its own copies are made, is closed only after that code has
+returned, because its copies may be in the middle of a step.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class OpenLanes(dict[int, L]):
 
     @contextmanager
     def in_use(self) -> Iterator[None]:
-        """Within it, environment code runs. What is closed meanwhile is closed at its end."""
+        """While it is entered, environment code runs, and closing lanes is postponed to its end."""
         self._in_use = True
         try:
             yield
@@ -49,7 +49,7 @@ class OpenLanes(dict[int, L]):
         return lane if lane is not None and lane.incarnation == incarnation else None
 
     def open(self, number: int, make: Callable[[], L]) -> L:
-        """Make a lane, after its earlier incarnation was closed."""
+        """Make a lane, after closing its earlier incarnation."""
         self.close([number])
         self._opening = number
         lane = make()
@@ -60,7 +60,7 @@ class OpenLanes(dict[int, L]):
         return lane
 
     def close(self, lanes: Iterable[int]) -> None:
-        """Close these lanes, if they are here: at once, or at the end of `in_use`."""
+        """Close those of these lanes that are open: at once, or at the end of `in_use`."""
         for number in lanes:
             if number == self._opening:
                 self._opening = None

@@ -1,8 +1,7 @@
-"""The state of an environment's own random generator: what a reset without a seed depends on, in environments that repeat
-themselves.
+"""The state of an environment's own random generator, on which a reset without a seed depends in deterministic environments.
 
-Rule: it is read only from gymnasium's `np_random`, which `super().reset(seed=...)` makes. An environment that draws from
-anything else, or has none, cannot tell in which state it is.
+Rule: it is read only from gymnasium's `np_random`, which `super().reset(seed=...)` makes. If an environment draws from
+anything else, or has no generator, its state cannot be read.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from millrace.protocol.envs.seats import SeatedEnv
 from millrace.workers.copies.reset_ahead import ResetAhead
 
 BYTES = 16 + 16 + 4 + 1
-"""of a packed state: PCG64's state and increment, and half of a number that it has drawn and not given yet"""
+"""size of a packed state: PCG64's state and increment, and a buffered half of the last number that it drew"""
 ATTRIBUTES = ("_np_random", "np_random")
 """Where environments keep their generator: those of gymnasium, and those of PettingZoo by convention."""
 
@@ -26,7 +25,7 @@ def repeatable(env: gymnasium.Env[Any, Any]) -> Any | None:
     inner: Any = env
     while isinstance(inner, gymnasium.Wrapper):
         if isinstance(inner, ResetAhead):
-            return None  # two instances take turns, each with a generator of its own
+            return None  # two instances take turns, each with its own generator
         inner = inner.env
     if isinstance(inner, SeatedEnv):
         inner = getattr(inner.env, "unwrapped", inner.env)
@@ -34,7 +33,7 @@ def repeatable(env: gymnasium.Env[Any, Any]) -> Any | None:
 
 
 def state_of(inner: Any | None) -> dict[str, Any] | None:
-    """The state of the generator of an environment inside all wrappers; None if it has none that can be read."""
+    """The state of the generator of an environment inside all wrappers; None if it has no readable one."""
     generator = _generator(inner)
     return None if generator is None else generator.bit_generator.state  # type: ignore[return-value]  # a new dict
 
@@ -63,7 +62,7 @@ def set_state(inner: Any | None, packed: bytes) -> bool:
 
 
 def _generator(inner: Any | None) -> np.random.Generator | None:
-    """Its generator, unless the class computes it: reading it would make one."""
+    """The environment's generator, unless it is a property of the class: reading it would create one."""
     own = getattr(inner, "__dict__", {})
     for name in ATTRIBUTES:
         generator = own.get(name)

@@ -1,8 +1,8 @@
 """`millrace:ResetAhead`, a wrapper for environments whose reset is slow: the next episode is prepared while this one runs.
 
-Rule: which instance plays an episode, and from which random numbers, depends on the resets before it and never on time. A
-reset with a seed or with options is made at once, by the instance that plays. The first reset without one makes a second
-instance in a thread. From then on the two take turns: one plays, and the thread resets the other.
+Rule: which instance plays an episode, and with which random numbers, depends on the resets before it and never on time. The
+instance that plays handles a reset with a seed or options at once. The first reset without them makes a second instance in a
+thread. From then on the two take turns: one plays, and the thread resets the other.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ class ResetAhead(gymnasium.Wrapper[Any, Any, Any, Any]):
     """An environment that resets a second instance of itself while an episode runs.
 
     Use it as the innermost wrapper, so that other wrappers see one environment. It takes the memory of two instances. A
-    reset overlaps with steps where either waits or computes without Python's global interpreter lock, as most simulators do.
+    reset overlaps with steps if either of them waits or releases Python's global interpreter lock, as most simulators do.
 
     Both are made with the same arguments. For a port or a folder, let the constructor ask `millrace.env_copy()`: the second
-    instance has a slot of its own.
+    instance has its own slot.
 
-    Attributes that a run sets in its environment reach both instances. The next episode was reset before that.
+    Attributes that a run sets in its environment reach both instances, but the next episode may already have been reset.
 
     >>> import gymnasium, millrace
     >>> env = millrace.ResetAhead(gymnasium.make("CartPole-v1"))
@@ -41,7 +41,7 @@ class ResetAhead(gymnasium.Wrapper[Any, Any, Any, Any]):
     """
 
     def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
-        """Raises `UsageError` for an environment that `gymnasium.make` did not make: no second one can be made."""
+        """Raises `UsageError` unless `gymnasium.make` made the environment: otherwise no second instance can be made."""
         super().__init__(env)
         if env.spec is None:
             raise UsageError(

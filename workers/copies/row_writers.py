@@ -1,10 +1,10 @@
-"""Writes what N env copies returned into arrays. What an array could only seem to hold is refused (`CopyFailed`).
+"""Writes what N env copies returned into arrays, and refuses values that an array would silently change (`CopyFailed`).
 
-numpy's assignment broadcasts an observation of another shape, reads None as NaN and text as a number, and cuts fractions off
-for a space of integers. Here every observation has the shape of its space, and its dtype is cast only within its kind; an
-integer keeps its value. This is checked at every step, in calls that treat all copies at once; the loop over the copies
-runs only to find which of them is wrong. A reward or a flag is what numpy's assignment makes of it: None is NaN, which the
-check of a rollout's values refuses.
+numpy's assignment broadcasts an observation of another shape, reads None as NaN and text as a number, and truncates
+fractions in a space of integers. Here every observation must have the shape of its space, and its dtype is cast only within
+its kind; integers keep their value. This is checked at every step, in calls that treat all copies at once; the loop over the
+copies runs only to find which of them is wrong. Rewards and flags are converted by numpy's assignment: None becomes NaN,
+which the check of a rollout's values refuses.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class LeafWriter:
         # Observations of one dimension or more are joined along their first one, which is the fastest way.
         self._lengths = [leaf.shape[0]] * copies if leaf.shape else None
         self._joined_shape = (copies * leaf.shape[0], *leaf.shape[1:]) if leaf.shape else (copies,)
-        # "same_kind" is the default, and naming it would cost a tenth of the time.
+        # "same_kind" is the default, and passing it explicitly would cost a tenth of the time.
         self._join: Callable[..., Any] = partial(np.concatenate, casting="safe") if self._is_whole else np.concatenate
 
     def joined(self, array: Array) -> Array:
@@ -47,7 +47,7 @@ class LeafWriter:
     def write(self, joined: Array, values: Any) -> None:
         """Write into one row of a `joined` array. `values`: an array [N, *leaf], or N observations in order.
 
-        Raises `CopyFailed`; some copies may be written then.
+        If it raises `CopyFailed`, some copies may already be written.
         """
         try:
             if self._lengths is not None and isinstance(values, (list, tuple)):
@@ -59,11 +59,11 @@ class LeafWriter:
                 if array.shape == self._shape and (array.dtype == self._dtype or self._keeps_values(array)):
                     joined[...] = array.reshape(self._joined_shape)
                     return
-        except Exception:  # the loop below finds what is wrong, if anything is: an object of the user's raises anything
+        except Exception:  # the loop below finds what is wrong, if anything is: a user-defined object may raise anything
             pass
         row = joined.reshape(self._shape)
         if len(values) != len(row):
-            raise CopyFailed(None, line=f"{self._leaf.name}: expected those of {len(row)} copies, got {len(values)}")
+            raise CopyFailed(None, line=f"{self._leaf.name}: expected observations of {len(row)} copies, got {len(values)}")
         for n, value in enumerate(values):
             self.write_one(row, n, value)
 
@@ -109,7 +109,7 @@ class ObservationWriter:
         return [writer.joined(array) for writer, array in zip(self._writers, arrays, strict=True)]
 
     def write(self, joined: Iterable[Array], t: int, leaves: Iterable[Any]) -> None:
-        """Write those of all copies into row `t` of `joined` arrays."""
+        """Write the observations of all copies into row `t` of `joined` arrays."""
         for writer, array, values in zip(self._writers, joined, leaves, strict=True):
             try:
                 writer.write(array[t], values)
@@ -117,7 +117,7 @@ class ObservationWriter:
                 raise of_seat(error, self._seats) from error
 
     def write_some(self, arrays: Iterable[Array], columns: Sequence[int], leaves: Iterable[Any]) -> None:
-        """Write those of these columns into arrays [N, *leaf]. `leaves`: values that have theirs at their numbers."""
+        """Write the observations of these columns into arrays [N, *leaf]. `leaves`: values, indexed by column."""
         for writer, array, values in zip(self._writers, arrays, leaves, strict=True):
             for n in columns:
                 try:
@@ -167,14 +167,17 @@ def write_numbers(arrays: Numbers, row: int | slice, values: Numbers) -> None:
     reward, terminated, truncated = arrays
     try:
         reward[row], terminated[row], truncated[row] = values
-    except Exception:  # the loop finds what is wrong: an int may be too large, and an object of the user's raises anything
+    except Exception:  # the loop finds what is wrong: an int may be too large, and a user-defined object may raise anything
         for name, array, of_copies in zip(("reward", "terminated", "truncated"), arrays, values, strict=True):
             for n, value in enumerate(of_copies):
                 array[row][n] = one_number(name, n, value)
 
 
 def one_number(name: str, n: int, value: Any) -> Any:
-    """Reward, terminated or truncated (`name`) of copy `n`, as a number. Raises `CopyFailed`, with advice for a vector."""
+    """Reward, terminated or truncated (`name`) of copy `n`, as a number.
+
+    Raises `CopyFailed`, with advice if it is a vector.
+    """
     try:
         array = np.asarray(value)
     except Exception:  # rows of different lengths, or an object of the user's

@@ -1,8 +1,8 @@
 """Environments that can save their state: `save_state() -> bytes` and `load_state(bytes)`, of the environment or a wrapper.
 
-Rule: what is outside of the object that saves must have no state of its own, or one that is known here: `TimeLimit` counts
-steps. With any other wrapper outside, the environment counts as one that cannot save. Beside what the environment saves, the
-state of `np_random` is kept. Nothing is unpickled here; what `load_state` does with its bytes is the environment's business.
+Rule: wrappers outside of the object that saves must be stateless, or have a state that is known here: `TimeLimit` counts
+steps. With any other wrapper outside, the environment counts as one that cannot save. The state of `np_random` is kept in
+addition to the saved state. Nothing is unpickled here; what `load_state` does with its bytes is up to the environment.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from millrace.protocol.bounds import MAX_SAVED_BYTES
 from millrace.workers.copies.random_state import pack, repeatable, set_state, state_of
 
 WITHOUT_STATE = (ClipAction, FlattenObservation, OrderEnforcing, PassiveEnvChecker, RescaleAction)
-"""Wrappers that remember nothing of an episode, by their exact types."""
+"""Wrappers without state of an episode, by their exact types."""
 
 
 class SavedCopy(msgspec.Struct, frozen=True, array_like=True):
     """The state of one env copy."""
 
     state: bytes
-    """as its environment saved it"""
+    """the bytes that its environment saved"""
     random: bytes | None
     """state of its `np_random`; None if that cannot be read"""
     elapsed: tuple[int, ...]
@@ -40,11 +40,11 @@ class SavedCopy(msgspec.Struct, frozen=True, array_like=True):
 
 
 class CannotSave(Exception):
-    """The state is not one that is kept. Its text says why."""
+    """The state can't be kept. The exception's text says why."""
 
 
 def saver(env: gymnasium.Env[Any, Any]) -> Any | None:
-    """The environment, or the wrapper of it, that can save its state; None if there is none."""
+    """The environment, or its wrapper, that can save its state; None if there is none."""
     inner: Any = env
     while True:
         if callable(getattr(type(inner), "save_state", None)) and callable(getattr(type(inner), "load_state", None)):
@@ -68,7 +68,7 @@ def save(env: gymnasium.Env[Any, Any]) -> SavedCopy:
 
 
 def load(env: gymnasium.Env[Any, Any], saved: SavedCopy) -> None:
-    """Give an environment, which was reset, this state. Raises what its code raises."""
+    """Load this state into an environment that was reset. Raises what its code raises."""
     outermost = _saver(env)
     outermost.load_state(saved.state)
     if saved.random is not None:
@@ -83,7 +83,7 @@ def packed(states: list[SavedCopy]) -> bytes:
 
 
 def unpacked(data: Bytes) -> list[SavedCopy]:
-    """Those states. Raises `msgspec.ValidationError` or `msgspec.DecodeError`."""
+    """The states of several copies, from bytes. Raises `msgspec.ValidationError` or `msgspec.DecodeError`."""
     return msgspec.msgpack.decode(data.tobytes(), type=list[SavedCopy])
 
 
@@ -94,7 +94,7 @@ def _saver(env: gymnasium.Env[Any, Any]) -> Any:
 
 
 def _limits(env: gymnasium.Env[Any, Any], outermost: Any) -> list[Any]:
-    """The `TimeLimit` wrappers outside of the one that saves, the outermost first."""
+    """The `TimeLimit` wrappers outside of the object that saves, the outermost first."""
     limits = []
     inner: Any = env
     while inner is not outermost:

@@ -1,7 +1,7 @@
 """A loop over N env copies with A seats each: N · A columns, those of a copy side by side.
 
-Rule: a column shows the mask of the episode's last observation in which its seat acts; all actions are allowed while it has
-none.
+Rule: a column shows the mask of the last observation of its episode in which its seat acts; until there is one, all actions
+are allowed.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class SeatedCopies(LoopedCopies):
         self.columns: SeatColumns
 
     def reset(self, seeds: Sequence[int], pulse: Pulse) -> Leaves:
-        """Start episodes in all copies, or in the first ones, with a seed for each. `columns` says who acts."""
+        """Start episodes in all copies, or in the first ones, with a seed for each. `columns` says which seats act."""
         copies = range(len(seeds))
         self._allowed = [None] * (self.count * self._seats)
         self._loop.reset(copies, seeds, self._observations, pulse)
@@ -55,7 +55,7 @@ class SeatedCopies(LoopedCopies):
         return self._result(copies).leaves
 
     def step(self, actions: Array, pulse: Pulse, copies: Sequence[int] | None = None) -> StepResult:
-        """Step with actions [N · A, *action], or with those of some copies. The result has a row for each column."""
+        """Step with actions [N · A, *action], or only some copies with theirs. The result has a row for each column."""
         of_copies = actions.reshape(-1, self._seats, *actions.shape[1:])
         stepped = range(self.count) if copies is None else copies
         loop = self._loop
@@ -68,12 +68,15 @@ class SeatedCopies(LoopedCopies):
         return self._result(copies)
 
     def _forget_masks(self, copies: Iterable[int]) -> None:
-        """These copies begin an episode."""
+        """Forget the masks of these copies, which begin an episode."""
         for n in copies:
             self._allowed[n * self._seats : (n + 1) * self._seats] = [None] * self._seats
 
     def _result(self, stepped: Sequence[int]) -> StepResult:
-        """What the last step of these copies returned. The others show their last step; copies never reset are left out."""
+        """The result of the last step of these copies.
+
+        Others keep their last rows; copies that were never reset are left out.
+        """
         steps: list[SeatStep] = [step for step in self._observations if step is not None]
         columns = side_by_side(steps)
         observations = columns.observations
@@ -106,13 +109,13 @@ class SeatedCopies(LoopedCopies):
         return StepResult(leaves, columns.reward, columns.terminated, columns.truncated, facts=facts, columns=self.columns)
 
     def pending(self, copy: int) -> Array:
-        """[A] rewards that the seats of this copy have got, and that none of its steps has returned."""
+        """[A] rewards of this copy's seats that no step has returned yet."""
         env = self.envs[copy]
         assert isinstance(env, SeatedEnv)
         return np.array(env.pending(), np.float64)
 
     def _facts_of(self, last: SeatStep) -> tuple[float, ...]:
-        """Of each fact, the mean over the seats that report it in the last step of a copy's episode; NaN if none does."""
+        """For each fact, the mean over the seats that report it in the last step of a copy's episode; NaN if none does."""
         of_seats = np.array([facts_of_info(self._facts, info) for info in last.infos])
         there = ~np.isnan(of_seats)
         sums = np.where(there, of_seats, 0).sum(0)

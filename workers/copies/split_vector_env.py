@@ -1,7 +1,7 @@
-"""One vector environment split into lanes: the workers of the vector environment step its env copies, a collector acts.
+"""One vector environment split into lanes: its workers step the env copies, and a collector acts.
 
-Rule: a lane returns, bit for bit, what a loop over its copies would return. The seeds and actions of its copies are its
-own, and autoreset is NextStep for the vector environment as for the loop.
+Rule: a lane returns, bit for bit, what a loop over its copies would return. The lane chooses its copies' seeds and actions,
+and the vector environment's autoreset is NextStep, like the loop's.
 """
 
 from __future__ import annotations
@@ -64,15 +64,15 @@ class SplitVectorEnv:
         self._result: StepResult | None = None
         self._no_workers: NoWorkers | None = None
         self._calls: Any = getattr(env, "calls", None)  # of a `ZmqVectorEnv`
-        self._assigned: dict[tuple[int, str], tuple[slice, bytes]] = {}  # by first copy and name: attributes that were set
-        self._lost = False  # whether copies were lost, and the copies that replace them need the attributes
+        self._assigned: dict[tuple[int, str], tuple[slice, bytes]] = {}  # attributes that were set, by first copy and name
+        self._lost = False  # whether copies were lost, so that their replacements need the attributes
 
     def open_lane(self, run: RunSpec, lane: int, pulse: Pulse) -> EnvCopies:
         """The copies of this lane: `OpenEnvCopies` of a `Collector`."""
         return SplitLane(self, lane * run.copies, run.copies)
 
     def evaluation_lane(self, count: int) -> SplitLane:
-        """The last copies, for evaluation. They are lanes of one copy each, behind the others."""
+        """The last copies, for evaluation. Each of them is a lane of one copy, after the other lanes."""
         return SplitLane(self, self.env.num_envs - count, count)
 
     def step_all(self, lanes: Sequence[int], actions: Array, pulse: Pulse) -> None:
@@ -88,12 +88,12 @@ class SplitVectorEnv:
             raise environment_failed(lane, CopyFailed(copy, "step", error.line)) from error
 
     def step_evaluation(self, first: int, copies: Sequence[int], actions: Array, pulse: Pulse) -> None:
-        """Step these copies of those for evaluation, of which this is the first."""
+        """Step these of the copies for evaluation, the first of which is `first`."""
         lanes = [self._lanes + n for n in copies]
         self._result = self.step_some(lanes, [first + n for n in copies], actions, pulse)
 
     def step_some(self, lanes: Sequence[int], copies: slice | list[int], actions: Array, pulse: Pulse) -> StepResult:
-        """Step these lanes, which have these copies, with their actions. The result has a row for every copy there is."""
+        """Step these lanes, which have these copies, with their actions. The result has a row for each copy of all lanes."""
         if self._lost:
             self._assign_again(pulse)
         if self._step_lanes is None:
@@ -145,7 +145,7 @@ class SplitVectorEnv:
         return [leaf[copies] for leaf in leaves]
 
     def assign(self, copies: slice, name: str, packed: bytes, pulse: Pulse) -> None:
-        """Set an attribute of these copies, also of those that replace lost ones."""
+        """Set an attribute of these copies, and of later replacements for lost ones."""
         try:
             self._wait(lambda: self._assign_now(copies, name, packed), pulse)
         except WorkerLost:
@@ -164,7 +164,7 @@ class SplitVectorEnv:
             raise CopyFailed(None, f"set_env_attr {name}") from error
 
     def _have(self, copies: Sequence[int], name: str) -> bool:
-        """Whether these copies have the attribute. Those of a client in another language have none."""
+        """Whether these copies have the attribute. Copies of a client in another language have no attributes."""
         try:
             return all(self._calls.call(copies, "has_wrapper_attr", (name,), {}))
         except AttributeError:
@@ -196,7 +196,10 @@ class SplitVectorEnv:
 
 
 class SplitLane:
-    """The env copies of one lane, or those for evaluation: a lost copy costs the episodes that are being played."""
+    """The env copies of one lane, or those for evaluation.
+
+    If a copy is lost, the running episodes of an evaluation are lost.
+    """
 
     def __init__(self, split: SplitVectorEnv, first: int, count: int) -> None:
         self._split = split
@@ -232,7 +235,7 @@ class SplitLane:
 
     @contextmanager
     def _own_numbers(self) -> Iterator[None]:
-        """Within it, an error of a copy of the vector environment becomes one of this lane's."""
+        """While it is entered, errors of the vector environment's copies become errors of this lane's copies."""
         try:
             yield
         except CopyFailed as error:

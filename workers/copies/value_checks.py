@@ -1,4 +1,4 @@
-"""Checks of the values of rows before they are sent: finite, and of their spaces. `row_writers` has checked their shapes.
+"""Checks that the values of rows are finite and within their spaces before they are sent. `row_writers` has checked shapes.
 
 Each raises `EnvironmentFailed`, which names the lane, or an evaluation (`lane` None), and the step and the copy of the
 first wrong value. Arrays are [rows, N, …] with the axes `RunSpec.row_axes`, and row 0 is `first_step`.
@@ -34,7 +34,7 @@ def check_rewards(lane: int | None, reward: Array, axes: Axes, first_step: int =
 
 
 def check_acted(lane: int | None, name: str, array: Array, obs: Sequence[Array], axes: Axes, first_step: int = 0) -> None:
-    """Check what the policy computed: if it is not finite, finite observations `obs` are too large for float32."""
+    """Check that the policy's outputs are finite: if not, finite observations `obs` are too large for float32."""
     if why := wrong_values(array, None, axes, first_step):
         largest = max((float(np.abs(leaf).max(initial=0)) for leaf in obs if leaf.dtype.kind == "f"), default=0)
         line = f"{name} of the policy: {why}, from observations up to {largest:g}"

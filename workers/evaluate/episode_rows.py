@@ -42,11 +42,14 @@ class RowSender:
         return self._order.send_frames and self._frames_so_far < MOST_FRAMES
 
     def observe(self, leaves: Sequence[Array], frame: Array | None) -> None:
-        """Add an observation: its arrays, which are copied, and what was rendered. Raises `ValueError` for another size."""
+        """Add an observation: its arrays, which are copied, and the rendered frame.
+
+        Raises `ValueError` if the frame's size differs.
+        """
         if frame is not None and self._frames and frame.shape != self._frames[-1].shape:
             before = list(self._frames[-1].shape)
             now = list(frame.shape)
-            raise ValueError(f"render: expected pictures of one size, {before} as the one before, got {now}")
+            raise ValueError(f"render: expected frames of one size, {before} as before, got {now}")
         self._obs.append(tuple(leaf.copy() for leaf in leaves))
         self._bytes += sum(leaf.nbytes for leaf in leaves)
         if frame is not None:
@@ -93,4 +96,4 @@ def as_frame(rendered: Any) -> Array:
     frame = np.asarray(rendered)
     if frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3 or not frame.size:
         raise ValueError(f"render: expected an array [H, W, 3] of uint8, got {frame.dtype}{list(frame.shape)}")
-    return frame.copy()  # an environment may draw the next one into the same array
+    return frame.copy()  # an environment may draw the next frame into the same array

@@ -1,8 +1,8 @@
 """Plays the episodes of an Evaluate order. The result depends on the order and the weights, and on nothing else.
 
 Rule: an order has k seeds, and is played on one lane of k env copies. The policy always sees a batch [1, k · A, ...], where
-A is the number of seats of a copy: a copy whose episode has ended stays in the batch and is not stepped. A few rows are
-played at once and then checked; rows that are sent are played one by one. The copies are apart from the lanes of training.
+A is the number of seats of a copy: a copy whose episode has ended stays in the batch and is not stepped. Rows are played in
+small groups and then checked; rows that are sent are played one by one. The copies are apart from the lanes of training.
 They are opened once, and reset with a seed before each episode.
 """
 
@@ -39,7 +39,7 @@ from millrace.workers.lanes.running_episodes import EndedEpisode
 from millrace.workers.opponents import KnownOpponents, Match, OtherTeams
 
 ROWS_AT_ONCE = 16
-"""Enough that what is done once for all of them costs little, and few enough that wrong values are found soon."""
+"""Rows played before a check: enough to amortize its cost, and few enough that wrong values are found soon."""
 
 OpenEvaluationCopies = Callable[[RunSpec, int, str | None, Pulse], EvaluationCopies]
 """Makes this number of copies, with this render mode."""
@@ -50,9 +50,9 @@ def open_looped_copies(run: RunSpec, count: int, render_mode: str | None, pulse:
     make = EnvMaker(run.env.for_evaluation(), render_mode)
     with warnings.catch_warnings():
         if render_mode is not None:
-            warnings.simplefilter("ignore")  # gymnasium's, about a render mode that is refused below
+            warnings.simplefilter("ignore")  # gymnasium's warning about a render mode that is refused below
         copies = loop_over(run, make, count, EnvCopy(evaluation=True), pulse)
-    modes = (copies.envs[0].metadata or {}).get("render_modes", [])  # None: as some environments of the old package gym
+    modes = (copies.envs[0].metadata or {}).get("render_modes", [])  # None in some environments of the old package gym
     if render_mode is not None and (copies.envs[0].render_mode != render_mode or render_mode not in modes):
         copies.close()
         raise UsageError(f"environment {run.env.id} cannot be filmed: expected it to render {render_mode}, got {modes}")
@@ -73,12 +73,12 @@ class Evaluator:
         self._open_copies = open_copies
         self._opponents = KnownOpponents(run)
         self._copies: dict[str | None, EvaluationCopies] = {}  # by render mode
-        self._ended_steps = 0  # of rows that are whole or were dropped
+        self._ended_steps = 0  # env steps of rows that are complete or were dropped
         self._under_way: Rows | None = None
 
     @property
     def steps(self) -> int:
-        """Number of env steps made, also of rows that are under way."""
+        """Number of env steps made, including those of unfinished rows."""
         return self._ended_steps + (0 if self._under_way is None else self._under_way.env_steps())
 
     def play(  # rule EVALUATE
@@ -92,7 +92,7 @@ class Evaluator:
         began_s = perf_counter()
         try:
             while True:
-                with suppress(EpisodesLost), environment_failures(None):  # what is lost is played again from its seeds
+                with suppress(EpisodesLost), environment_failures(None):  # lost episodes are played again from their seeds
                     return self._play(order, send, pulse, self._other_teams(order, held))
         except BaseException:
             self.close()
@@ -148,7 +148,7 @@ class Evaluator:
         self._runner.check(rows)
 
     def _other_teams(self, order: Evaluate, held: Mapping[int, Weights]) -> OtherTeams | None:
-        """The other teams, if the order says who plays them."""
+        """The other teams, if the order names their players."""
         find = self._opponents.among(held)
         matches = [Match(team, find(number)) for team, number in zip(order.teams, order.opponents, strict=True)]
         if not matches:
@@ -158,7 +158,7 @@ class Evaluator:
         return others
 
     def _opened(self, count: int, render_mode: str | None, pulse: Pulse) -> EvaluationCopies:
-        """At least this number of copies. Raises `UsageError` when their spaces are not those of the run."""
+        """At least this number of copies. Raises `UsageError` if their spaces are not those of the run."""
         copies = self._copies.get(render_mode)
         if copies is not None and copies.count >= count:
             return copies
@@ -171,7 +171,7 @@ class Evaluator:
     def _observe(self, sender: RowSender, rows: RowsOfLane, row: int, copies: EvaluationCopies) -> None:
         """Add an observation of the sender's episode to what it sends."""
         n = sender.episode
-        shown = [self._of_copy(n, leaf[row]) for leaf in rows.obs[: len(self._run.policy.observation)]]  # no mask, for one
+        shown = [self._of_copy(n, leaf[row]) for leaf in rows.obs[: len(self._run.policy.observation)]]  # without the mask
         try:
             sender.observe(shown, as_frame(copies.render(n)) if sender.wants_frame else None)
         except ValueError as error:
@@ -190,7 +190,7 @@ class Evaluator:
         sender.step(self._of_copy(n, chosen), float(reward), bool(terminated), bool(truncated) or cut)
 
     def _of_copy(self, n: int, columns: Array) -> Array:
-        """What an array [k · A, …] has for copy n: an entry for each seat, or without seats the entry itself."""
+        """The part of an array [k · A, …] that belongs to copy n: an entry for each seat, or one entry without seats."""
         A = self._run.seats_of_copy
         return columns[n * A : (n + 1) * A] if self._run.seats else columns[n]
 
@@ -222,5 +222,5 @@ class _PlayedActions:
         return self.chosen[None].copy()
 
     def written(self, i: int) -> list[Array]:
-        """None: nobody learns from them."""
+        """No arrays: nobody learns from these rows."""
         return []

@@ -1,9 +1,10 @@
-"""Brings a lane back: continues on new env copies what they did elsewhere, from the lane's past (`protocol/lane_past.py`).
+"""Brings a lane back: continues its episodes on new env copies, from the lane's past (`protocol/lane_past.py`).
 
-Rule: each episode is begun as it was, and its actions are repeated without the policy, row by row, in all copies together.
-Then what the copies show and what they gave is compared with the past. A copy that shows something else does not repeat
-itself: it starts anew, under the next number. Repeated steps are work of the environment, with its timeouts, and count as
-nothing else. An environment that has saved its state gets it back, and repeats nothing.
+Rule: each episode begins as it did before, and its actions are replayed without the policy, row by row, in all copies
+together. Then the copies' observations, returns and lengths are compared with the past. If they differ, the environment does
+not repeat itself: the copy starts anew, with the next number. Replayed steps are calls of the environment, with its
+timeouts, but aren't counted as env steps. If an environment has saved its state, the state is loaded, and nothing is
+replayed.
 """
 
 from __future__ import annotations
@@ -29,18 +30,19 @@ from millrace.workers.lanes.lane import Lane
 
 NOT_REPEATED = (
     "the environment does not repeat itself: when a lost episode was begun again with the same seed and its actions were "
-    "repeated, or its saved state was loaded, {}; so a new episode began in its place, and the run depends on who was lost"
+    "replayed, or its saved state was loaded, {}; so a new episode began instead, and results depend on who was lost"
 )
 
 
 def bring_back(
     run: RunSpec, lane: Lane, past: LanePast, attributes: bytes, pulse: Pulse, written: Sequence[Array] = ()
 ) -> str:
-    """Continue this past on a new lane, whose copies were not reset yet. At the end they have these `attributes`, packed.
+    """Continue this past on a new lane, whose copies have not been reset yet.
 
-    `written`: with seats, arrays [T, N · A, …] as the policy writes them. The past of another lane is not continued.
+    At the end they have these `attributes`, packed.
 
-    Returns what whoever trains should know, in one line; empty if there is nothing. Raises `EnvironmentFailed`.
+    `written`: with seats, arrays [T, N · A, …] as the policy writes them. The past of another lane is not continued. Returns
+    a line for the user; empty if there is nothing to say. Raises `EnvironmentFailed`.
     """
     copies = lane.copies
     continued: list[int] = []
@@ -50,7 +52,7 @@ def bring_back(
     if isinstance(copies, LoopedCopies) and lane.remembers and _fits(past, memory, lane, run, written):
         continued = [n for n, last in enumerate(past.copies) if last.goes_on]
         states = _states(past.memory[-1], lane) if saved else []
-    if not isinstance(copies, LoopedCopies) or not continued:  # the learner knows why
+    if not isinstance(copies, LoopedCopies) or not continued:  # the learner knows the reason
         lane.set_attributes(attributes, pulse)
         starts = [last.start + 1 for last in past.copies]
         lane.start(starts if len(starts) == lane.count else [max(starts, default=1)] * lane.count, pulse)
@@ -67,15 +69,15 @@ def bring_back(
 
 
 class _Repeated:
-    """The copies of a lane while their episodes are repeated."""
+    """The copies of a lane while their episodes are replayed."""
 
     def __init__(
         self, run: RunSpec, lane: Lane, copies: LoopedCopies, past: LanePast, continued: list[int], pulse: Pulse
     ) -> None:
         self.continued = continued
-        """the copies that are as they were, so far as it is known"""
+        """the copies that have agreed with the past so far"""
         self.why = ""
-        """in what a copy differed"""
+        """how a copy differed"""
         self._run = run
         self._lane = lane
         lane.starts = [last.start for last in past.copies]
@@ -86,11 +88,11 @@ class _Repeated:
         self._acts = np.zeros(lane.columns, bool)
         self._obs = [np.empty_like(leaf) for leaf in past.obs]
         self._returns = np.zeros((lane.count, self._seats))
-        self._sizes = np.zeros(lane.count)  # [N] sum of what the rewards are without their signs
+        self._sizes = np.zeros(lane.count)  # [N] sum of the rewards' absolute values
         self._numbers = (np.zeros(lane.columns), np.zeros(lane.columns, bool), np.zeros(lane.columns, bool))
 
     def repeat(self) -> None:
-        """Begin the episodes as they began, and repeat their actions. Raises `CopyFailed`."""
+        """Begin the episodes as they began, and replay their actions. Raises `CopyFailed`."""
         past = self._past
         attributes = {each.row: each.packed.tobytes() for each in past.attributes}
         taken = action_converter_of(self._run.policy)(past.action)
@@ -112,7 +114,7 @@ class _Repeated:
                 self._set_random(n)
 
     def load(self, states: list[SavedCopy]) -> None:
-        """Load the states that were saved. A copy whose episode is over is reset by the next step."""
+        """Load the saved states. A copy whose episode is over is reset by the next step."""
         for n in list(self.continued):
             if self._past.copies[n].saved:
                 why = self._copies.load(n, states[n]) if n < len(states) else "its state is damaged"
@@ -121,7 +123,7 @@ class _Repeated:
         self._copies.end([n for n in self.continued if self._past.copies[n].over])
 
     def compare(self) -> None:
-        """A copy that is not as it was is continued no more."""
+        """Compare the copies with the past, and give up those that differ."""
         past = self._past
         returns = past.memory[0][:, :-2]
         for n in list(self.continued):
@@ -131,11 +133,11 @@ class _Repeated:
             most = self._sizes[n] * np.finfo(np.float64).eps * (len(past.action) - self._first(n) + 1)
             if any((new[columns] != old[columns]).any() for new, old in zip(self._obs, past.obs, strict=True)):
                 self._differs(n, "it shows another observation")
-            elif not np.abs(self._returns[n] - returns[n]).max() <= most < np.inf:  # the same numbers in another order
+            elif not np.abs(self._returns[n] - returns[n]).max() <= most < np.inf:  # for another order of sums
                 self._differs(n, "its rewards add up to another return")
 
     def start_others(self) -> None:
-        """Each copy that is not continued starts anew."""
+        """Start each copy anew that isn't continued."""
         lane = self._lane
         anew = [n for n in range(lane.count) if n not in self.continued]
         for n in anew:
@@ -144,7 +146,7 @@ class _Repeated:
         self._seed(anew)
 
     def hand_over(self) -> None:
-        """The lane is as it was at its last row, but for the copies that have started anew."""
+        """Give the lane its state after its last row, except for copies that have started anew."""
         lane = self._lane
         past = self._past
         over = [n for n in self.continued if past.copies[n].over]
@@ -170,7 +172,7 @@ class _Repeated:
         return last.is_repeated and last.random == b""
 
     def _follows(self, n: int) -> bool:
-        """Whether the episode of copy n began with a reset without a seed, which a step made."""
+        """Whether the episode of copy n began with a reset without a seed, in a step."""
         last = self._past.copies[n]
         return bool(last.random) and last.is_repeated
 
@@ -182,7 +184,7 @@ class _Repeated:
             self._began(copies, [copy_seed(self._run.seed, lane.number, lane.starts[n], n) for n in copies])
 
     def _reset(self, copies: list[int]) -> None:
-        """Begin the next episodes of these copies, from the random numbers that they had then."""
+        """Begin the next episodes of these copies, from the random states that they had then."""
         if able := [n for n in copies if self._set_random(n)]:
             self._began(able, [None] * len(able))
 
@@ -202,14 +204,14 @@ class _Repeated:
             self._count(copies, result.columns.outside)
 
     def _see(self, result: StepResult, copies: list[int]) -> None:
-        """Keep what these copies show."""
+        """Keep the observations of these copies."""
         columns = columns_of(copies, self._seats)
         self._lane.writer.write_some(self._obs, columns, result.leaves)
         if result.columns is not None:
             self._acts[columns] = result.columns.acts[columns]
 
     def _step(self, taken: Array, copies: list[int]) -> StepResult:
-        """Step these copies, and count what they gave."""
+        """Step these copies, and count their rewards."""
         self._pulse()
         result = self._copies.step(taken[columns_of(copies, self._seats)], self._pulse, copies)
         write_numbers(self._numbers, slice(None), (result.reward, result.terminated, result.truncated))
@@ -245,7 +247,7 @@ def _states(blob: Array, lane: Lane) -> list[SavedCopy]:
 
 
 def _fits(past: LanePast, memory: Sequence[Array], lane: Lane, run: RunSpec, written: Sequence[Array]) -> bool:
-    """Whether the arrays are those of this lane. They come from another worker, through the learner."""
+    """Whether the arrays fit this lane. They come from another worker, through the learner."""
     action = run.policy.action
     rows = past.action.shape[0] if past.action.ndim else 0
     expected: Iterable[tuple[Array, tuple[int, ...], str]] = [

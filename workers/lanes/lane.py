@@ -1,8 +1,8 @@
-"""A lane: N env copies that are stepped together, and all that one step of them passes on to the next.
+"""A lane: N env copies that are stepped together, and all the state that one step passes on to the next.
 
-Rule: whatever a lane remembers is here: its copies and what was set in them, the observations and the policy's state, which
-copies are playing, their running episodes, seats that wait, opponents, and how its newest episodes began. What steps lanes
-(`runner.py`) remembers nothing. `bring_back.py` gives a new lane the memory of one that was lost.
+Rule: a lane's whole state is here: its copies and their attributes, the observations and the policy's state, which copies
+are playing, their running episodes, seats that wait, opponents, and how its newest episodes began. The code that steps lanes
+(`runner.py`) is stateless. `bring_back.py` gives a new lane the state of one that was lost.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from millrace.workers.opponents import Opponent, OtherTeams
 
 
 class Lane:
-    """N env copies. Each has A columns, one for each seat; A is 1 for an environment of gymnasium's."""
+    """N env copies. Each has A columns, one for each seat; A is 1 for a gymnasium environment."""
 
     def __init__(
         self,
@@ -47,10 +47,10 @@ class Lane:
         incarnation: int = 0,
         most_steps: int = LARGEST,
     ) -> None:
-        """`count`: N, the first so many of the copies.
+        """`count`: N; the lane has the first N of the copies.
 
         `number`: None if the lane plays an evaluation. Then no step resets a copy, and one whose episode is over is not
-        stepped. `most_steps`: an episode that reaches so many is cut.
+        stepped. `most_steps`: an episode that reaches this number of steps is cut.
         """
         self.number = number
         self.incarnation = incarnation
@@ -59,32 +59,32 @@ class Lane:
         self.count = count
         """N"""
         self.starts: list[int] = []
-        """[N] the number of each copy's start, which decides its seed; none in an evaluation"""
+        """[N] the number of each copy's start, which determines its seed; empty in an evaluation"""
         self.new_starts: Sequence[int] = ()
-        """the copies that have started since `begun` was asked"""
+        """the copies that have started since the last call of `begun`"""
         self.remembers = isinstance(copies, LoopedCopies) and not run.teams
         """whether its episodes can be continued on other copies"""
         self.columns = self.count * run.seats_of_copy
         """N · A"""
         leaves = stored_leaves(run)
         self.obs = tuple(np.empty((self.columns, *leaf.shape), leaf.dtype) for leaf in leaves)
-        """[N · A, *leaf] each, with which the next rows begin"""
+        """[N · A, *leaf] each, the observations with which the next rows begin"""
         self.state = zero_state(run.policy, self.columns)
         """[N · A, S] recurrent state of the policy, with which the next rows begin"""
         self.playing = np.ones(self.count, bool)
-        """[N] whether the copy's episode goes on: if not, the next step only resets the copy, or leaves it as it is"""
+        """[N] whether the copy's episode continues: if not, the next step only resets the copy, or leaves it as it is"""
         self.episodes = RunningEpisodes(run, self.count, number, most_steps)
         self.seats = Seats(run.policy, self.columns) if run.seats else None
         self.others: OtherTeams | None = None
-        """those who play the other teams, if the policy plays one team alone"""
+        """the players of the other teams, if the policy plays only one team"""
         self.opponent: Opponent | None = None
-        """who plays them in the episodes that begin from now on; None: as before"""
+        """the opponent in the episodes that begin from now on; None: as before"""
         self.writer = ObservationWriter(leaves, self.columns, run.seats)
         self._run = run
-        self._attributes = b""  # that were set in the copies
+        self._attributes = b""  # attributes that were set in the copies
 
     def set_attributes(self, packed: bytes, pulse: Pulse) -> None:
-        """Set these attributes in all copies unless they are set. Raises `EnvironmentFailed` if a copy has none."""
+        """Set these attributes in all copies, unless already set. Raises `EnvironmentFailed` if a copy lacks one."""
         if packed == self._attributes:
             return
         before, now = (unpack(each) if each else {} for each in (self._attributes, packed))
@@ -96,7 +96,7 @@ class Lane:
         self._attributes = packed
 
     def start(self, starts: list[int], pulse: Pulse) -> None:
-        """Start all copies, under these numbers. Raises `EnvironmentFailed`."""
+        """Start all copies, with these numbers of their starts. Raises `EnvironmentFailed`."""
         assert self.number is not None
         self.starts = starts
         self.new_starts = range(self.count)
@@ -115,18 +115,18 @@ class Lane:
             self.add_outside(first.outside[: self.columns], 0)
 
     def add_outside(self, rewards: Doubles, step: int) -> None:
-        """Add rewards [N · A] of this step that are in no row to the returns. No later check sees them."""
+        """Add rewards [N · A] of this step that don't belong to any row to the returns. No later check sees them."""
         if not np.abs(rewards).max() < LARGEST_REWARD:  # false for NaN too
             check_rewards(self.number, rewards[None], self._run.row_axes, step)
         self.episodes.returns += rewards.reshape(self.episodes.returns.shape)
 
     @property
     def sent(self) -> slice | npt.NDArray[np.intp]:
-        """The columns whose rows a rollout has."""
+        """The columns whose rows are in a rollout."""
         return slice(None) if self.others is None else np.flatnonzero(self.others.mine)
 
     def begun(self) -> tuple[EpisodeBegin, ...]:  # rule PAST
-        """How the newest episodes began, of the copies that have new ones since this was last asked."""
+        """How the newest episodes began, for copies with new episodes since the last call."""
         random: dict[int, bytes | None] = dict.fromkeys(self.new_starts, b"" if self.remembers else None)
         self.new_starts = ()
         if self.remembers and isinstance(self.copies, LoopedCopies):
@@ -136,7 +136,7 @@ class Lane:
         return tuple(EpisodeBegin(n, self.starts[n], state) for n, state in sorted(random.items()))
 
     def memory(self) -> tuple[Array, ...]:  # rule PAST
-        """What `recall` needs beside the observations, the actions, and how the episodes began."""
+        """The state that `recall` needs besides the observations, the actions, and how the episodes began."""
         if not self.remembers:
             return ()
         state = (self.state,) if self.state.size else ()
@@ -152,11 +152,11 @@ class Lane:
                 return copies.save()
         except CannotSave as error:
             copies.saves = False
-            copies.note = f"{error}, so its episodes are repeated if a worker is lost"
+            copies.note = f"{error}, so its episodes are replayed if a worker is lost"
             return []
 
     def can_recall(self, memory: Sequence[Array], written: Sequence[Array]) -> bool:
-        """Whether this is the memory of such a lane. `written`: see `bring_back`."""
+        """Whether this memory fits this lane. `written`: see `bring_back`."""
         own = self.memory()
         rest = memory[len(own) :]
         held = written if self.seats is not None and rest else ()
@@ -166,7 +166,7 @@ class Lane:
         return self.episodes.can_recall(memory[0])
 
     def recall(self, memory: Sequence[Array], copies: Sequence[int]) -> None:
-        """Take over, for these copies, what `memory` said of another lane. `can_recall` must hold."""
+        """Take over, for these copies, the `memory` of another lane. `can_recall` must be true."""
         left = list(memory)
         columns = columns_of(copies, self.columns // self.count)
         self.episodes.recall(left.pop(0), copies, perf_counter())

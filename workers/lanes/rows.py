@@ -1,9 +1,8 @@
-"""The rows of lanes that are stepped together, while they are written.
+"""The rows of lanes that are stepped together, while they are being written.
 
 Rule: a step fills one row of every lane. When all rows are filled, they keep the row format (`protocol/rollout.py`), and the
-running episodes of each lane have come as far as its rows. Rows stay empty only where an evaluation ends: all its episodes
-are over. The part of a row that belongs to a copy which was not stepped shows what the copy showed before, and nothing that
-happened.
+running episodes of each lane include all its rows. Rows stay empty only at the end of an evaluation, when all its episodes
+are over. If a copy was not stepped, its part of the row repeats the copy's last observation and has no reward.
 """
 
 from __future__ import annotations
@@ -27,14 +26,14 @@ from millrace.workers.lanes.seats import Seats
 
 
 class EpisodesLost(Exception):
-    """Copies were lost with their worker, and with them episodes of an evaluation."""
+    """Copies were lost with their worker, and so were episodes of an evaluation."""
 
 
 class Rows:
     """T rows of L lanes. N · A is the number of columns of each lane."""
 
     def __init__(self, run: RunSpec, lanes: Sequence[Lane], steps: int) -> None:
-        """T is `steps`. The first observations and the states are those of the lanes."""
+        """T is `steps`. The first observations and the states come from the lanes."""
         L = len(lanes)
         T = steps
         columns = lanes[0].columns
@@ -63,7 +62,7 @@ class Rows:
 
     @property
     def filled(self) -> int:
-        """How many rows are whole."""
+        """How many rows are complete."""
         return len(self.step_end_s)
 
     @property
@@ -72,11 +71,11 @@ class Rows:
         return not any(each.lane.autoresets or np.count_nonzero(each.lane.playing) for each in self.of_lanes)
 
     def begin_row(self) -> None:
-        """The row before is whole, and the next one begins."""
+        """Begin the next row; the one before is complete."""
         self._calls_before_row = self._calls[ENV_CALLS]
 
     def begin_again(self) -> None:
-        """Where these rows end, the next ones begin, in the same arrays."""
+        """Begin the next rows, in the same arrays, where these rows end."""
         self.first_step += self.steps
         self.step_end_s.clear()
         for array in self.obs:
@@ -85,21 +84,21 @@ class Rows:
             each.begin()
 
     def env_steps(self) -> int:
-        """Env steps made, also those of a row that is not whole.
+        """Env steps made, including those of an incomplete row.
 
-        The count never falls, and only calls of the environment that have returned are in it.
+        The count never falls, and includes only calls of the environment that have returned.
         """
         before = self._of_rows(self.filled)
         if self.filled == self.steps:
             return before
         after = self._of_rows(self.filled + 1)
-        # Calls in this row that have returned. At worst the copies that it resets were called first.
+        # Calls in this row that have returned. In the worst case, the copies that it resets were called first.
         calls = self._calls[ENV_CALLS] - self._calls_before_row
         resets = sum(each.lane.count for each in self.of_lanes) - (after - before)
         return min(after, before + max(0, calls - resets))
 
     def _of_rows(self, rows: int) -> int:
-        """Of so many rows. It is known before a row is made which copies that row only resets."""
+        """Env steps of this many rows. Which copies a row only resets is known before the row is made."""
         return sum(rows * each.lane.count - each.resets_in(rows) for each in self.of_lanes)
 
 
@@ -107,7 +106,7 @@ class RowsOfLane:
     """The part of the rows that belongs to one lane."""
 
     def __init__(self, run: RunSpec, rows: Rows, i: int, lane: Lane) -> None:
-        """`i`: which of the lanes it is."""
+        """`i`: index of the lane."""
         self.lane = lane
         self.obs = tuple(array[i] for array in rows.obs)
         self.state = rows.state[i]
@@ -126,24 +125,24 @@ class RowsOfLane:
         self._numbers = (self.reward, self.terminated, self.truncated)
         self._nothing_outside = np.zeros(lane.columns)
         self._joined = lane.writer.joined(self.obs)
-        self._facts: dict[tuple[int, int], tuple[float, ...]] = {}  # by row and copy, of episodes that ended
+        self._facts: dict[tuple[int, int], tuple[float, ...]] = {}  # facts of episodes that ended, by row and copy
         for array, newest in zip(self.obs, lane.obs, strict=True):
             array[0] = newest
         self.begin()
 
     def begin(self) -> None:
-        """No row is written yet."""
+        """Start over: no row has been written."""
         self.resets[0] = ~self.lane.playing  # rules FIRST_VALID, FIRST_RESETS
         self.ended.clear()
         self._facts.clear()
 
     def pass_on(self) -> None:  # rule CONTINUES
-        """Leave to the lane what its next rows begin with."""
+        """Store in the lane the state that its next rows begin with."""
         self.lane.obs = tuple(array[-1].copy() for array in self.obs)
         self.lane.state = self.state.copy()
 
     def resets_in(self, rows: int) -> int:
-        """How many of the steps of the copies, in so many rows, belong to no episode."""
+        """How many steps of the copies, in this many rows, belong to no episode."""
         if self.lane.seats is not None or not self.lane.autoresets:
             return int(np.count_nonzero(self.resets[:rows]))
         if not rows:
@@ -152,7 +151,7 @@ class RowsOfLane:
         return int(np.count_nonzero(self.resets[0]) + np.count_nonzero(ended))
 
     def acted(self, t: int, written: Sequence[Array], before: Floats, taken: Array) -> None:
-        """With seats: the policy has written its row t, and was in the state `before`. Those of other teams act too.
+        """With seats: take the policy's row t, before which its state was `before`. Opponents act, too.
 
         `taken`: the actions [N · A, *action] for the environment.
         """
@@ -182,7 +181,7 @@ class RowsOfLane:
             self._show_playing(t)
 
     def _step_playing(self, actions: Array, pulse: Pulse) -> StepResult:
-        """Step the copies whose episodes go on. Returns what it means for those of the lane: there may be more."""
+        """Step the copies whose episodes continue. Returns the result for the lane's copies: there may be more copies."""
         lane = self.lane
         copies: EvaluationCopies = lane.copies  # type: ignore[assignment]
         playing = lane.playing.nonzero()[0].tolist()
@@ -192,9 +191,9 @@ class RowsOfLane:
         return result if lane.count == copies.count else result.first(lane.count, lane.columns)
 
     def _show_playing(self, t: int) -> None:
-        """Nothing has happened in row t to copies that were not stepped: what the row has of them is their last step.
+        """Remove rewards and ends from row t for copies that were not stepped, because the row repeats their last step.
 
-        Nobody learns from these rows, so rewards that are outside of any row of a seat are in them too.
+        Nobody learns from these rows, so they also contain rewards that belong to no row of a seat.
         """
         playing = self.lane.playing
         if self.columns is not None:
@@ -208,10 +207,10 @@ class RowsOfLane:
                 self.columns.complete[still] = False
 
     def _lose(self, t: int, lost: Bools) -> None:
-        """These copies [N] were lost in step `t`: their episodes are truncated at the last step that was made.
+        """Truncate the episodes of these copies [N], which were lost in step `t`, at the last step that was made.
 
         Rows `t` and `t + 1` are then not valid, because step `t` was not made. Raises `EpisodesLost` in an evaluation, whose
-        episodes must be whole.
+        episodes must be complete.
         """
         if not self.lane.autoresets:
             if (lost & self.lane.playing).any():
@@ -221,7 +220,7 @@ class RowsOfLane:
         if t:
             self.truncated[t - 1] |= lost & ~self.terminated[t - 1]
         else:
-            self.resets[0] |= lost  # the last rollout is already delivered, so no rollout has the end of the episode
+            self.resets[0] |= lost  # the last rollout is already delivered, so no rollout contains the end of the episode
 
     def count(self, t: int, now_s: float) -> None:
         """Add row t to the running episodes."""
@@ -240,9 +239,10 @@ class RowsOfLane:
         self.resets[t + 1] = ~lane.playing
 
     def _count_seats(self, t: int, seats: Seats) -> Bools:  # rule SEATS
-        """What row t means for seats: whether the episode of each copy [N] is over.
+        """Count row t for seats.
 
-        Where an episode begins, the policy's state is set to zeros, and another opponent may come.
+        Returns whether the episode of each copy [N] is over. Where an episode begins, the policy's state is set to zeros,
+        and the opponent may change.
         """
         lane = self.lane
         columns = self.columns
@@ -259,7 +259,7 @@ class RowsOfLane:
         return columns.over
 
     def count_all(self) -> None:
-        """As `count` for each row, but faster. Only for copies with one agent, which steps reset."""
+        """Like `count` for each row, but faster. Only for copies with one agent that are reset by steps."""
         np.logical_or(self.terminated, self.truncated, out=self.resets[1:])
         only_resets = self.resets[:-1]
         self.reward[only_resets] = 0.0
@@ -268,9 +268,9 @@ class RowsOfLane:
         self.ended += self.lane.episodes.add_rows(self.reward, self.resets, self._rows.step_end_s, self._facts)
 
     def _cut(self, t: int, now_s: float) -> None:
-        """End the episodes that have had the most steps, at row t.
+        """End the episodes that have reached the step limit, at row t.
 
-        What seats have got that wait for the move is added to the row: no later step will return it.
+        Rewards of seats that wait for others are added to the row, because no later step will return them.
         """
         lane = self.lane
         too_long = lane.playing & (lane.episodes.lengths >= lane.episodes.most_steps)

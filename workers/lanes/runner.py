@@ -1,8 +1,8 @@
 """Steps a policy over the env copies of lanes, in rollouts as in evaluations.
 
-Rule: lanes that are run together are stepped in lock-step, with one forward pass for all of them [L, N · A, ·]. What a lane
-does depends on the lane and the weights, and on nothing else: not on the other lanes. An evaluation differs in what its lane
-is (`Lane.autoresets`), in how its actions are chosen, and in how many rows are run at once.
+Rule: lanes that are run together are stepped in lock-step, with one forward pass for all of them [L, N · A, ·]. The result
+of a lane depends only on the lane and the weights, not on the other lanes. An evaluation differs in its lane
+(`Lane.autoresets`), in how its actions are chosen, and in how many rows are run at once.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class LaneRunner:
         try:
             self._fill(rows, actions, pulse)
         except (EnvironmentFailed, PolicyFailed, IndexError):
-            # An invalid observation or reward may have caused the error. Then these checks raise the clearer one.
+            # An invalid observation or reward may have caused the error. Then these checks raise a clearer one.
             self.check(rows)
             raise
 

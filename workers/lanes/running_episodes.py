@@ -1,6 +1,6 @@
 """The episodes that env copies are playing: the one place where rewards are summed and steps are counted.
 
-Rule: the fields of `RunningEpisodes` are all that is known of an episode before it ends. Returns are sums in float64, before
+Rule: the fields of `RunningEpisodes` are the whole state of an episode before it ends. Returns are summed in float64, before
 any reward is rounded.
 """
 
@@ -25,20 +25,23 @@ FactsOfRows = Mapping[tuple[int, int], tuple[float, ...]]
 
 
 class EndedEpisode(NamedTuple):
-    """An episode, and how it came about."""
+    """An episode, and how it was played."""
 
     copy: int
     """number of the copy that played it"""
     episode: Episode
     cut: bool = False
-    """whether it was ended here, at the most steps that it may have"""
+    """whether it was cut here, at the limit of its steps"""
 
 
 class RunningEpisodes:
-    """What the running episodes of N copies, with A seats each, have come to so far."""
+    """The returns and lengths so far of the running episodes of N copies, with A seats each."""
 
     def __init__(self, run: RunSpec, copies: int, lane: int | None, most_steps: int = LARGEST) -> None:
-        """`lane`: as errors name it, None for an evaluation. `most_steps`: an episode that reaches so many is cut."""
+        """`lane`: its number, for errors; None for an evaluation.
+
+        `most_steps`: an episode that reaches this number of steps is cut.
+        """
         self.returns = np.zeros((copies, run.seats_of_copy))
         """[N, A] float64: the sum of each seat's rewards"""
         self.lengths = np.zeros(copies, np.int64)
@@ -59,33 +62,34 @@ class RunningEpisodes:
         return memory
 
     def can_recall(self, memory: Doubles) -> bool:
-        """Whether these numbers, of this shape, are returns and seconds."""
+        """Whether these numbers have the right shape and are possible returns and times."""
         return bool(np.isfinite(memory).all() and (memory[:, -1] >= 0).all())
 
     def recall(self, memory: Doubles, copies: Sequence[int], now_s: float) -> None:
-        """Take over, for these copies, what `memory` said elsewhere."""
+        """Take over, for these copies, the `memory` of others."""
         for n in copies:
             self.returns[n] = memory[n, :-2]
             self.lengths[n] = memory[n, -2]
             self.began_s[n] = now_s - float(memory[n, -1])
 
     def begin(self, now_s: float) -> None:
-        """The first episodes of all copies begin with a reset."""
+        """Begin the first episodes of all copies, with a reset."""
         self.began_s = [now_s] * len(self.began_s)
 
     def add(self, rewards: Array, playing: Bools) -> None:  # rule EPISODES
-        """One step of these copies [N], with rewards [N, A], which are 0 for seats that got none."""
+        """Add one step of these copies [N], with rewards [N, A], which are 0 for seats without one."""
         self.returns += rewards
         self.lengths += playing
 
     # rule EPISODE_ORDER
     def add_rows(self, reward: Array, resets: Bools, step_end_s: Sequence[float], facts: FactsOfRows) -> list[EndedEpisode]:
-        """T steps of copies with one agent each. Returns the episodes that ended, ordered by step, then by copy.
+        """Add T steps of copies with one agent each.
 
-        As `add` and `ended` for each row, but it sums the rewards of a copy's rows before it adds them to the return: that
-        is several times faster. `reward` [T, N] is 0 where a row only resets. `resets` [T+1, N]: whether row t only resets
-        the copy; the last row is of the next step. `step_end_s` [T] is when each step ended. Episodes are not checked: if
-        all these rewards are finite, a learner takes them.
+        Returns the episodes that ended, ordered by step, then by copy. Like `add` and `ended` for each row, but several
+        times faster, because it sums the rewards of a copy's rows before it adds them to the return. `reward` [T, N] is 0
+        where a row only resets. `resets` [T+1, N]: whether row t only resets the copy; the last row is of the next step.
+        `step_end_s` [T] is when each step ended. Episodes are not checked: if all these rewards are finite, a learner takes
+        them.
         """
         rewards = reward.T.tolist()  # by copy
         returns = self.returns[:, 0].tolist()
@@ -122,9 +126,10 @@ class RunningEpisodes:
     def ended(
         self, n: int, now_s: float, of_info: tuple[float, ...] | None, others: OtherTeams | None, *, cut: bool = False
     ) -> EndedEpisode:
-        """The episode of copy n is over. `of_info`: facts that the environment reports, if it does. `others`: who played.
+        """End the episode of copy n.
 
-        Raises `EnvironmentFailed` if no learner would take it: its return has rewards that are in no row.
+        `of_info`: facts that the environment reports, if any. `others`: the players of the other teams. Raises
+        `EnvironmentFailed` if no learner would accept it: its return includes rewards that are in no row.
         """
         returns: list[float] = self.returns[n].tolist()
         seconds = now_s - self.began_s[n]

@@ -1,8 +1,8 @@
-"""What the seats of a lane's env copies keep from step to step: who acts, who waits, and what those did who wait.
+"""The state of the seats of a lane's env copies from step to step: who acts, who waits, and the actions of those who wait.
 
-Rule: a seat's row is the one in which its outcome comes (`millrace.protocol.envs.seats`). Until then each row repeats what
-was written when the seat acted: action, log-probability, and the state of the policy before it. So the row is whole wherever
-rollouts are cut, and a rollout may hold an action that older weights chose, with its log-probability under those.
+Rule: a seat's row is the one in which its outcome arrives (`millrace.protocol.envs.seats`). Until then each row repeats what
+was written when the seat acted: action, log-probability, and the state of the policy before it. So the row is complete
+wherever rollouts are cut, and a rollout may contain an action that older weights chose, with its log-probability under them.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ class Seats:
     def __init__(self, policy: PolicySpec, columns: int) -> None:
         self.acts: Bools = np.zeros(columns, bool)
         """[N · A] whether the next step takes the seat's action"""
-        self._waits = np.zeros(columns, bool)  # [N · A] it has acted, and its row is not complete
-        self._held: list[Array] = []  # what the policy wrote when each seat acted last
-        self._held_state = zero_state(policy, columns)  # [N · A, S] before that
+        self._waits = np.zeros(columns, bool)  # [N · A] whether it has acted, and its row is not complete
+        self._held: list[Array] = []  # what the policy wrote when each seat last acted
+        self._held_state = zero_state(policy, columns)  # [N · A, S] the policy's state before that
 
     def memory(self) -> tuple[Array, ...]:
-        """What `recall` needs: who waits, the states in which they acted, and what was written then, if any has acted."""
+        """The state that `recall` needs: who waits, the policy's states before they acted, and the rows written then."""
         return (self._waits.copy(), self._held_state.copy(), *(held.copy() for held in self._held))
 
     def recall(self, memory: Sequence[Array], columns: Sequence[int]) -> None:
-        """Take over, for these columns, what `memory` said of other seats."""
+        """Take over, for these columns, the `memory` of other seats."""
         waits, held_state, *held = memory
         self._waits[columns] = waits[columns]
         self._held_state[columns] = held_state[columns]
@@ -45,7 +45,7 @@ class Seats:
         return np.where(self._waits[:, None], self._held_state, state)
 
     def acted(self, t: int, written: Sequence[Array], before: Floats, state: Floats) -> None:
-        """The policy has written its row t for all columns, and was in the state `before`. Only some seats act."""
+        """Take the policy's row t, written for all columns from the state `before`. Only some seats act."""
         if not self._held:
             self._held = [np.zeros_like(array[0]) for array in written]
         for array, held in zip(written, self._held, strict=True):
@@ -56,6 +56,6 @@ class Seats:
         self._waits |= self.acts
 
     def stepped(self, columns: SeatColumns) -> None:
-        """A step has returned this."""
+        """Take the result of a step."""
         self._waits &= ~columns.complete
         self.acts = columns.acts

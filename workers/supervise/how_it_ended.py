@@ -14,9 +14,11 @@ class Ending:
     reason: str
     """One line."""
     on_purpose: bool = False
-    """The worker has said beforehand that it leaves with this code."""
+    """The worker announced that it would leave with this code."""
     failed: bool = False
-    """Its environment, the policy, or the worker is to blame: it ended neither on purpose nor before it ran their code."""
+    """The environment, the policy, or the worker is to blame: the worker ended neither on purpose nor before it ran their
+    code.
+    """
     of_policy: bool = False
     """It failed in a call of the policy."""
     hung: bool = False
@@ -24,4 +26,4 @@ class Ending:
     worked: bool = False
     """Calls of its environment have returned."""
     last_lines: str | None = None
-    """What it wrote last, if it failed before it had joined a run."""
+    """The last lines of its output, if it failed before it had joined a run."""

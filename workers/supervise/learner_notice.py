@@ -1,12 +1,13 @@
-"""Tells the learner, on a connection of the supervisor's own, which workers are alive, what they do, and how others ended.
+"""Tells the learner, over the supervisor's own connection, which workers are alive, what they do, and how others ended.
 
 Rule: it says so about every second, and more often while a call of an environment takes long. An ended worker is named for a
 while, because a message may be lost: a failed one at once, one that left on purpose a moment later, so that its own last
-messages come first. Nothing is sent before a worker has joined: a wrong address or key is the worker's to report. This file
-imports neither numpy nor gymnasium.
+messages arrive first. Nothing is sent before a worker has joined, because the worker itself reports a wrong address or key.
+This file imports neither numpy nor gymnasium.
 
-If the workers share weights, the learner sends each version once, over this connection. It answers each word, so that both
-sides know what has arrived; and its answer says whose weights these are, as a Welcome does on a worker's connection.
+If the workers share weights, the learner sends each version once, over this connection. It answers each message, so that
+both sides know what has arrived; and its answer says which learner the weights belong to, as a Welcome does on a worker's
+connection.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ log = logging.getLogger("millrace.worker")
 
 EVERY_S = 1.0
 EVERY_S_WHILE_SLOW = 0.4
-SLOW_S = 0.3  # a call of an environment that takes longer: its worker does not send heartbeats meanwhile
+SLOW_S = 0.3  # for longer calls of an environment, the supervisor speaks for the worker, which can't send heartbeats
 ENDED_AFTER_S = 0.2
 ENDED_FOR_S = 5.0
 
@@ -42,11 +43,11 @@ class AliveSender:
     """The supervisor's connection to the learner."""
 
     def __init__(self, address: str, token: Token | None, weights: SharedWeights | None = None) -> None:
-        """Connects at the first `send` that has something to say. `weights`: shares those that come among the workers."""
+        """Connects at the first `send` with content. `weights`: shares received weights among the workers."""
         self._address = address
         self._token = token
         self._weights = weights
-        self._first_session = self._replies = 0  # of the learner's last answer
+        self._first_session = self._replies = 0  # from the learner's last answer
         self._socket: zmq.Socket[bytes] | None = None
         self._due_s = 0.0
         self._ended: list[tuple[float, WorkerExit]] = []
@@ -54,7 +55,7 @@ class AliveSender:
         self._encoder = msgspec.msgpack.Encoder()
 
     def send(self, running: Sequence[WorkerActivity], ended: Sequence[WorkerExit], now: float) -> None:
-        """Say this, if it is time to."""
+        """Send this, if it is due."""
         self._ended += [(now, each) for each in ended]
         self._ended = [(at, each) for at, each in self._ended if now - at < ENDED_FOR_S]
         joined = [each for each in running if each.doing != "starting"]
@@ -72,7 +73,7 @@ class AliveSender:
             self._say(Alive(tuple(joined[first : first + MAX_WORKERS]), reported[:MAX_WORKERS], replies))
 
     def listen(self, for_s: float) -> bool:
-        """Take at once what the learner sends, for so long. Whether it has said that the run is over."""
+        """Handle the learner's messages for this many seconds. Returns whether it has said that the run is over."""
         if self._socket is None:
             time.sleep(for_s)
             return False
@@ -90,7 +91,7 @@ class AliveSender:
             self._socket.close(linger=200)
 
     def _take(self, frames: Sequence[zmq.Frame]) -> bool:
-        """Take a message. Whether it says that the run is over. One that cannot be read is ignored."""
+        """Handle a message. Returns whether it says that the run is over. An unreadable one is ignored."""
         with suppress(*INVALID):
             match msgspec.msgpack.decode(frames[0].bytes):
                 case ["Drain", *_]:
@@ -107,7 +108,7 @@ class AliveSender:
         try:
             self._weights.write(self._first_session, version, frames)
         except (OSError, struct.error) as error:
-            log.warning("the workers cannot share weights, and each gets its own from now on: %s", error)
+            log.warning("the workers cannot share weights; from now on each receives its own: %s", error)
             self._weights = None
 
     def _say(self, message: Alive) -> None:
@@ -120,7 +121,7 @@ class AliveSender:
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context.instance()
         dealer = context.socket(zmq.DEALER)
         set_options(dealer, self._address, self._token is not None)
-        dealer.sndhwm = 10  # only the newest word counts
+        dealer.sndhwm = 10  # only the newest message counts
         name = f"supervisor-{socket.gethostname()}-{os.getpid()}-{os.urandom(3).hex()}"[-MAX_NAME:]
         dealer.routing_id = routing_id(name, self._token)
         dealer.reconnect_ivl = RECONNECT_MS

@@ -1,7 +1,7 @@
-"""The end of a worker's session: of the worker, and of what its environment has started.
+"""Ends a worker's session: the worker, and the processes that its environment has started.
 
-Rule: a process is gone when it holds no port and no file any more. A zombie is, even if nobody ever reaps it. The ranks of
-an MPI program have process groups of their own, and stay in the session.
+Rule: a process is gone when it doesn't hold any port or file any more. This includes a zombie, even if nobody ever reaps it.
+The ranks of an MPI program have their own process groups, but stay in the session.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ def live_members(leader: int) -> list[int]:
     with suppress(FileNotFoundError):
         for name in filter(str.isdecimal, os.listdir("/proc")):
             fields = process_stat(int(name))
-            # With the state Z, its first thread has ended; others may hold its files yet.
+            # State Z means that its first thread has ended; other threads may still hold its files.
             if str(leader) in fields[2:4] and (fields[0] not in "ZX" or int(fields[17]) > 1):
                 pids.append(int(name))
     return pids
 
 
 def kill(pids: Iterable[int]) -> None:
-    """SIGKILL to these processes, as far as they live and are ours."""
+    """Send SIGKILL to those of these processes that live and belong to this user."""
     for pid in pids:
         with suppress(ProcessLookupError, PermissionError):
             os.kill(pid, signal.SIGKILL)

@@ -1,7 +1,7 @@
 """Keeps the log of a worker short while the worker, and what its environment starts, append to it.
 
-Rule: of a log that has grown beyond `MOST` bytes, whole lines at its beginning and at its end stay, and a line says that
-what stood between them is gone. Whoever appends need not know of it: the file stays the same, and is open for appending.
+Rule: if a log grows beyond `MOST` bytes, whole lines at its beginning and end stay, and a line says that the text between
+them was removed. Programs that append don't notice: the file stays the same, and is open for appending.
 """
 
 from __future__ import annotations
@@ -12,13 +12,13 @@ from pathlib import Path
 MOST = 16 << 20  # bytes
 BEGINNING = 1 << 20  # bytes that stay
 END = 4 << 20  # bytes that stay
-GONE = b"[millrace: the log became too long, and what stood here was removed]\n"
+GONE = b"[millrace: the log became too long, and the text here was removed]\n"
 
 
 def keep_short(log: Path, position: int) -> int:
-    """Shorten the log if it is too long. Returns where that is now which was at `position`. Raises `OSError`.
+    """Shorten the log if it is too long.
 
-    What is written while this removes the rest may be lost.
+    Returns the new offset of the text that was at `position`. Raises `OSError`. Text that is written meanwhile may be lost.
     """
     if log.stat().st_size <= MOST:
         return position

@@ -1,13 +1,15 @@
-"""Starts, watches, restarts and stops the workers of this machine. Of their conversation it knows only when the run is over.
+"""Starts, watches, restarts and stops the workers of this machine.
+
+All it knows of their conversation is when the run is over.
 
 Rule: a worker that left on purpose with exit code 0, was refused (2), found no learner (EXIT_NO_LEARNER) or cannot take part
 in this run (EXIT_UNSUITABLE) is not started again. Any other is restarted with backoff: the pause doubles with each death,
 and is reset once calls of the environment have returned, or a worker has run for `HEALTHY_S`. So a simulator that works and
-dies is soon there again; the learner counts its failures. A worker is on purpose only if it said so beforehand: the exit
-codes that an environment makes are failures. No worker outlives its supervisor.
+then dies is soon back; the learner counts its failures. A worker left on purpose only if it announced this: exit codes
+caused by an environment are failures. No worker outlives its supervisor.
 
-One that has never joined a run, and has ended soon after its start `MOST_FAILED_STARTS` times in a row, is not started
-again: what keeps it from starting, such as a broken installation, does not go away by itself.
+A worker that has never joined a run, and has ended soon after its start `MOST_FAILED_STARTS` times in a row, is not started
+again: its problem, such as a broken installation, won't go away by itself.
 
 With `stay`, only a refusal is final: each worker that has left a run is followed by a new one, which waits for the next.
 
@@ -38,9 +40,9 @@ MOST_FAILED_STARTS = 4
 GIVEN_UP = f"; after {MOST_FAILED_STARTS} such ends it is not started again"
 POLL_S = 0.1
 ENFORCE_EVERY_S = 0.2
-STOP_WITHIN_S = 3.0  # at the end of whatever local workers did, after SIGTERM: then they are killed
+STOP_WITHIN_S = 3.0  # after SIGTERM at the end of a run; then local workers are killed
 FINISH_ROLLOUT_WITHIN_S = 30.0  # after the request to leave, as long as calls of the environment return
-HANGS_AFTER_S = 8.0  # after the request to leave, or the end of the run: how long one call of the environment may take
+HANGS_AFTER_S = 8.0  # longest call of the environment after the request to leave, or the end of the run
 
 
 class Running(Protocol):
@@ -61,19 +63,22 @@ class Running(Protocol):
         ...
 
     def activity(self, now: float) -> WorkerActivity | None:
-        """What it does. None if it has ended, or if its process is stopped."""
+        """What it is doing. None if it has ended, or if its process is stopped."""
         ...
 
     def last_line(self) -> str:
-        """The last line that it wrote to a log of its own; empty if it has written nothing, or has no log."""
+        """The last line in its own log; empty if it has written nothing, or has no log."""
         ...
 
     def end_if_hung(self, now: float) -> None:
-        """End it if a call of the user's code takes longer than its run allows."""
+        """End it if a call of user code takes longer than its run allows."""
         ...
 
     def lower_priority(self) -> None:
-        """Give it the lowest CPU priority: it uses what other processes leave of the cores. A thread keeps its own."""
+        """Give it the lowest CPU priority, so that it uses only the CPU time that other processes leave.
+
+        A thread keeps its own.
+        """
         ...
 
     def stop(self) -> None:
@@ -90,7 +95,7 @@ class Running(Protocol):
 
 
 class LearnerNotice(Protocol):
-    """Tells the learner what the workers do."""
+    """Tells the learner what the workers are doing."""
 
     def send(self, running: Sequence[WorkerActivity], ended: Sequence[WorkerExit], now: float) -> None:
         """Say this, if it is time to."""
@@ -103,15 +108,15 @@ class LearnerNotice(Protocol):
 
 @dataclass
 class _NamedWorker:
-    """A worker's name, and the process or thread that runs under it at present."""
+    """A worker's name, and the process or thread that currently has it."""
 
     name: str
     running: Running | None
     started_s: float
     backoff_s: float = BACKOFF_FIRST_S
     restart_s: float | None = None
-    exit_code: int = 0  # of the last one that ended
-    has_joined: bool = False  # one of them has joined a run
+    exit_code: int = 0  # of the last process that ended
+    has_joined: bool = False  # whether one of its processes has joined a run
     failed_starts: int = 0  # in a row
 
 
@@ -127,7 +132,7 @@ class Supervisor:
         prefix: str = "w",
         stay: bool = False,
     ) -> None:
-        """`start` starts the worker of a name; the names are `prefix` and a number.
+        """`start` starts the worker with this name; names consist of `prefix` and a number.
 
         `stay`: they serve one run after another.
         """
@@ -141,7 +146,7 @@ class Supervisor:
         try:
             for name in (f"{prefix}{number}" for number in range(count)):
                 self._workers.append(_NamedWorker(name, start(name), clock()))
-        except BaseException:  # of some workers, none is left behind
+        except BaseException:  # if only some have started, don't leave them behind
             self.stop(0.0)
             raise
 
@@ -174,8 +179,8 @@ class Supervisor:
     def _restart(self, worker: _NamedWorker, now: float) -> None:
         try:
             worker.running = self._start(worker.name)
-        except (OSError, UsageError) as error:  # the system has no memory, process or file for it now
-            log.warning("worker %s cannot be started, which is tried again: %s", worker.name, error)
+        except (OSError, UsageError) as error:  # the system currently lacks memory, processes or files
+            log.warning("worker %s cannot be started and will be tried again: %s", worker.name, error)
             self._schedule(worker, now)
             return
         worker.restart_s = None
@@ -185,7 +190,7 @@ class Supervisor:
 
     def _record_end(self, worker: _NamedWorker, end: Ending, now: float) -> None:
         left = end.on_purpose and end.code in (0, EXIT_REFUSED, EXIT_NO_LEARNER, EXIT_UNSUITABLE)
-        told_early = self._stopping and end.code == -signal.SIGTERM  # to leave, before it could listen to signals
+        told_early = self._stopping and end.code == -signal.SIGTERM  # asked to leave before it could handle signals
         worker.running = None
         worker.exit_code = end.code if left else 0 if told_early else 1
         healthy = end.worked or now - worker.started_s > HEALTHY_S or (left and end.code == 0)
@@ -202,13 +207,13 @@ class Supervisor:
         worker.backoff_s = min(2 * worker.backoff_s, BACKOFF_MOST_S)
 
     def activities(self) -> list[WorkerActivity]:
-        """What each running worker does. A stopped process is left out."""
+        """What each running worker is doing. A stopped process is left out."""
         now = self._clock()
         activities = (worker.running.activity(now) for worker in self._workers if worker.running is not None)
         return [activity for activity in activities if activity is not None]
 
     def said(self) -> dict[str, str]:
-        """The last line of the log of each running worker that has written to one."""
+        """The last line of each running worker's log, if it has written one."""
         last_lines = {worker.name: worker.running.last_line() for worker in self._workers if worker.running is not None}
         return {name: line for name, line in last_lines.items() if line}
 
@@ -261,10 +266,10 @@ class Supervisor:
     def run(
         self, stop_requests: Callable[[], int], report: Callable[[str], None], notice: LearnerNotice | None = None
     ) -> int:
-        """Watch the workers until none is left; the exit code. Each request to stop is passed on to all of them.
+        """Watch the workers until none is left. Returns the exit code. Each request to stop is passed on to all of them.
 
         After such a request, or once the run is over, no worker is restarted, and one whose environment hangs is killed.
-        With `stay`, one that hangs after the end of a run is killed too.
+        With `stay`, a worker that hangs after the end of a run is killed, too.
         """
         handled = 0
         leave_by_s = float("inf")
@@ -273,7 +278,7 @@ class Supervisor:
         while True:
             ended = self._ended()
             for each, end in ended:
-                if len(self._workers) > 1 or not end.on_purpose:  # a single worker has said itself why it leaves
+                if len(self._workers) > 1 or not end.on_purpose:  # a single worker has already said why it leaves
                     report(f"{each.worker} {each.reason}")
             if notice is not None:
                 notice.send(self.activities(), [each for each, _ in ended], self._clock())
@@ -291,7 +296,7 @@ class Supervisor:
                 leave_by_s = kill_hanging_from_s if self._stopping else leave_by_s
             if now > kill_hanging_from_s:
                 self._kill_hanging(HANGS_AFTER_S, now)
-                if not self._stopping:  # those of the next run are younger than this
+                if not self._stopping:  # workers of the next run are younger than this
                     kill_hanging_from_s = float("inf")
             if now > leave_by_s:
                 self.stop(0.0)
@@ -309,5 +314,5 @@ class Supervisor:
 
 
 def core_flags(cores: Sequence[int], name: str) -> list[str]:
-    """Flags of a worker that pin worker w0, w1, … to one of these cores, in turn. None if there are no cores."""
+    """Flags that pin workers w0, w1, … to these cores in turn. Empty if there are no cores."""
     return ["--core", str(cores[int(name.removeprefix("w")) % len(cores)])] if cores else []

@@ -1,9 +1,9 @@
-"""A worker in a process of its own, as its supervisor starts it, watches it and ends it.
+"""A worker in its own process, which its supervisor starts, watches and ends.
 
-Rule: the worker has a session of its own. When the worker has ended, whatever its environment started in that session is
-killed; the slots of its env copies are free when all of it is gone, because this process holds them too. If a call of the
-user's code takes longer than its run allows, the worker writes its stacks and is killed. A worker that leaves on purpose
-says so beforehand: any other end is not on purpose, whatever the exit code.
+Rule: the worker has its own session. When the worker has ended, everything that its environment started in that session is
+killed; the slots of its env copies are free once all of these processes are gone, because this process holds them, too. If a
+call of user code takes longer than its run allows, the worker writes its stacks and is killed. A worker that leaves on
+purpose announces it: any other end is a failure, whatever the exit code.
 """
 
 from __future__ import annotations
@@ -34,16 +34,16 @@ from millrace.workers.watchdog import deepest_frame, where_it_hung
 
 log = logging.getLogger("millrace.worker")
 
-popen = subprocess.Popen  # a name of its own: a test may start workers in another way
+popen = subprocess.Popen  # a separate name, so that a test may start workers in another way
 
 NONCE_VARIABLE = "MILLRACE_WORKER_NONCE"
 WRITE_STACKS_S = 0.3  # from the signal until the worker is killed
-CLOSE_ENVS_WITHIN_S = 5.0  # from a worker's word that it leaves until it has closed its environments and ended
+CLOSE_ENVS_WITHIN_S = 5.0  # from a worker's notice that it leaves until it has closed its environments and ended
 KILLED_WITHIN_S = 5.0  # from SIGKILL until it is given up
 POLL_S = 0.02
-LONGEST_OUTPUT = 1 << 20  # bytes of a log that are read for what it ends with
-MOST_LAST_LINES = 12  # of it that are shown if a worker cannot start
-MAX_LAST_TEXT = 2_000  # characters of it that are shown then
+LONGEST_OUTPUT = 1 << 20  # bytes that are read from the end of a log
+MOST_LAST_LINES = 12  # of the log, shown if a worker cannot start
+MAX_LAST_TEXT = 2_000  # characters of these lines
 LOWEST_PRIORITY = 19  # niceness
 SINGLE_THREADED = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
@@ -64,7 +64,7 @@ class WorkerCommand:
 
 
 class WorkerProcess:
-    """A worker in a process of its own."""
+    """A worker in its own process."""
 
     def __init__(self, start: WorkerCommand) -> None:
         self.name = start.name
@@ -75,22 +75,22 @@ class WorkerProcess:
         self._because = ""  # why the supervisor ends it
         self._kill_at_s = float("inf")
         self._end: Ending | None = None
-        self._exit_code: int | None = None  # of the worker; what it started may not be gone yet
+        self._exit_code: int | None = None  # of the worker; processes that it started may not be gone yet
         self._give_up_at_s = float("inf")
-        self._was_reaped = False  # by the system: then its exit code is not known
+        self._was_reaped = False  # by the system, so that its exit code is not known
         command = [sys.executable, "-P", "-m", "millrace.workers", start.address, "--name", start.name]
         command += ["--parent", str(os.getpid()), "--activity", str(self._page.fd)]
         command += ["--slots", str(self._slots), *start.flags]
         # The child must find the modules that its parent found: a user's environment may lie beside the user's script.
         path = os.pathsep.join(entry or os.getcwd() for entry in [*sys.path, str(Path(__file__).parents[3])])
-        # A token that this program has not given the worker is not for this learner.
+        # A token that this program has not passed to the worker is not for this learner.
         environment = {name: value for name, value in os.environ.items() if name != TOKEN_VARIABLE}
         environment |= SINGLE_THREADED | {NONCE_VARIABLE: str(self.process_nonce), "PYTHONPATH": path}
         if start.token is not None:
             environment[TOKEN_VARIABLE] = start.token.to_text()
         try:
             with _opened(start.log) as stderr:
-                self._log_from = stderr.tell()  # what stands before is of another process
+                self._log_from = stderr.tell()  # earlier text comes from another process
                 self._process = popen(
                     command,
                     stdin=subprocess.DEVNULL,
@@ -111,14 +111,14 @@ class WorkerProcess:
         return self._process.pid
 
     def ended(self) -> Ending | None:
-        """How it ended, or None while it runs, or while something that it started is not gone."""
+        """How it ended, or None while it, or a process that it started, still runs."""
         if self._runs():
             return None
         if self._end is None:
             if left := live_members(self.pid):
                 if time.monotonic() < self._give_up_at_s:
                     return None
-                line = "worker %s has ended, and processes %s of its environment do not, so its slots stay taken"
+                line = "worker %s has ended, but processes %s of its environment have not, so its slots stay taken"
                 log.warning(line, self.name, left)
             else:
                 free_all(self._slots)
@@ -128,10 +128,10 @@ class WorkerProcess:
         return self._end
 
     def activity(self, now: float) -> WorkerActivity | None:
-        """What it does. None if it has ended, or if it is stopped: then nobody speaks for it.
+        """What it is doing.
 
-        While something that it started is not gone, it does what it did last: a learner that took it for silent in that time
-        would not count its failure.
+        None if it has ended, or if it is stopped: then nobody speaks for it. While processes that it started still run, its
+        last activity is reported: if the learner considered it silent during that time, it would not count the failure.
         """
         if self.ended() is not None or _is_stopped(self.pid):
             return None
@@ -139,11 +139,11 @@ class WorkerProcess:
         return WorkerActivity(self.name, self.process_nonce, page.doing, page.for_s, page.env_calls)
 
     def last_line(self) -> str:
-        """The last line of its log that it wrote itself; empty if it has none."""
+        """The last line of its log that this process wrote; empty if there is none."""
         return one_line("".join(self._output().strip().splitlines()[-1:]))
 
     def end_if_hung(self, now: float) -> None:
-        """End it if a call of the user's code takes longer than its run allows, or if it does not end although it leaves."""
+        """End it if a call of user code takes longer than its run allows, or if it announced its exit but doesn't end."""
         if not self._runs():
             return
         touch(self._slots)
@@ -164,8 +164,8 @@ class WorkerProcess:
     def lower_priority(self) -> None:
         """Give its main thread, which steps the environments, the lowest CPU priority.
 
-        With Linux's autogroup, niceness counts only within a session, and a worker is a session of its own. So the session
-        gets the niceness, too.
+        With Linux's autogroup, niceness counts only within a session, and a worker has its own session. So the session gets
+        the niceness, too.
         """
         if self._runs():
             os.setpriority(os.PRIO_PROCESS, self.pid, LOWEST_PRIORITY)
@@ -180,7 +180,7 @@ class WorkerProcess:
     def wait(self, timeout_s: float) -> None:
         """Wait until it has ended; kill it if it is still running after that.
 
-        A process that not even SIGKILL ends, because it waits for a device or a network file system, is left behind.
+        A process that survives even SIGKILL, because it waits for a device or a network file system, is left behind.
         """
         if not self._ends_within(timeout_s):
             self.kill()
@@ -196,7 +196,7 @@ class WorkerProcess:
         return True
 
     def kill(self) -> None:
-        """SIGKILL to all of its session, for a worker that hangs."""
+        """Send SIGKILL to its whole session, because it hangs."""
         if self._runs():
             self._kill_session()
 
@@ -205,13 +205,13 @@ class WorkerProcess:
     def _runs(self) -> bool:
         """Whether the worker runs. When it has ended, its session is killed and it is reaped."""
         if self._exit_code is None and self._has_ended():
-            self._kill_session()  # before the process is reaped: until then nobody else can have its id
+            self._kill_session()  # before the process is reaped: until then no other process can have its id
             self._exit_code = self._process.wait()
             self._give_up_at_s = time.monotonic() + KILLED_WITHIN_S
         return self._exit_code is None
 
     def _has_ended(self) -> bool:
-        """Whether it has ended. It is not reaped, where the system can tell without."""
+        """Whether it has ended. This doesn't reap it if the system can tell without."""
         if not hasattr(os, "waitid"):
             return self._process.poll() is not None
         try:
@@ -251,7 +251,7 @@ class WorkerProcess:
             line = f"ended{meanwhile}; its exit code is not known"
         else:
             line = f"ended with exit code {code}{meanwhile}{last if code else ''}"
-        # In `close`, an environment has done its work: that its process ends there does not count against the run.
+        # In `close`, an environment has finished its work: if the process ends there, that doesn't count as a failure.
         failed = page.doing != "closing" and (worked or page.doing not in OUR_CODE)
         of_policy = failed and page.doing in OF_POLICY
         last_lines = _end_of(output) if page.doing == "starting" else None
@@ -266,7 +266,7 @@ class WorkerProcess:
         )
 
     def _output(self) -> str:
-        """What it has written to its log, the end of it if that is long: a simulator may write without a limit."""
+        """Its output in the log, only the end if it is long: a simulator may write without limit."""
         with suppress(OSError):  # the log may have been deleted
             if self._log is not None:
                 with self._log.open("rb") as log:
@@ -280,7 +280,7 @@ class WorkerProcess:
                 self._log_from = keep_short(self._log, self._log_from)
 
     def _write(self, stacks: str) -> None:
-        """Write to where the worker's stderr goes."""
+        """Write to the worker's stderr."""
         text = f"worker {self.name} {self._because}\n{stacks}"
         with suppress(OSError):
             if self._log is None:

@@ -1,8 +1,8 @@
 """The env copies of one lane of a vector environment with seats: N · A rows, those of a copy side by side.
 
 Rule: rows are, bit for bit, those of a loop over the same copies (`millrace.protocol.envs.seats`). With SameStep, the step
-in which a copy's last agent leaves has its last rows, the first observations of its next episode, and infos with the old
-ones.
+in which a copy's last agent leaves has its last rows, the first observations of its next episode, and infos with the final
+observations.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ class SeatedLane(SteppedLane):
         return [(row, dict(info)) for row, info in zip(numbers, newest.infos, strict=True) if info]
 
     def _newest(self, copies: Iterable[int], infos: CopyInfos) -> tuple[SeatStep, Sequence[Any]]:
-        """The newest step of these copies, and what to write of it as their observations."""
-        last = {n: info["final_obs"] for n, info in infos}  # of the copies that SameStep has reset
+        """The newest step of these copies, and the observations to write."""
+        last = {n: info["final_obs"] for n, info in infos}  # final observations of copies that SameStep has reset
         steps: list[SeatStep] = [self._observations[n] for n in copies]
         newest = side_by_side(_reset(last[n], step) if n in last else step for n, step in zip(copies, steps, strict=True))
         seen = newest.observations
@@ -53,7 +53,7 @@ class SeatedLane(SteppedLane):
 
 
 def _reset(last: SeatStep, first: SeatStep) -> SeatStep:
-    """The last step of an episode in which its copy was reset, as SameStep has it."""
+    """The last step of an episode, in which SameStep has reset its copy."""
     infos: list[Mapping[str, Any]] = [
         {"final_obs": seen, "final_info": info, **new}
         for seen, info, new in zip(last.observations, last.infos, first.infos, strict=True)

@@ -47,7 +47,7 @@ class SteppedLane:
     """N env copies that are stepped together."""
 
     def __init__(self, spec: StepSpec, lane: int, incarnation: int, rows: ResultRows, pulse: Pulse) -> None:
-        """Make the copies, and reset none. Raises `UsageError` when their spaces are not the vector environment's."""
+        """Make the copies, without a reset. Raises `UsageError` if their spaces are not the vector environment's."""
         self.incarnation = incarnation
         self.rows = rows
         self.executed = 0
@@ -66,14 +66,17 @@ class SteppedLane:
         self._nest = make_unflatten(action)
         self._nested_observations = _is_nested(observation)
         self._read = make_flatten(observation)
-        self._observations: list[Any] = [None] * self.count  # as the copies returned them last
+        self._observations: list[Any] = [None] * self.count  # the last ones that the copies returned
         self._seats = spec.seats
         self._writer = ObservationWriter(spec.leaves, len(rows.reward), spec.seats)
         self._joined = self._writer.joined(array[None] for array in rows.obs)
 
     # rules RESET_SOME, OPTIONS
     def reset(self, copies: Sequence[int], seeds: Sequence[int | None], options: Any, pulse: Pulse) -> CopyInfos:
-        """Start episodes in these copies, with a seed for each. `options`: a list with those of each, or those of all."""
+        """Start episodes in these copies, with a seed for each.
+
+        `options`: a list with options for each copy, or options for all.
+        """
         each = options if isinstance(options, list) else [options] * len(copies)
         return self._write_some(copies, self._loop.reset(copies, seeds, self._observations, pulse, each))
 
@@ -91,15 +94,15 @@ class SteppedLane:
         return map(self._nest, zip(*actions, strict=True)) if self._nested_actions else actions[0]
 
     def _write(self, infos: CopyInfos) -> CopyInfos:
-        """Write the rows of all copies, of which the loop returned these infos. Returns the infos of rows."""
+        """Write the rows of all copies, for which the loop returned these infos. Returns the infos by row."""
         leaves = read_leaves(self._read, self._observations) if self._nested_observations else (self._observations,)
         self._writer.write(self._joined, 0, leaves)
         self._write_numbers()
         return infos
 
     def _write_some(self, copies: Sequence[int], infos: CopyInfos) -> CopyInfos:
-        """Write the rows of these copies, which were reset. Returns the infos of rows."""
-        for n in copies:  # only these: a copy may overwrite the observation that it returned before
+        """Write the rows of these copies, which were reset. Returns the infos by row."""
+        for n in copies:  # only these: a copy may overwrite its earlier observation
             leaves = read_leaves(self._read, [self._observations[n]])
             self._writer.write_some(self.rows.obs, [n], [{n: value} for (value,) in leaves])
         self._write_numbers()
@@ -120,11 +123,11 @@ class SteppedLane:
         return results
 
     def describe(self, copies: Sequence[int]) -> list[EnvDescription]:
-        """What each of these copies is."""
+        """The description of each of these copies."""
         return [describe_env(self._loop.envs[n]) for n in copies]
 
     def assign(self, copies: Sequence[int], name: str, values: Sequence[Any]) -> None:
-        """Set the attribute, to one value for each of these copies."""
+        """Set the attribute of these copies to one value each."""
         for n, value in zip(copies, values, strict=True):
             self._loop.envs[n].set_wrapper_attr(name, value)
 
@@ -134,14 +137,14 @@ class SteppedLane:
 
 
 def _first_copy(spec: StepSpec, lane: int) -> EnvCopy:
-    """Which copy the first one of a lane is."""
+    """The identity of a lane's first copy."""
     number = spec.first_copy(lane)
     position = number - (len(spec.copies) - spec.evaluation_copies)
     return EnvCopy(number, lane) if position < 0 else EnvCopy(position, copy=position, evaluation=True)
 
 
 def _checked(spec: StepSpec, env: gymnasium.Env[Any, Any], which: EnvCopy) -> gymnasium.Env[Any, Any]:
-    """A copy of the vector environment. Raises `UsageError` if its spaces are others."""
+    """A copy of the vector environment. Raises `UsageError` if its spaces differ."""
     copy = f"{'evaluation ' if which.evaluation else ''}copy {which.number}"
     try:
         fits = (leaves_with_own_dtype(env.observation_space), leaves_with_own_dtype(env.action_space)) == (

@@ -1,7 +1,7 @@
 """A worker's part of a vector environment: it owns lanes of env copies and executes their orders, one at a time.
 
-Orders come as messages. Orders to step may come through shared memory instead, if this process inherited it; the results are
-then written there, too. Both ways step the same lanes. A lane whose copies cannot be used any more is closed.
+Orders arrive as messages. Orders to step may arrive through shared memory instead, if this process inherited it; the results
+are then written there, too. Both ways step the same lanes. A lane whose copies can't be used any more is closed.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from millrace.workers.vector_env.stepped_lane import ResultRows, SteppedLane, ne
 
 
 class Stepper:
-    """Executes orders on lanes of env copies, which are made when their first order comes."""
+    """Executes orders on lanes of env copies, which are made at their first order."""
 
     def __init__(
         self, spec: StepSpec, shared_memory: InheritedDescriptors | None = None, *, allow_private_names: bool = True
@@ -48,7 +48,7 @@ class Stepper:
         self._spec = spec
         self._allow_private_names = allow_private_names
         self.lanes = OpenLanes[SteppedLane]()
-        """the lanes that an order has come for, until they are closed"""
+        """the lanes that have had an order, until they are closed"""
         self._memory = None if shared_memory is None else SharedMemory(spec, shared_memory.memory)
         self._wake_in = None if shared_memory is None else WakePipe(read_fd=shared_memory.to_worker)
         self._wake_out = None if shared_memory is None else WakePipe(write_fd=shared_memory.to_learner)
@@ -120,7 +120,7 @@ class Stepper:
             self.lanes.close([number])
             raise environment_failed(number, error) from error
         if number not in self.lanes:
-            return True  # it was released meanwhile, and another worker may answer for it
+            return True  # it was released meanwhile, and another worker may now have it
         if not memory.answer(number, order, infos):
             step = Step(session, -order, number, lane.incarnation, ())
             send(_stepped(step, lane.rows, infos))
@@ -144,7 +144,7 @@ class Stepper:
         return infos
 
     def _lane_for(self, number: int, incarnation: int, pulse: Pulse) -> SteppedLane:
-        """The lane in this incarnation. It is made if it does not exist."""
+        """The lane in this incarnation, which is made if it doesn't exist."""
         if (lane := self.lanes.here(number, incarnation)) is not None:
             return lane
         began = perf_counter()
@@ -163,7 +163,7 @@ class Stepper:
 
 
 def pack_infos(infos: CopyInfos) -> bytes:
-    """The infos as bytes; no bytes if there are none."""
+    """The infos as bytes; empty if there are none."""
     return pack(infos, use_repr=True) if infos else b""
 
 
@@ -187,7 +187,7 @@ def _stepped(order: Reset | Step, rows: ResultRows, infos: bytes) -> Stepped:  #
 
 
 def _private_name(order: Call, arguments: Any) -> str:
-    """The private name that a call is about: its own, or one that a method of gymnasium's takes. Empty if none is."""
+    """The private name that a call uses: its own, or an argument of a gymnasium method. Empty if there is none."""
     names = [order.name]
     if order.name in ("get_wrapper_attr", "has_wrapper_attr", "set_wrapper_attr") and not order.assign:
         args, kwargs = arguments
@@ -196,7 +196,7 @@ def _private_name(order: Call, arguments: Any) -> str:
 
 
 def _call(order: Call, lane: SteppedLane, allow_private_names: bool) -> Returned:  # rule RETURNED
-    """The attribute's values or results. If it raises, the answer holds the exception."""
+    """The attribute's values or results. If it raises, the answer contains the exception."""
     results: list[Any] = []
     error = detail = ""
     try:

@@ -1,1 +1,1 @@
-"""What to write, or to install, when an environment cannot be used as it is."""
+"""Advice about what to write or install if an environment can't be used as it is."""

@@ -1,4 +1,7 @@
-"""ALE's ids of Atari games, which are raw, and our environment of the same games, with the usual wrappers. Pure."""
+"""ALE's ids of Atari games, without preprocessing, and millrace's environment of these games, with the usual wrappers.
+
+Pure.
+"""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Environments whose constructor takes one dict, as RLlib hands it: how to give them theirs. Pure.
+"""Environments whose constructor takes one dict, as RLlib passes it: how to pass it. Pure.
 
-Rule: only the exception of such a constructor is looked at, after it was called without the dict.
+Rule: this only inspects the exception of such a constructor, after it was called without the dict.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _READS_A_DICT = re.compile(
 
 @words_an_error
 def wants_a_dict(name: str, factory: Callable[..., object], kwargs: Mapping[str, Any], error: Exception) -> str:
-    """What to write if the constructor of an environment failed because its first argument was no dict; else nothing."""
+    """What to write if the constructor of an environment failed because its first argument wasn't a dict; else empty."""
     if not _READS_A_DICT.search(first_line(error)):
         return ""
     parameters = list(inspect.signature(factory).parameters.values())
@@ -32,6 +32,6 @@ def wants_a_dict(name: str, factory: Callable[..., object], kwargs: Mapping[str,
     if not re.search(rf"\b({parameters[0].name}|\w*config)\b", raised_by):
         return ""  # something else was None
     return (
-        f"its argument {parameters[0].name} is a dict, as RLlib passes it; name a function of yours in place of {name}: "
+        f"its argument {parameters[0].name} is a dict, as RLlib passes it; name a function of your own in place of {name}: "
         f"def make_env(**config): return {last_part(name)}(config), and give entries of the dict as --env-kwargs NAME VALUE"
     )

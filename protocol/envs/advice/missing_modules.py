@@ -1,4 +1,4 @@
-"""What to install for a Python module that is missing, where the package has another name or is not the newest one. Pure."""
+"""What to install for a missing Python module if the package has another name or must not be the newest one. Pure."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ PACKAGES = {
     "cv2": "opencv-python-headless",
     "gym": "gym==0.26.2 shimmy",
     "mujoco": "'gymnasium[mujoco]'",
-    "pkg_resources": "'setuptools<81'",  # newer ones have it no more
+    "pkg_resources": "'setuptools<81'",  # newer ones don't contain it any more
     "pygame": "pygame-ce",
     "skimage": "scikit-image",
     "sklearn": "scikit-learn",

@@ -1,6 +1,6 @@
-"""Environments of the package gym, which gymnasium has replaced: how the package shimmy makes them gymnasium's.
+"""Environments of the package gym, which gymnasium has replaced: how to convert them with the package shimmy.
 
-Rule: gym is not imported here. Where a module has imported it, what it has registered there is looked up.
+Rule: gym is not imported here. If another module has imported it, its registry is used.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ INSTALL = "pip install gym==0.26.2 shimmy"
 
 
 def is_of_old_gym(made: object) -> bool:
-    """Whether this is an environment of gym: by its classes, or, as if it does without gym, by its methods and spaces."""
+    """Whether this is an environment of gym: by its classes, or, if it doesn't use gym, by its methods and spaces."""
     if any(str(kind.__module__).partition(".")[0] == "gym" for kind in type(made).__mro__):
         return True
     space = attribute(made, "action_space")
@@ -29,7 +29,7 @@ def is_of_old_gym(made: object) -> bool:
 
 @words_an_error
 def instead_of_object(made: object) -> str:
-    """What a callable should return instead of an environment of gym."""
+    """What a callable should return instead of a gym environment."""
     version = _version(made)
     wrap = f"`{INSTALL}`, and return shimmy.Gym{version}CompatibilityV0(env=it)"
     return f"it has the interface of the old package gym: {wrap}{_about_seed(made, version)}"
@@ -62,16 +62,16 @@ def _class_of(spec: object) -> object:
 
 
 def _about_seed(of: object, version: str) -> str:
-    """What to do about an environment, or its class, that shimmy cannot seed, as the end of a line; else nothing."""
+    """The end of a line: what to do about an environment, or its class, that shimmy can't seed; else empty."""
     if version != "V21" or attribute(of, "seed") is not None:
         return ""
     return "; it also needs a method seed(seed), as under 'Old gym environments' in docs/how-to/third_party_environments.md"
 
 
 def _version(of: object) -> str:
-    """Of gym's two interfaces the one that an environment, or its class, has, as shimmy names it; V26 if it has no `reset`.
+    """Which of gym's two interfaces an environment, or its class, has, by shimmy's names.
 
-    A function that makes the environment has none.
+    V26 if it has no `reset`, such as a function that makes the environment.
     """
     reset: Any = attribute(of, "reset")
     try:

@@ -1,16 +1,16 @@
-"""What an object lacks that looks like an environment of several agents and is not one of PettingZoo's. Pure."""
+"""What is missing in an object that looks like a multi-agent environment but isn't a PettingZoo environment. Pure."""
 
 from __future__ import annotations
 
 from millrace.protocol.errors import words_an_error
 
 MARKS = ("possible_agents", "agents", "agent_iter", "agent_selection", "observation_spaces")
-"""Attributes that environments of one agent have not."""
+"""Attributes that single-agent environments don't have."""
 
 
 @words_an_error
 def what_it_lacks(made: object) -> str:
-    """What an object must have to be one of PettingZoo's environments, as the end of a line; empty if it is not like one."""
+    """The end of a line: what an object lacks to be a PettingZoo environment; empty if it doesn't look like one."""
     if not any(_has(made, name) for name in MARKS) and not callable(getattr(made, "observation_space", None)):
         return ""
     if not _has(made, "possible_agents"):
@@ -24,5 +24,5 @@ def what_it_lacks(made: object) -> str:
 def _has(made: object, name: str) -> bool:
     try:
         return hasattr(made, name)
-    except Exception:  # a property of the user's; it is there
+    except Exception:  # a user-defined property raised, so it exists
         return True

@@ -1,4 +1,4 @@
-"""What to pass when no policy takes the observations of an environment: a wrapper that makes them arrays. Pure."""
+"""What to do if no policy supports the observations of an environment: a wrapper that makes them arrays. Pure."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from millrace.protocol.envs.space_records import describe_space
 from millrace.protocol.errors import words_an_error
 
 IMAGES_ONLY = {"minigrid": "minigrid.wrappers:ImgObsWrapper", "babyai": "minigrid.wrappers:ImgObsWrapper"}
-"""By the package of an environment whose observations have a text beside an image: its wrapper that leaves the image"""
+"""For packages whose observations have a text beside an image: the wrapper that keeps only the image"""
 
 
 @words_an_error
@@ -19,7 +19,7 @@ def observation_advice(env: gymnasium.Env[Any, Any]) -> str:
     """How to wrap an environment whose observation space is not supported, as the end of a line."""
     space = env.observation_space
     package = str(type(env.unwrapped).__module__).partition(".")[0]
-    own = "--wrappers my_module:MyWrapper, a gymnasium.ObservationWrapper of yours that returns arrays"
+    own = "--wrappers my_module:MyWrapper, your own gymnasium.ObservationWrapper that returns arrays"
     match space:
         case spaces.Dict():
             kept: list[str | int] = [key for key, inner in space.spaces.items() if _is_supported(inner)]
@@ -30,15 +30,15 @@ def observation_advice(env: gymnasium.Env[Any, Any]) -> str:
         case _:
             return f"wrap it: {own}"
     if package in IMAGES_ONLY and "image" in kept:
-        return f"wrap it: --wrappers {IMAGES_ONLY[package]} leaves the image"
+        return f"wrap it: --wrappers {IMAGES_ONLY[package]} keeps only the image"
     if not kept:
         return f"wrap it: {own}"
-    return f'wrap it: --wrappers "gymnasium.wrappers:FilterObservation(filter_keys={kept!r})" leaves what is supported'
+    return f'wrap it: --wrappers "gymnasium.wrappers:FilterObservation(filter_keys={kept!r})" keeps only what is supported'
 
 
 def _is_supported(space: gymnasium.Space[Any]) -> bool:
     try:
         describe_space(space)
-    except Exception:  # not only a `UsageError`: the space may be the user's own
+    except Exception:  # not only a `UsageError`: the space may be user-defined
         return False
     return True

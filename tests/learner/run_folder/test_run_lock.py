@@ -261,10 +261,7 @@ def test_the_lock_says_where_the_learner_listens_and_keeps_saying_it(tmp_path: P
             assert owner_of(tmp_path).address == ""
         for why, line in (
             (Unreachable.INPROC, "cannot be asked: with --transport inproc it listens in its own process only"),
-            (
-                Unreachable.KEYS_OF_THE_RUN,
-                "cannot be asked: .* the keys of its local workers are not in any file; run it with",
-            ),
+            (Unreachable.KEYS_OF_THE_RUN, "cannot be asked: .* of its local workers are not in any file; run it with"),
         ):
             held.announce(why)
             with pytest.raises(UsageError, match=line):

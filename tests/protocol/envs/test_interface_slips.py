@@ -63,7 +63,7 @@ def test_an_environment_that_takes_a_dict_is_told_how_to_get_it(name: str, argum
     found = refusal(name)
     assert found.startswith(f"environment {MODULE}:{name}: {says}")
     assert found.endswith(
-        f": its argument {argument} is a dict, as RLlib passes it; name a function of yours in place of {MODULE}:{name}: "
+        f": its argument {argument} is a dict, as RLlib passes it; name a function of your own in place of {MODULE}:{name}: "
         f"def make_env(**config): return {name}(config), and give entries of the dict as --env-kwargs NAME VALUE"
     )
 

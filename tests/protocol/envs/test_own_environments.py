@@ -149,7 +149,7 @@ def test_a_name_of_a_function_or_a_class_makes_an_environment() -> None:
     with pytest.raises(UsageError, match=r"got SyncVectorEnv; it is a vector environment: return one copy"):
         EnvSpec(f"{MODULE}:many").make()
     with pytest.raises(
-        UsageError, match=r"neither registers make_countdwn nor .* so named; did you mean .*:make_countdown\?$"
+        UsageError, match=r"neither registers make_countdwn nor .* class or function; did you mean .*:make_countdown\?$"
     ):
         EnvSpec(f"{MODULE}:make_countdwn").make()
 

@@ -106,7 +106,7 @@ def test_a_misspelled_id_is_suggested(site: Site) -> None:
     assert refusal("FakeHigway-v0").endswith("is not registered: did you mean FakeHighway-v0?")
     assert refusal("CartPol-v1").endswith("did you mean CartPole-v1?")
     site.install("fake_flappy", REGISTERS_ON_IMPORT)
-    says = "module fake_flappy neither registers FakeFlapy-v0 nor has a class or function so named; did you mean "
+    says = "module fake_flappy neither registers FakeFlapy-v0 nor has such a class or function; did you mean "
     assert refusal("fake_flappy:FakeFlapy-v0").endswith(f"{says}FakeFlappy-v0?")
     assert refusal("fake_flappy:Gamo").endswith("; did you mean fake_flappy:Game?")
 
@@ -267,16 +267,16 @@ GRID = {"image": spaces.Box(0, 9, (7, 7, 3)), "direction": spaces.Discrete(4), "
     [
         (
             Observes(spaces.Dict(GRID)),
-            """ "gymnasium.wrappers:FilterObservation(filter_keys=['direction', 'image'])" leaves what is supported""",
+            """ "gymnasium.wrappers:FilterObservation(filter_keys=['direction', 'image'])" keeps only what is supported""",
         ),
-        (Observes(spaces.Dict(GRID), "minigrid.envs.empty"), "--wrappers minigrid.wrappers:ImgObsWrapper leaves the image"),
+        (Observes(spaces.Dict(GRID), "minigrid.envs.empty"), "minigrid.wrappers:ImgObsWrapper keeps only the image"),
         (
             Observes(spaces.Tuple([spaces.Text(3), spaces.Discrete(2)])),
-            '--wrappers "gymnasium.wrappers:FilterObservation(filter_keys=[1])" leaves what is supported',
+            '--wrappers "gymnasium.wrappers:FilterObservation(filter_keys=[1])" keeps only what is supported',
         ),
         (Observes(spaces.Text(3)), "--wrappers gymnasium.wrappers:FlattenObservation makes it an array"),
-        (Observes(spaces.Graph(spaces.Discrete(2), None)), "a gymnasium.ObservationWrapper of yours that returns arrays"),
-        (Observes(spaces.Dict({"said": spaces.Text(3)})), "a gymnasium.ObservationWrapper of yours that returns arrays"),
+        (Observes(spaces.Graph(spaces.Discrete(2), None)), "your own gymnasium.ObservationWrapper that returns arrays"),
+        (Observes(spaces.Dict({"said": spaces.Text(3)})), "your own gymnasium.ObservationWrapper that returns arrays"),
     ],
     ids=["dict", "minigrid", "tuple", "text", "graph", "only text"],
 )

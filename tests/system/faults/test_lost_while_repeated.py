@@ -60,7 +60,7 @@ def test_episodes_continue_although_the_next_worker_dies_too(stage: Stage) -> No
     ("what", "why"),
     [
         ("raises", "the trap was sprung"),
-        ("hangs", r"a step of an episode that it repeats took longer than 1.5 s \(--step-timeout-s\), at .*slow_envs.py"),
+        ("hangs", r"a step of an episode that it replays took longer than 1.5 s \(--step-timeout-s\), at .*slow_envs.py"),
     ],
 )
 def test_a_lane_whose_environment_fails_while_it_is_repeated_begins_new_episodes(stage: Stage, what: str, why: str) -> None:

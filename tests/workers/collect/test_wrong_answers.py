@@ -92,7 +92,7 @@ def test_a_reset_that_returns_something_else_is_named(answer: Any, space: spaces
     ids=str,
 )
 def test_a_step_that_returns_something_else_is_named(answer: Any, got: str) -> None:
-    advice = ", not the old form with `done`: truncated is True where a time limit ends the episode"
+    advice = ", not the old form with `done`: truncated is True if a time limit ends the episode"
     said = said_of(Form(step=answer))
     assert said == f"lane 0, copy 0, step 0: its step returned {got}; {STEP}{advice if got.startswith('4') else ''}"
 

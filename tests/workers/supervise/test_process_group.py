@@ -95,7 +95,7 @@ def test_the_slots_of_a_killed_worker_stay_taken_until_its_simulator_is_gone(
             os.kill(simulator, signal.SIGKILL)
     wait_until(lambda: worker.ended() is not None)
     assert others.take() == (1 if gives_up else 0)
-    said = [f"worker w0 has ended, and processes [{simulator}] of its environment do not, so its slots stay taken"]
+    said = [f"worker w0 has ended, but processes [{simulator}] of its environment have not, so its slots stay taken"]
     assert [record.message for record in caplog.records] == (said if gives_up else [])
 
 
