@@ -1,6 +1,6 @@
 """millrace: worker processes step copies of a gymnasium environment; one learner trains a policy in PyTorch.
 
-User code imports this package only.
+User code imports only this package.
 
     run = millrace.train("CartPole-v1", seed=1)
     policy = millrace.load(run)
@@ -122,10 +122,10 @@ _IMPORTED_WHEN_USED = {
     "record": "millrace.playing",
     "train": "millrace.runs",
 }
-"""Public names, and the module of each. They are imported when they are used, because that takes longer than this file."""
+"""Public names, and the module of each. They are imported at first use, because their imports take long."""
 
 _MODULES = ("algorithms", "testing")
-"""Public modules, which are imported when they are used, too"""
+"""Public modules, also imported at first use"""
 
 
 def __getattr__(name: str) -> Any:

@@ -1,7 +1,7 @@
 """`python -m millrace` and the command `millrace`: run the command line and end the process.
 
-Rule: a signal that ends the process gives exit code 130 and no traceback, from the first line of `command` on. So all that
-takes long to import is imported there. Signals wait meanwhile: an extension module whose import is interrupted may crash.
+Rule: from the first line of `command` on, a signal that ends the process gives exit code 130 and no traceback. So slow
+imports happen there. Signals wait meanwhile, because an extension module whose import is interrupted may crash.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ def command() -> NoReturn:
     try:
         with stopped_by_signals():
             code = main()
-    except KeyboardInterrupt:  # it came during the imports, or while `main` printed another error
+    except KeyboardInterrupt:  # during the imports, or while `main` printed another error
         sys.stderr.write("millrace: interrupted\n")
         code = 130
     if "millrace.learner.imports_ahead" in sys.modules:

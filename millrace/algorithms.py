@@ -1,6 +1,6 @@
-"""All that an algorithm of one's own needs. Importing this module imports PyTorch.
+"""Everything that you need for your own algorithm. Importing this module imports PyTorch.
 
-There are two levels. On the first, an algorithm is a loss; everything else about an update is done for it:
+There are two levels. On the first, you write only the loss; millrace does everything else in an update:
 
 >>> import millrace
 >>> from millrace.algorithms import ActorCritic, ActorCriticConfig
@@ -16,21 +16,21 @@ There are two levels. On the first, an algorithm is a loss; everything else abou
 ...         return loss, {"penalty": penalty}
 >>> run = millrace.train("CartPole-v1", algo=Mine, penalty=0.2, steps=500, workers=1, eval_episodes=2, progress=False)
 
-On the second, a class derives from `Algorithm` and makes the whole update. `millrace.testing.check_algorithm` tells what is
-wrong with a class of either level. A run takes it as `millrace train CartPole-v1 --algo my_module:Mine --penalty 0.2`, or as
+On the second, a class derives from `Algorithm` and makes the whole update. `millrace.testing.check_algorithm` finds mistakes
+in a class of either level. Use the class with `millrace train CartPole-v1 --algo my_module:Mine --penalty 0.2`, or with
 `millrace.train("CartPole-v1", algo=Mine, penalty=0.2)`.
 
 The algorithm itself:
 
-- `Algorithm`, the base of all; `GradientDescent`, the base of ours: optimizers, schedules, statistics, `UpdateMetrics`, the
-  state; `ActorCritic`, the base of those with an actor and a critic, of which are `PPO`, `A2C`, `IMPALA` and `REINFORCE`;
-  `OffPolicy`, the base of those with a replay buffer, of which are `DQN`, `SAC` and `TD3`. The last two share `Continuous`:
-  actions in a bounded Box, an exact replay ratio.
+- `Algorithm`, the base of all; `GradientDescent`, the base of the built-in ones: optimizers, schedules, statistics,
+  `UpdateMetrics`, the state; `ActorCritic`, the base of algorithms with an actor and a critic: `PPO`, `A2C`, `IMPALA` and
+  `REINFORCE`; `OffPolicy`, the base of algorithms with a replay buffer: `DQN`, `SAC` and `TD3`. The last two share
+  `Continuous`: actions in a bounded Box, an exact replay ratio.
 - `AlgorithmConfig`, `ActorCriticConfig`, `OffPolicyConfig` and `ContinuousConfig`, the bases of `Config`; `PPOConfig` and so
   on. Every setting has a default value and a type, perhaps with bounds: `Annotated[float, msgspec.Meta(gt=0)]`. The text
   under it is its help.
-- `Free`, `Adaptable` and `Fixed` say what becomes of another value in a resumed run: `n_steps: Free[int] = 3`. Without one,
-  a float is free and anything else is fixed.
+- `Free`, `Adaptable` and `Fixed` say whether a resumed run may change a setting: `n_steps: Free[int] = 3`. Without one, a
+  float is free and anything else is fixed.
 
 What it learns from:
 
@@ -44,11 +44,11 @@ Tools:
 
 - `gae`, `vtrace` and `EpisodeEnds`: advantages and targets of arrays [T, N].
 - `ActorCriticNetwork`, `QNetwork` and `ActorAndCritics`: the networks that workers act with, and `log_prob_and_entropy`,
-  `policy_log_prob` or `squashed_sample` of their outputs. `trainable`: a leaf of autograd's graph for a flat tensor.
+  `policy_log_prob` or `squashed_sample` for their outputs. `trainable`: a leaf of autograd's graph for a flat tensor.
 - `ReplayBuffer`, which gives a `Sample` of transitions, `MixedReplay`, which also draws prior data, `Hindsight`, which gives
   transitions another goal, and `SequenceReplay`, which gives a `SequenceSample` for a policy with memory; `Transitions`, the
-  tensors of either, with their `Sequences`; and `CriticLoss`, what a loss says of them.
-- `Encoder`: what stands before the hidden layers of a network; `RecurrentInput`: what its recurrent core needs.
+  tensors of either, with their `Sequences`; and `CriticLoss`, the result of a loss on them.
+- `Encoder`: the layers before the hidden layers of a network; `RecurrentInput`: the input of its recurrent core.
 - `ObservationNormalizer` and `RewardScaler`: running statistics of observations and of returns.
 - `features` and `normalize`: observations as these networks take them; `random_shift`: images, moved at random.
 - `UsageError`: raise it, in one line, for settings or spaces that cannot be used.

@@ -1,11 +1,12 @@
-"""The door of the public functions: arguments become plain, and those that are not settings are checked.
+"""Checks arguments of public functions: they become plain values, and those that aren't settings are checked.
 
-Rule: what comes in is plain. numpy's scalars and members of enums become Python's numbers and text; a whole number has at
-most 64 bits, and text can be written to a file. A parameter that stands in the signature has the type of its annotation.
-Settings, which a function takes as `**settings: Unpack[ATypedDict]`, are checked where msgspec makes a record of them. What
-is annotated as `object` is the user's own, and goes through as it is. Errors are one line, in the function's name.
+Rule: arguments become plain values. numpy's scalars and members of enums become Python's numbers and text; a whole number
+has at most 64 bits, and text can be written to a file. A parameter in the signature has the type of its annotation.
+Settings, which a function takes as `**settings: Unpack[ATypedDict]`, are checked where msgspec makes a record of them.
+Arguments annotated as `object` are the user's own objects, and stay unchanged. Errors are one line that begins with the
+function's name.
 
-The keys of such a `TypedDict` stand in the signature by name, for `help` and notebooks.
+The signature shows the keys of such a `TypedDict` by name, for `help` and notebooks.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ WORDS: dict[Any, str] = {
     dict: "a dict",
 }
 UNSET = type("Unset", (), {"__repr__": lambda unset: "..."})()
-"""Shown as the default of a keyword whose default depends on others"""
+"""Shown as the default of a keyword whose default depends on other settings"""
 _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
 
@@ -60,7 +61,7 @@ def checked(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Re
         try:
             given = signature.bind(*args, **keywords)
         except TypeError:
-            return function(*args, **keywords)  # raises it with the function's name
+            return function(*args, **keywords)  # raises the error with the function's name
         for name, value in given.arguments.items():
             match signature.parameters[name].kind:
                 case inspect.Parameter.VAR_KEYWORD:
@@ -92,7 +93,7 @@ def _by_name(function: Callable[..., Any], signature: inspect.Signature) -> Iter
 
 
 def _names_keys(annotation: object) -> bool:
-    """Whether an annotation, which is text, says that keywords are the keys of a TypedDict."""
+    """Whether an annotation, given as text, says that keywords are the keys of a TypedDict."""
     return str(annotation).startswith("Unpack[")
 
 
@@ -115,7 +116,7 @@ def plain(value: Any) -> Any:
 
 
 def unusable(value: Any) -> str:
-    """What was expected in place of text or a number that no message and no file can hold; empty if it can be held."""
+    """What was expected in place of text or a number that doesn't fit into messages and files; empty if it fits."""
     try:
         match value:
             case os.PathLike():

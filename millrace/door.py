@@ -1,7 +1,7 @@
-"""What an extra in a package of your own may import: for callbacks, commands and kinds of env copies.
+"""Everything that an extra in your own package may import: for callbacks, commands and kinds of env copies.
 
-Rule: an extra imports names of `millrace`, `millrace.algorithms` and this file, and nothing else of millrace, so that the
-rest may change. These are functions and classes, at most forty; no modules.
+Rule: an extra imports only names of `millrace`, `millrace.algorithms` and this file, so that the rest of millrace may
+change. These are functions and classes, at most forty; no modules.
 
     commands            `Flag`, `parse_flags`, `one_line`; a command is an entry point of the group `millrace.commands`
     runs on the disk    `find_runs`, `read_line`, `RunLine`, `read_rows`, `read_summary`

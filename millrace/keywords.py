@@ -488,7 +488,7 @@ class EvaluateKeywords(PlayKeywords, total=False):
     """Keywords of `millrace.evaluate`."""
 
     against: str | PathLike[str] | None
-    """run folder of a policy that plays the other teams; both draw their actions, and each team is played in turn"""
+    """run folder of a policy that plays the other teams; both sample their actions, and each team is played in turn"""
     seed: int
     """seed of the episodes"""
     copies: int

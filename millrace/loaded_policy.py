@@ -1,8 +1,8 @@
 """A saved policy that acts: `millrace.load`. Reads the run folder; needs no environment, and torch only for images.
 
-Rule: for the same observations it chooses the same actions as the workers of `millrace evaluate`, bit for bit, if as many
-observations are passed at once as a worker plays side by side (`--copies`). In a batch of another size, the last bits of a
-matrix product may differ.
+Rule: for the same observations it chooses the same actions as the workers of `millrace evaluate`, bit for bit, if you pass
+    as many observations at once as a worker plays side by side (`--copies`). In a batch of another size, the last bits of a
+    matrix product may differ.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ Observation: TypeAlias = Any
 
 
 class LoadedPolicy:
-    """A policy of a run folder, which acts: `policy(observation)` is an action for `env.step`. `millrace.load` makes it.
+    """A policy from a run folder that acts: `policy(observation)` is an action for `env.step`. `millrace.load` makes it.
 
     It takes one observation of the environment's space, or n of them stacked along a first axis, and returns one action or
     n. Actions are the environment's: of the dtype and shape of its action space, counted from its `start` and within its
-    bounds; those of a Dict or Tuple space are a dict or tuple. Observations are as the environment returns them; the policy
-    normalizes them itself if it was trained so.
+    bounds; those of a Dict or Tuple space are a dict or tuple. Pass observations as the environment returns them; the policy
+    normalizes them if it was trained with normalization.
 
     A policy with a recurrent core remembers what it saw in each env copy: call `reset(n)` before the first observations, and
     say with `first` which copies begin a new episode.
@@ -61,11 +61,13 @@ class LoadedPolicy:
         self.spec: PolicySpec = card.policy
         """The observations, the actions and the network, as plain data."""
         self.parameters: Floats = parameters
-        """The flat float32 vector [P] that `RolloutService.publish` takes: a learner of your own can start from this policy.
+        """The flat float32 vector [P] that `RolloutService.publish` takes: your own learner can start from this policy.
         `PolicyParameters(policy.spec)` names its pieces.
         """
         self.buffers: Floats = buffers
-        """Mean and standard deviation of the observations, flat float32 [2 D], likewise; empty if none are normalized."""
+        """Mean and standard deviation of the observations, flat float32 [2 D], for `publish`; empty if they aren't
+        normalized.
+        """
         self._name = f"{card.env}, {'best' if best else 'newest'} policy"
         self._policy = make_policy(card.policy)
         self._policy.load(parameters, buffers)
@@ -79,7 +81,7 @@ class LoadedPolicy:
 
     @checked
     def reset(self, copies: int = 1, *, seed: int | None = None) -> None:
-        """Begin new episodes in this number of env copies. A policy with a recurrent core needs it; others do not.
+        """Begin new episodes in this number of env copies. A policy with a recurrent core needs this; others don't.
 
         `seed`: restart the random numbers of a policy that samples its actions. Raises `UsageError` if `copies` is below 1.
 
@@ -92,7 +94,7 @@ class LoadedPolicy:
         check_at_least("reset: seed", seed or 0, 0)
         try:
             self._state = zero_state(self.spec, 1, copies)
-        except (MemoryError, ValueError) as error:  # ValueError: no array can be so long
+        except (MemoryError, ValueError) as error:  # ValueError: no array can be this long
             raise UsageError(f"reset: copies: expected a number whose states fit into memory, got {copies}") from error
         if seed is not None and self._generator is not None:
             self._generator = generator(seed, Purpose.PLAYED_ACTIONS)
@@ -104,13 +106,14 @@ class LoadedPolicy:
         dict or tuple of arrays [n, *part].
 
         Arguments:
-            observation: One of the environment's observation space, or n of them: arrays [n, *leaf]. A Dict or Tuple
-                observation is a dict or tuple of such arrays. The policy normalizes it, if it was trained so.
-            first: Of a recurrent policy: True where this observation is the first of an episode. A bool, or [n] of them.
-            mask: Which actions are allowed: [choices] bool or int8, as `info["action_mask"]` has it, or [n, choices]. If the
+            observation: An element of the environment's observation space, or n of them: arrays [n, *leaf]. A Dict or Tuple
+                observation is a dict or tuple of such arrays. The policy normalizes it if it was trained with normalization.
+            first: For a recurrent policy: True where this observation is the first of an episode. A bool, or [n] of them.
+            mask: Which actions are allowed: [choices] bool or int8, as in `info["action_mask"]`, or [n, choices]. If the
                 policy was trained with masks in its Dict observations, they are read there. None: all are allowed.
 
-        Raises `UsageError` if the observation is not of the space, not finite, or of another number of copies than `reset`.
+        Raises `UsageError` if the observation isn't in the space, isn't finite, or is for another number of copies than
+        `reset`.
 
         >>> import millrace
         >>> policy = millrace.load(run)
@@ -196,17 +199,17 @@ class LoadedPolicy:
 
 @checked
 def load(run: str | os.PathLike[str], *, best: bool = False, deterministic: bool = True, seed: int = 0) -> LoadedPolicy:
-    """Load a policy of a run folder, to act with it: `policy(observation)` gives the action.
+    """Load a policy from a run folder, to act with it: `policy(observation)` returns the action.
 
     Arguments:
-        run: The run folder. Also one of a run that has not ended: its policy is saved with each checkpoint.
+        run: The run folder. The run need not have ended: its policy is saved with each checkpoint.
         best: Take the policy with the best evaluation during the run (`eval_every`). Otherwise it is the newest one, as in
             `millrace evaluate`: the policy with which a run that has ended was evaluated at its end.
-        deterministic: Take the most probable action, as `millrace evaluate` does. Otherwise draw it, as in training.
-        seed: Seed of the actions that are drawn.
+        deterministic: Take the most probable action, as `millrace evaluate` does. Otherwise sample it, as in training.
+        seed: Seed of sampled actions.
 
-    It reads policy.safetensors and policy.json; neither the environment nor the algorithm must be installed. A policy of
-    images or with an encoder imports torch. Raises `UsageError`, with a message of one line, if there is no such policy.
+    It reads policy.safetensors and policy.json; neither the environment nor the algorithm must be installed. A policy with
+    images or an encoder imports torch. Raises `UsageError`, with a message of one line, if there is no such policy.
 
     >>> import millrace, numpy
     >>> policy = millrace.load(run)
@@ -219,7 +222,7 @@ def load(run: str | os.PathLike[str], *, best: bool = False, deterministic: bool
 
 
 def _by_path(observation: Observation, path: str) -> Iterator[tuple[str, Any]]:
-    """The arrays of a Dict or Tuple observation, by the names that a policy gives them."""
+    """The arrays of a Dict or Tuple observation, by the policy's names for them."""
     match observation:
         case Mapping():
             parts = list(observation.items())

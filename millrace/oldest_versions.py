@@ -16,12 +16,12 @@ class Oldest(NamedTuple):
     file: str
     """the file of the package that has its version"""
     asked_by: str
-    """who may have asked for an older one"""
+    """what may have required an older one"""
 
 
 OLDEST = {
     "gymnasium": Oldest((1, 1), "__init__.py", "a package of environments"),
-    "numpy": Oldest((2, 0), "version.py", "another package"),  # before, a uint64 and an int together were a float
+    "numpy": Oldest((2, 0), "version.py", "another package"),  # in older versions, a uint64 and an int together gave a float
 }
 VERSION = re.compile(r"""^(?:__version__|version) *= *["'](\d+\.\d+[\d.]*)""", re.MULTILINE)
 
@@ -47,7 +47,7 @@ def check_versions() -> None:
 
 
 def _too_old(name: str, oldest: Oldest) -> str:
-    """A line if the installed package is too old; else nothing, also if there is none.
+    """A line if the installed package is too old; empty if it isn't, or isn't installed.
 
     Its version is read in its source text: `importlib.metadata` takes a third of the time of `import millrace`.
     """
@@ -68,7 +68,7 @@ def _too_old(name: str, oldest: Oldest) -> str:
 
 
 def _folder(name: str) -> Path | None:
-    """The folder of the package that `import NAME` takes, or has taken; None if there is none."""
+    """The folder of the package that `import NAME` finds, or has found; None if there is none."""
     module = sys.modules.get(name)
     spec = getattr(module, "__spec__", None) if module is not None else importlib.util.find_spec(name)
     if spec is None or not spec.submodule_search_locations:

@@ -1,4 +1,4 @@
-"""A policy of the user's own: which callable makes it in the workers, and what is declared of it. Imports no torch."""
+"""A user-defined policy: the callable that makes it in the workers, and its declarations. Imports no torch."""
 
 from __future__ import annotations
 
@@ -41,12 +41,12 @@ class OwnPolicy:
     (8, 2, 2)
 
     `factory(**kwargs)` is called in each worker and returns such an object. `act` is called once for each step of a lane,
-    with exactly its copies; if they have agents, with all of these, also those that wait or have left. What they remember
-    goes into `state` [N, state_size] float32, which is zeros when an episode begins; if the object keeps nothing else
+    with exactly its copies; if they have several agents, with all of them, including those that wait or have left. Their
+    memory is `state` [N, state_size] float32, which is zeros when an episode begins; if the object keeps nothing else
     between its calls, results do not depend on the number of workers. An action is whole numbers that count from 0, or
     float32, which is clipped to the space after it was stored. If the environment has action masks, `act` also gets `mask=`
-    [N, choices] bool, and must choose what it allows.
-    `service.evaluate` calls `act_greedy` of the object if there is one, else `act`. docs/how-to/own_learner.md has more.
+    [N, choices] bool, and must choose an allowed action. `service.evaluate` calls the object's `act_greedy` if there is one,
+    else `act`. docs/how-to/own_learner.md has more.
     """
 
     factory: str | Callable[..., object]
@@ -68,14 +68,14 @@ class OwnPolicy:
 
     @property
     def name(self) -> str:
-        """By which it is called in errors."""
+        """Its name in errors."""
         return (
             self.factory if isinstance(self.factory, str) else getattr(self.factory, "__name__", type(self.factory).__name__)
         )
 
     @property
     def extra_arrays(self) -> tuple[ExtraArray, ...]:
-        """The declared extras but `log_prob`. Raises `UsageError`."""
+        """The declared extras except `log_prob`. Raises `UsageError`."""
         return tuple(extra for extra in self._declared() if extra != LOG_PROB)
 
     def spec(self, observation: tuple[Leaf, ...], action: ActionSpec) -> PolicySpec:

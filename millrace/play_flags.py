@@ -20,9 +20,9 @@ class PlayFlags(msgspec.Struct, frozen=True, kw_only=True):
     best: bool = False
     """use the policy with the best evaluation during the run (--eval-every), instead of the newest"""
     env: str = ""
-    """the environment, if the run does not find it by itself, such as my_module:make_env or my_module:MyEnv-v0"""
+    """the environment, if the run can't find it itself, such as my_module:make_env or my_module:MyEnv-v0"""
     wrappers: Annotated[tuple[str, ...], Flag("MODULE:CLASS ...")] = ()
-    """the wrappers, innermost first, if the run does not find them by itself"""
+    """the wrappers, innermost first, if the run can't find them itself"""
     workers: Count = 2
     """number of worker processes that play the episodes; the result does not depend on it"""
     transport: Literal["inproc", "ipc", "tcp"] = "ipc"
@@ -41,7 +41,7 @@ class EvaluateFlags(PlayFlags, frozen=True, kw_only=True):
     episodes: Annotated[Count | None, Flag("INT")] = None
     """number of episodes; if not given: 100, or 3 with --video"""
     against: Annotated[Path | None, Flag("RUN")] = None
-    """run folder of a policy that plays the other teams; both draw their actions, and each team is played in turn"""
+    """run folder of a policy that plays the other teams; both sample their actions, and each team is played in turn"""
     seed: Natural = 1_000_000
     """seed of the episodes"""
     copies: Annotated[int, Meta(ge=1, le=MAX_SEEDS)] = 4
@@ -58,7 +58,7 @@ class RecordFlags(PlayFlags, frozen=True, kw_only=True):
     out: str
     """id of the dataset, such as cartpole/expert-v0; it is written to MINARI_DATASETS_PATH, or to ~/.minari/datasets"""
     steps: Count = 50_000
-    """number of env steps; the last episode is finished, unless that would take more than twice as many"""
+    """number of env steps; the last episode is finished, unless that would more than double the number"""
     npy: Annotated[Path | None, Flag("PATH")] = None
     """also write this .npy file: a float32 array with a row [observation, action], flattened, for each step"""
     stochastic: bool = False

@@ -1,6 +1,6 @@
-"""Evaluating a run's policy: the command `evaluate` and the function of the same name; and what else plays a policy needs.
+"""Evaluating a run's policy: the command `evaluate`, the function of the same name, and parts that `record` shares.
 
-Rule: a keyword of the function is the flag of the command, by the same name and with the same default. Worker processes play
+Rule: each keyword of the function is a flag of the command with the same name and default. Worker processes play
 the episodes; the caller's process runs no environment code.
 """
 
@@ -28,16 +28,16 @@ from millrace.protocol.envs.wrappers import WrapperLike
 from millrace.protocol.errors import UsageError, did_you_mean
 from millrace.terminal import count_line
 
-NOT_KEYWORDS = ("wrappers",)  # in Python they may be objects, and are handed on apart
+NOT_KEYWORDS = ("wrappers",)  # in Python they may be objects, and are passed separately
 ShowPlayed = Callable[[str], None]
-"""Gets how far it is, as text."""
+"""Gets the progress, as text."""
 _Flags = TypeVar("_Flags", bound=PlayFlags)
 RecordVideos = Callable[[PolicyPlayer, Path, int, int, int, str], tuple[Evaluation, list[Path]]]
 """Gets player, run folder, episodes, seed, max_steps and the prefix of the names of the videos."""
 
 
 class Given(NamedTuple):
-    """What is taken in place of the environment and the wrappers that the run remembers by name."""
+    """Replaces the environment and the wrappers that the run remembers by name."""
 
     env: EnvLike | None = None
     wrappers: Sequence[WrapperLike] | None = None
@@ -47,7 +47,7 @@ WriteDataset = Callable[[RecordFlags, ShowPlayed, Given], RecordedDataset]
 
 
 class ShownKeywords(TypedDict, total=False):
-    """Keywords of the two functions that are no flags of the commands."""
+    """Keywords of the two functions that aren't flags of the commands."""
 
     env: EnvLike | None
     wrappers: Sequence[WrapperLike] | None
@@ -77,8 +77,8 @@ def evaluate(
     Arguments:
         run: A `Run`, or a run folder.
         episodes: Number of episodes; if not given 100, or 3 with `video`.
-        env: The environment that the run was started with, if it is not found by its name: it was made in another script or
-            notebook. (`Run.evaluate` of the `Run` that `train` returned knows it.)
+        env: The environment that the run was started with, if it can't be found by its name because it was made in another
+            script or notebook. (`Run.evaluate` of the `Run` that `train` returned knows it.)
         wrappers: Likewise the wrappers.
         progress: Show how far it is.
         **keywords: The flags of `millrace evaluate`. `seed` of the episodes; `best`, to use the policy with the best
@@ -114,17 +114,18 @@ def record(
 
     Arguments:
         run: A `Run`, or a run folder.
-        out: Id of the dataset, as `cartpole/expert-v0`. It is written to MINARI_DATASETS_PATH, or to ~/.minari/datasets.
+        out: Id of the dataset, such as `cartpole/expert-v0`. It is written to MINARI_DATASETS_PATH, or to
+            ~/.minari/datasets.
         steps: Number of env steps. The last episode is finished, unless that would take more than twice as many.
-        env: The environment that the run was started with, if it is not found by its name: it was made in another script or
-            notebook. (`Run.record` of the `Run` that `train` returned knows it.)
+        env: The environment that the run was started with, if it can't be found by its name because it was made in another
+            script or notebook. (`Run.record` of the `Run` that `train` returned knows it.)
         wrappers: Likewise the wrappers.
         progress: Show how far it is.
         **keywords: The flags of `millrace record`: `stochastic`, to sample actions; `npy`, a file for rows of observation
             and action; `seed`, `best`, `workers`, `transport`, `bind`, `inference` and `max_env_failures`.
 
     Returns a `RecordedDataset`: `dataset_id`, `episodes`, `steps`, `return_mean`, `return_std` and `cut`. It does not depend
-    on the number of workers. Raises `UserFacingError` with a message of one line; then it leaves no files.
+    on the number of workers. Raises `UserFacingError` with a message of one line; in that case no files are left.
 
     >>> import millrace
     >>> millrace.record(run, "cartpole/example-v0", steps=20, workers=1).dataset_id
@@ -137,7 +138,7 @@ def record(
 
 
 def flags_of(kind: type[_Flags], name: str, **keywords: Any) -> _Flags:
-    """The flags that these keyword arguments make. Raises `UsageError` that names one that is wrong."""
+    """The flags from these keyword arguments. Raises `UsageError`, which names a wrong one."""
     fields = fields_of(kind)
     for keyword in keywords:
         if keyword not in fields or keyword in NOT_KEYWORDS:
@@ -172,7 +173,7 @@ def play(flags: EvaluateFlags, watch: ShowPlayed, given: Given | None = None) ->
 
 
 def playing_workers(flags: PlayFlags, count: int, copies: int) -> PlayingWorkers:
-    """`count` workers that play episodes, or those from elsewhere, on at most so many `copies` each."""
+    """`count` local workers that play episodes, or workers from elsewhere, on at most `copies` env copies each."""
     settings = RolloutConfig(max_env_failures=flags.max_env_failures)
     return PlayingWorkers(count, flags.transport, flags.bind, flags.inference, copies, settings)
 

@@ -1,7 +1,7 @@
 """The policies that workers can act with: how a user chooses one, and where its parameters are in the flat vector.
 
-A policy here is the acting part alone: observation in, distribution over actions out. What else a learner trains (a critic,
-say) is its own business. Imports no torch.
+A policy here is only the acting part: observation in, distribution over actions out. Anything else that a learner trains,
+such as a critic, is up to the learner. Imports no torch.
 """
 
 from __future__ import annotations
@@ -186,7 +186,7 @@ class PolicyParameters:
     def initial(self, seed: int = 1) -> Floats:
         """Initial parameters [P] float32: orthogonal weights with the gains of the layout, biases 0.
 
-        Raises `UsageError` for an `OwnPolicy`, whose initial values only you know.
+        Raises `UsageError` for an `OwnPolicy`: only you know its initial values.
 
         >>> import millrace
         >>> parameters = millrace.PolicyParameters(millrace.load(run).spec)
@@ -195,7 +195,7 @@ class PolicyParameters:
         """
         check_at_least("initial: seed", seed, 0)
         if self.spec.own is not None:
-            raise UsageError(f"policy {self.spec.own.factory}: expected initial values of your own; publish them")
+            raise UsageError(f"policy {self.spec.own.factory}: expected your own initial values; publish them")
         drawn = generator(seed, Purpose.WEIGHTS)
         flat = np.zeros(self.size, np.float32)
         for piece in self.layout:

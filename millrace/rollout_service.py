@@ -1,4 +1,4 @@
-"""Rollouts for a learner of your own: any framework, any loop. millrace collects; you learn.
+"""Rollouts for your own learner, in any framework and any loop: millrace collects, you learn.
 
     with millrace.RolloutService("CartPole-v1", policy=millrace.MLP(64, 64), workers=2, envs=64) as service:
         parameters = service.policy.initial(seed=1)
@@ -7,8 +7,8 @@
             parameters = update(parameters, batch)
             service.publish(parameters)
 
-The built-in trainer runs on the same service: tickets, ledger, lags, faults and reproducible results are
-those of `millrace train`. Imports no torch.
+The built-in trainer uses the same service: tickets, ledger, lags, faults and reproducible results work as in `millrace
+train`. Imports no torch.
 """
 
 from __future__ import annotations
@@ -57,12 +57,12 @@ EVALUATION_COPIES = 4  # episodes that a worker plays side by side
 class RolloutBatch(Batch, frozen=True, kw_only=True, eq=False):
     """One rollout of each lane, side by side: T steps of N env copies. All arrays are writable and yours.
 
-    Row t says: in `obs[t]` we did `action[t]`, got `reward[t]` and saw `obs[t + 1]`, wherever `valid[t]`. A row that is not
-    valid only resets its env copy: leave it out of every loss, return and count.
+    Row t says: in `obs[t]` the policy took `action[t]`, got `reward[t]` and saw `obs[t + 1]`, wherever `valid[t]`. A row
+    that is not valid only resets its env copy: leave it out of every loss, return and count.
 
-    With several agents, each has a column: N is the number of copies times `len(service.seats)`, those of a copy side by
-    side. A row that is not valid may then also be of an agent that waits for others, or has left: what is carried along a
-    column, a return or a recurrent state, passes through it unchanged.
+    With several agents, each has a column: N is the number of copies times `len(service.seats)`, and the columns of a copy
+    are adjacent. A row that is not valid may then also belong to an agent that waits for others, or has left: a return or a
+    recurrent state that is carried along the column passes through it unchanged.
 
     >>> import millrace
     >>> with millrace.RolloutService("CartPole-v1", workers=1, envs=2, lanes=1, rollout_steps=8) as service:
@@ -73,7 +73,7 @@ class RolloutBatch(Batch, frozen=True, kw_only=True, eq=False):
 
     Beside the fields below it has `action` [T, N, *action] (int64 counted from 0, or float32 before clipping), `reward`
     [T, N] float32 (raw), `terminated`, `truncated` and `valid` [T, N] bool, `state` [N, S] float32 before `obs[0]`, `lane`
-    [N] int64, `fresh` [N] bool (False where a column goes on where it ended in the batch before), `columns_per_rollout`
+    [N] int64, `fresh` [N] bool (False where a column continues the batch before), `columns_per_rollout`
     (those of a lane are adjacent), `mask` [T+1, N, choices] bool of the actions that were allowed (None without action
     masks), and `episodes`, which have `reward` (the return, of all agents together), `length`, `seconds` and `facts`. With
     several agents, `resets` [T+1, env copies] bool says which steps only reset a copy; the last row is of the next batch's
@@ -85,7 +85,7 @@ class RolloutBatch(Batch, frozen=True, kw_only=True, eq=False):
     log_prob: Any
     """[T, N] float32 of the action, under the policy that acted; None if it is your own and does not return it"""
     extras: Any
-    """what your own policy returned, by name: {name: [T, N, *shape]}; empty for the built-in ones"""
+    """further arrays that your own policy returned, by name: {name: [T, N, *shape]}; empty for built-in policies"""
     version: Ints
     """[N] int64, the version of the weights that acted"""
 
@@ -95,15 +95,15 @@ class RolloutBatch(Batch, frozen=True, kw_only=True, eq=False):
 
 
 class RolloutService:
-    """Collects rollouts of one policy with worker processes, here or elsewhere, for a learner of your own.
+    """Collects rollouts of one policy with worker processes, here or elsewhere, for your own learner.
 
     Use it in a `with` statement and from one thread. While you compute, a thread of the service answers the workers, so a
     long computation loses none of them.
 
     `publish` sets the weights: the flat float32 vector [P] of the policy, or an array for each of its pieces. Iterating, or
     `gather`, gives a `RolloutBatch` for each update: T = `rollout_steps` rows of `envs` env copies. It waits until one
-    rollout of each lane is there. The batch was collected under the weights that were the newest when `gather` was called
-    `max_lag` batches before: with 0, under those that you published last.
+    rollout of each lane has arrived. The batch was collected with the weights that were the newest when `gather` was called
+    `max_lag` batches earlier: with 0, with those that you published last.
 
     After `close`, and from another thread, every method raises `UsageError`. `gather` and `evaluate` raise `RunError` if no
     batch can come: `NoWorkers`, `Stalled`, `EnvironmentFailed` or `PolicyFailed`. Ctrl-C raises `KeyboardInterrupt`.
@@ -134,15 +134,16 @@ class RolloutService:
 
         Args:
             env: an id that `gymnasium.make` takes, a `gymnasium.envs.registration.EnvSpec`, or a callable that returns an
-                environment; also one that only your script or notebook has. It may be of PettingZoo's, with several agents.
+                environment; it may be defined only in your script or notebook. It may be a PettingZoo environment, with
+                several agents.
             wrappers: applied to every env copy in its worker, the first one innermost: classes, functions, or names as
                 "gymnasium.wrappers:FlattenObservation".
             policy: `MLP`, `CNN`, `Recurrent` or your `OwnPolicy`; by default `MLP(64, 64)`.
             rollout_steps: T, env steps of an env copy in a batch.
             restore: a file that `save` wrote; `restored` then has its arrays.
-            **settings: those of `millrace train` for environments, workers, network and timeouts, by the same names and with
-                the same defaults: `workers=2`, `envs=8`, `lanes=4`, `max_lag=0`. With `bind="tcp://0.0.0.0:5555"` no worker
-                is started here: workers elsewhere join with `millrace worker`.
+            **settings: those of `millrace train` for environments, workers, network and timeouts, with the same names and
+                defaults: `workers=2`, `envs=8`, `lanes=4`, `max_lag=0`. With `bind="tcp://0.0.0.0:5555"` no worker is
+                started here: workers elsewhere join with `millrace worker`.
 
         Raises `UsageError` if an argument is wrong, `NoWorkers` if too few workers join in time, `EnvironmentFailed` if the
         environment cannot be made, and `PolicyFailed` if your `OwnPolicy` cannot.
@@ -197,7 +198,7 @@ class RolloutService:
                 if state.normalizer is not None:
                     try:
                         self.normalizer.restore(state.normalizer)
-                    except Exception as error:  # dicts, numpy and torch raise many types for what no normalizer has
+                    except Exception as error:  # dicts, numpy and torch raise many types for an invalid state
                         raise unreadable(str(restore), error) from error
         except BaseException:
             self._resources.close()
@@ -207,9 +208,9 @@ class RolloutService:
         self.seats: tuple[str, ...] = self.run.seats
         """The agents of each env copy, in the order of their columns; none if the environment is gymnasium's."""
         self.observation_space: gymnasium.Space[Any] = described.observation_space
-        """That of a single env copy, or of a single agent."""
+        """The space of a single env copy, or of a single agent."""
         self.action_space: gymnasium.Space[Any] = described.action_space
-        """That of a single env copy, or of a single agent."""
+        """The space of a single env copy, or of a single agent."""
         self._thread = threading.Thread(target=self._answer_workers, name="millrace-service", daemon=True)
         self._thread.start()
 
@@ -228,7 +229,7 @@ class RolloutService:
         return self._version
 
     def publish(self, parameters: Mapping[str, Array] | Array, buffers: Mapping[str, Array] | Array | None = None) -> int:
-        """Set the newest weights, under which rollouts are collected from the next `gather` on. Returns their version.
+        """Set the newest weights, with which rollouts are collected from the next `gather` on. Returns their version.
 
         `parameters`: the flat vector [P], or an array for each name in `policy.layout`. `buffers` likewise, for a policy
         that normalizes observations; by default those of `normalizer`. They are copied.
@@ -271,7 +272,7 @@ class RolloutService:
     def gather(self) -> RolloutBatch:
         """Wait for the next batch.
 
-        Raises `NoWorkers` if none has been there for `no_workers_timeout_s`, `EnvironmentFailed` or `PolicyFailed` if it
+        Raises `NoWorkers` if there has been none for `no_workers_timeout_s`, `EnvironmentFailed` or `PolicyFailed` if it
         failed more often than `max_env_failures` allows, `Stalled` if no env step has ended for ten minutes (or as long as
         one may take), and `UsageError` before the first `publish`.
 
@@ -300,7 +301,7 @@ class RolloutService:
 
     @checked
     def evaluate(self, episodes: int = 100, *, seed: int = 1_000_000, max_steps: int = 1_000_000) -> Evaluation:
-        """Let the workers play greedy episodes under the newest weights, on env copies apart from those of the rollouts.
+        """Let the workers play greedy episodes with the newest weights, on other env copies than those of the rollouts.
 
         The result does not depend on the number of workers. `max_steps`: env steps of the whole evaluation at most; each
         episode gets an equal share.
@@ -321,16 +322,16 @@ class RolloutService:
             self._hub.begin_evaluation(plan)
             return evaluation_of(self._hub.end_evaluation(lambda played, env_steps: None), self.run.facts)
 
-    # ---------------------------------------------------------------- saving, and what else there is to know
+    # ---------------------------------------------------------------- saving, and the state of the service
 
     @checked
     def save(self, path: str | os.PathLike[str], **arrays: object) -> None:
-        """Write the service's state and your arrays into one .npz file, which is there whole or not at all.
+        """Write the service's state and your arrays into one .npz file, atomically.
 
-        Call it right after `publish`. `RolloutService(..., restore=path)` goes on from it: ledger, versions, rounds and
+        Call it right after `publish`. `RolloutService(..., restore=path)` continues from it: ledger, versions, rounds and
         normalizer continue, and `restored` has the arrays. Workers repeat the episodes that ran when the last batch was
-        gathered, and go on there. If the environment repeats itself, the next batches are those that this service returns
-        next.
+        gathered, and continue from there. If the environment repeats itself, the next batches are those that this service
+        returns next.
 
         Raises `UsageError` for arrays that are not of numbers, and `RunError` if the file cannot be written.
 
@@ -425,7 +426,7 @@ class RolloutService:
     # ---------------------------------------------------------------- inside
 
     def _answer_workers(self) -> None:
-        """Answer the workers while the user computes. `publish`, `gather` and `evaluate` do it themselves."""
+        """Answer the workers while the user computes. `publish`, `gather` and `evaluate` also do it."""
         while not self._over.wait(PULSE_S):
             with self._lock:
                 self._hub.pulse()
@@ -448,7 +449,7 @@ class RolloutService:
         )
 
     def _progress(self, lags: Ints) -> Progress:
-        """What `millrace status` shows after a batch with these lags [N]."""
+        """The progress for `millrace status` after a batch with these lags [N]."""
         return Progress(
             env_steps=self.env_steps,
             steps_per_s=steps_per_second(self.env_steps - self._steps_before, time.monotonic() - self._began_s),

@@ -1,6 +1,6 @@
-"""A run in Python: `millrace.train` makes it, `millrace.Run` names its folder and reads it each time it is asked.
+"""A run in Python: `millrace.train` makes it, and `millrace.Run` reads its folder whenever you access it.
 
-Rule: what a run folder lacks is None or empty, and what cannot be read is said in one line. Its repr never raises.
+Rule: parts that a run folder lacks are None or empty, and an unreadable file is an error of one line. The repr never raises.
 """
 
 from __future__ import annotations
@@ -49,9 +49,9 @@ _Played = TypeVar("_Played", RunEvaluateKeywords, RunRecordKeywords)
 
 
 class Metrics(dict[str, Array]):
-    """The metrics of a run: a numpy array [updates] for each name, as `metrics["rollout/ep_rew_mean"]`.
+    """The metrics of a run: a numpy array [updates] for each name, such as `metrics["rollout/ep_rew_mean"]`.
 
-    Whole numbers are int64. Other columns are float64, with NaN where an update has no such number: most updates make no
+    Whole numbers are int64. Other columns are float64, with NaN where an update has no such number, for example no
     evaluation. The names are those of metrics.jsonl, which are Stable-Baselines3's where it has one.
 
     >>> import millrace
@@ -63,7 +63,7 @@ class Metrics(dict[str, Array]):
     """
 
     unreadable: int
-    """Number of rows that could not be read, and are left out."""
+    """Number of unreadable rows, which are left out."""
 
     def __init__(self, rows: list[dict[str, Any]], unreadable: int = 0) -> None:
         names = dict.fromkeys(name for row in rows for name in row)
@@ -83,7 +83,7 @@ class Picture(Protocol):
     """the picture as SVG text"""
 
     def _repr_svg_(self) -> str:
-        """What a notebook shows."""
+        """The representation in a notebook."""
 
     def png(self) -> bytes:
         """The picture as a PNG. Raises `UsageError` if its packages are not installed."""
@@ -93,12 +93,11 @@ class Picture(Protocol):
 
 
 class Run(os.PathLike[str]):
-    """A run folder: its results, and what can be done with its policy. `millrace.train` returns one.
+    """A run folder: its results, and methods to use its policy. `millrace.train` returns one.
 
-    Everything is read from the folder when it is asked for, so a `Run` of a run that still trains shows how far it is.
-    `os.fspath(run)` is its folder: a run can be passed wherever a path is expected.
-
-    Raises `UsageError`, with a message of one line, if `path` is no run folder.
+    Everything is read from the folder at each access, so the `Run` of a run that still trains shows how far it is.
+    `os.fspath(run)` is its folder: you can pass a run wherever a path is expected. Raises `UsageError`, with a message of
+    one line, if `path` isn't a run folder.
 
     >>> import millrace
     >>> millrace.Run(run).summary.env
@@ -179,8 +178,8 @@ class Run(os.PathLike[str]):
     def resume(self, **keywords: Unpack[ResumeKeywords]) -> Run:
         """Continue the run from its newest checkpoint: `millrace.train(resume=run)`, with the same keywords.
 
-        An environment or algorithm that was given to `train` as an object is given again. Returns the run, which has the
-        same folder. A run that has reached its `steps` ends at once, so give more of them.
+        If you passed the environment or algorithm to `train` as an object, it is passed again. Returns the run, which has
+        the same folder. A run that has reached its `steps` ends at once, so pass a larger number.
 
         >>> import millrace
         >>> millrace.Run(run).resume(steps=96, progress=False).summary.updates
@@ -226,13 +225,13 @@ class Run(os.PathLike[str]):
         return f"<table>{''.join(f'<tr><th {left}>{name}</th><td {left}>{fact}</td></tr>' for name, fact in cells)}</table>"
 
     def _with_given(self, keywords: _Played) -> _Played:
-        """These keywords, and what `train` was given as objects where they do not say something else."""
+        """These keywords, and the objects that were passed to `train` unless the keywords replace them."""
         keywords.setdefault("env", self._given.get("env"))
         keywords.setdefault("wrappers", self._given.get("wrappers"))
         return keywords
 
     def _facts(self) -> dict[str, str]:
-        """What is most important about the run, by name. Never raises."""
+        """The most important facts about the run, by name. Never raises."""
         try:
             config = read_config(self.path)  # not `self.config`, which imports the algorithm
             summary = self.summary
@@ -265,22 +264,23 @@ def train(
 
     Arguments:
         env: An id that `gymnasium.make` takes, a `gymnasium.envs.registration.EnvSpec`, or a callable that returns an
-            environment; also one that only your script or notebook has. A resumed run finds it by its name, or it is
-            given again.
+            environment; it may be defined only in your script or notebook. A resumed run finds it by its name, or you pass
+            it again.
         wrappers: Applied to every env copy, also in evaluations, the first one innermost: classes, functions, or names as
             "gymnasium.wrappers:FlattenObservation".
         config: A TOML file of settings.
         resume: A run, or its folder, to continue from its newest checkpoint; or "auto": the newest run of this environment,
             algorithm and seed if there is one, else a new run.
         preset: The name of a preset (`millrace presets` lists them); "auto" takes that of `env`; "none" takes none.
-        callbacks: What the run calls between updates, and what may end it: objects with some of the methods of `Callback`;
+        callbacks: Callbacks between updates, which may also end the run: objects with some of the methods of `Callback`;
             names as "my_module:factory", which a resumed run finds again; and functions, which get a `Progress` after each
             update, and several times a second during an evaluation or a long wait.
-        progress: Show how far the run is: in one display in a notebook, in place on a terminal, else in a line every 5 s.
-        **settings: The flags of `millrace train`, by the same names: `learning_rate=1e-3`. `algo` may be a class of your own
-            (`millrace.algorithms`). A class that was made in a script or a notebook is given again on resume. Settings that
-            only your class has are known to no type checker: pass them as `**own`, a `dict[str, Any]`. `start_from` may be a
-            `Run`: the new run begins with its policy (`--from`).
+        progress: Show how far the run is: in one display in a notebook, in place on a terminal, otherwise as a line every 5
+            s.
+        **settings: The flags of `millrace train`, with the same names: `learning_rate=1e-3`. `algo` may be your own class
+            (`millrace.algorithms`). If it is defined in a script or a notebook, pass it again on resume. Type checkers don't
+            know settings that only your class has: pass them as `**own`, a `dict[str, Any]`. `start_from` may be a `Run`:
+            the new run begins with its policy (`--from`).
 
     Returns the `Run`. Raises `UserFacingError` with a message of one line.
 
@@ -319,7 +319,7 @@ def train(
 
 
 def _newest_figures(metrics: Metrics) -> dict[str, str]:
-    """How far a run is that has not ended."""
+    """The newest figures of a run that has not ended."""
     facts = {"env steps": f"{int(metrics[ENV_STEPS_KEY][-1]):,} env steps"} if ENV_STEPS_KEY in metrics else {}
     returns = metrics.get(RETURN_KEY)
     if returns is not None and np.isfinite(returns[-1]):

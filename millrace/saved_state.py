@@ -1,4 +1,4 @@
-"""The file of a `RolloutService`: its state beside the user's own arrays, one .npz, written whole or not at all."""
+"""The file of a `RolloutService`: its state and the user's own arrays in one .npz, written atomically."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ from millrace.protocol.errors import CheckpointError, UsageError
 from millrace.protocol.messages import LanePast, Weights
 from millrace.protocol.specs import PolicySpec
 
-OURS = "millrace"  # name of our entry, JSON as bytes; the user's arrays have other names
-OF_NUMPY = ("file", "allow_pickle")  # arguments of numpy.savez, which an array cannot have as its name
+OURS = "millrace"  # name of millrace's entry, JSON as bytes; the user's arrays have other names
+OF_NUMPY = ("file", "allow_pickle")  # arguments of numpy.savez, which can't be names of arrays
 FORMAT = 1
 
 
 class ServiceState(msgspec.Struct, frozen=True, kw_only=True):
-    """What a service goes on from."""
+    """The state that a service continues from."""
 
     env: str
     """id or name of the environment"""
     policy: str
     """digest of the policy's specification"""
     version: Annotated[int, Meta(ge=-1, le=LARGEST >> 2)]
-    """of the newest weights that were published"""
+    """version of the newest published weights"""
     env_steps: Past
     ledger: Ledger
     incarnations: list[Past]
@@ -52,21 +52,24 @@ class ServiceState(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def past(self) -> PastRollouts:
-        """With which the hub goes on. Raises as `unpacked` does."""
+        """The state from which the hub continues. Raises like `unpacked`."""
         lanes = unpacked(LanePast, np.frombuffer(self.lanes, np.uint8))
         acting = unpacked(Weights, np.frombuffer(self.acting, np.uint8))
         return PastRollouts(self.ledger, self.incarnations, self.rounds, lanes, acting)
 
 
 def digest(policy: PolicySpec) -> str:
-    """A short text that differs for different policies. Of the user's own, its name and layout count, and not its code."""
+    """A short text that differs for different policies.
+
+    For a user-defined policy, it covers the name and layout, not the code.
+    """
     if policy.own is not None:
         policy = msgspec.structs.replace(policy, own=msgspec.structs.replace(policy.own, code=None))
     return hashlib.sha256(msgspec.msgpack.encode(policy)).hexdigest()[:32]
 
 
 def write(path: Path, state: ServiceState, arrays: Mapping[str, Any]) -> None:
-    """Write the state and the user's arrays. Raises `UsageError` for arrays that cannot be kept, and `RunError`."""
+    """Write the state and the user's arrays. Raises `UsageError` for unsupported arrays, and `RunError`."""
     kept = {}
     for name, value in arrays.items():
         array = np.asarray(value)
@@ -85,11 +88,11 @@ def read(path: Path) -> tuple[ServiceState, dict[str, Array]]:
         # Opened here, because numpy leaves a damaged file open.
         with os.fdopen(descriptor, "rb") as opened, np.load(opened, allow_pickle=False) as file:
             if any(entry.compress_type != zipfile.ZIP_STORED for entry in file.zip.infolist()):
-                raise ValueError("it is compressed, and no file of ours is")  # a few bytes could fill the memory
+                raise ValueError("it is compressed, which millrace never does")  # a few bytes could fill the memory
             arrays = {name: file[name] for name in file.files}
         state = msgspec.json.decode(arrays.pop(OURS).tobytes(), type=ServiceState)
         state.ledger.end_outstanding()
-        _ = state.past  # it raises for what no service has
+        _ = state.past  # raises for an invalid state
     except Exception as error:  # zipfile, numpy and msgspec raise a dozen types for damaged files
         raise unreadable(path, error) from error
     if state.format != FORMAT:
@@ -98,7 +101,7 @@ def read(path: Path) -> tuple[ServiceState, dict[str, Array]]:
 
 
 def unreadable(path: Path | str, error: Exception) -> CheckpointError:
-    """The error for a file that no `RolloutService.save` wrote."""
+    """The error for a file that `RolloutService.save` did not write."""
     why = one_line(reason(error))
     return CheckpointError(
         f"{path}: expected a file that RolloutService.save wrote, cannot read it: {why}; restore an older one"

@@ -46,10 +46,10 @@ def make_vec_env(
     """Make a vector environment, as `stable_baselines3.common.env_util.make_vec_env` does.
 
     Args:
-        env_id: as in `millrace.make_vec`. Of an environment with agents, which must all act at every step, each is a row.
+        env_id: as in `millrace.make_vec`. If it has several agents, which must all act at every step, each agent is a row.
         n_envs: number of env copies; by default 1, or the length of the list.
-        seed: of the first reset: copy n gets `seed + n`; and of samples of `action_space`.
-        monitor: record the return and length of each episode, for `rollout/ep_rew_mean`: those of the environment without
+        seed: seed of the first reset, in which copy n gets `seed + n`, and of samples of `action_space`.
+        monitor: record the return and length of each episode, for `rollout/ep_rew_mean`, of the environment without
             `wrapper_class`, as SB3 does.
         wrapper_class: called with each env copy, in the workers: a wrapper, or a function that applies several. It is code,
             so it is sent over TCP only to workers that have a key.
@@ -81,7 +81,7 @@ def make_vec_env(
 class Sb3VecEnv(VecEnv):
     """The SB3 interface of a vector environment whose autoreset mode is `SameStep`.
 
-    With seats, `num_envs` counts the agents of all copies, which must all act at every step: SB3 has no place for others.
+    With seats, `num_envs` counts the agents of all copies, which must all act at every step: SB3 doesn't support others.
     """
 
     def __init__(self, env: ZmqVectorEnv, *, monitored: bool = False) -> None:
@@ -99,7 +99,10 @@ class Sb3VecEnv(VecEnv):
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
-        """Set the seeds of the next reset: copy n gets `seed + n`, however many agents it has. Returns that of each row."""
+        """Set the seeds of the next reset: copy n gets `seed + n`, however many agents it has.
+
+        Returns the seed of each row.
+        """
         first, *_ = super().seed(seed)
         if first is not None:
             self._seeds = [first + n // self._rows_of_copy for n in range(self.num_envs)]
@@ -214,7 +217,7 @@ class _Wrapping:
 
     def __call__(self, env: EnvLike) -> Callable[..., gymnasium.Env[Any, Any]]:
         """A factory of this environment, wrapped. The same one for the same environment, so that it is sent once."""
-        key = env if isinstance(env, str) else id(env)  # gymnasium's specs cannot be hashed
+        key = env if isinstance(env, str) else id(env)  # gymnasium's specs aren't hashable
         if key not in self._made:
             self._made[key] = _wrapped(env, self._wrapper_class, self._keywords, self._monitor)
         return self._made[key]
@@ -229,7 +232,9 @@ def _wrapped(
     def make(render_mode: str | None = None, **kwargs: Scalar) -> gymnasium.Env[Any, Any]:
         made = msgspec.structs.replace(inner, kwargs=kwargs).make(render_mode)
         if isinstance(made, SeatedEnv):
-            raise UsageError("make_vec_env: wrapper_class: expected none with agents; give PettingZoo's as wrappers=[...]")
+            raise UsageError(
+                "make_vec_env: wrapper_class: expected none with agents; pass PettingZoo wrappers as wrappers=[...]"
+            )
         return wrapper_class(gymnasium.wrappers.RecordEpisodeStatistics(made) if monitor else made, **keywords)
 
     make.__name__ = make.__qualname__ = inner.id

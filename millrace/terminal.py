@@ -1,8 +1,8 @@
 """Shows the progress of a run: as a live block on a terminal, as one display in a notebook, as lines elsewhere, or as JSON.
 
 Rule: it never slows the run (at most five redraws a second), and the last progress is always shown. Warnings of the log are
-shown above the block. No text is read as markup or controls the terminal. `millrace.learner.standard_streams` sees to it
-that a stream which is full or closed does not end the run.
+shown above the block. No text is interpreted as markup or terminal control. `millrace.learner.standard_streams` ensures that
+a full or closed stream doesn't end the run.
 """
 
 from __future__ import annotations
@@ -48,11 +48,11 @@ REDRAW_EVERY_S = 0.2
 NOTEBOOK_EVERY_S = 0.5
 LINE_EVERY_S = 5.0
 GAP = "   "  # between the figures of a row
-MOST_REASON = 80  # characters; an error has a line of its own below the block
+MOST_REASON = 80  # characters; an error has its own line below the block
 
 
 class ProgressView:
-    """A way to show progress. What it does not say does nothing."""
+    """A way to show progress. By default, its methods do nothing."""
 
     def show(self, progress: Progress) -> None:
         """Show this progress now."""
@@ -68,9 +68,9 @@ class ProgressView:
 def progress_view(
     log_json: bool = False, clock: Callable[[], float] = time.monotonic, *, may_fail: bool = True
 ) -> Iterator[Callable[[Progress], None]]:
-    """A context manager that returns a function to call with each progress. Until it ends, millrace's log is shown too.
+    """A context manager that returns a function to call with each progress.
 
-    `may_fail`: raise what showing raises. Otherwise it is dropped.
+    While it is entered, millrace's log is shown too. `may_fail`: raise errors of showing. Otherwise they are dropped.
     """
     view, every_s = _view(log_json)
     if not may_fail:
@@ -95,9 +95,9 @@ def progress_view(
 def count_line(
     doing: str, clock: Callable[[], float] = time.monotonic, *, show: bool = True
 ) -> Iterator[Callable[[str], None]]:
-    """Gives a function that shows a text, after `doing`: in place on a terminal or in a notebook, else a line now and then.
+    """Gives a function that shows a text after `doing`: in place on a terminal or in a notebook, else as occasional lines.
 
-    Outside a notebook it is written to stderr. `show`: whether it is shown at all.
+    Outside a notebook it writes to stderr. `show`: whether anything is shown at all.
     """
     notebook = NotebookCell() if show and in_notebook() else None
     live = notebook is None and _is_terminal(sys.stderr)
@@ -130,7 +130,7 @@ def in_notebook() -> bool:
 
 
 def _is_terminal(stream: TextIO | None) -> bool:
-    """Whether a stream is a terminal. A user's program may have closed it, or replaced it with anything."""
+    """Whether a stream is a terminal. The user's program may have closed it, or replaced it with another object."""
     try:
         return stream is not None and stream.isatty()
     except (AttributeError, ValueError, OSError):
@@ -138,14 +138,14 @@ def _is_terminal(stream: TextIO | None) -> bool:
 
 
 def _write_to_stderr(text: str) -> None:
-    """Write, or drop what cannot be written."""
+    """Write the text, or drop it if that fails."""
     with suppress(AttributeError, ValueError, OSError):
         sys.stderr.write(text)
         sys.stderr.flush()
 
 
 def _view(log_json: bool) -> tuple[ProgressView, float]:
-    """The way to show progress here, and how many seconds pass between two."""
+    """The way to show progress here, and the least seconds between two updates."""
     if log_json:
         return JsonEvents(), LINE_EVERY_S
     if in_notebook():
@@ -156,7 +156,7 @@ def _view(log_json: bool) -> tuple[ProgressView, float]:
 
 
 class DroppingView(ProgressView):
-    """Shows what can be shown, and drops the rest: standard output may be full, closed, or anything the user put there."""
+    """Shows progress, and drops errors: standard output may be full, closed, or replaced by the user."""
 
     def __init__(self, view: ProgressView) -> None:
         self._view = view
@@ -178,9 +178,9 @@ class DroppingView(ProgressView):
 
 
 class RateLimitedView:
-    """Shows the first progress, then at most one in `every_s`, and the last one. A new note is printed at once.
+    """Shows the first progress, then at most one in `every_s`, and the last one.
 
-    While the run makes no update, lines that are not redrawn come ever less often.
+    A new note is printed at once. While the run makes no update, lines that aren't redrawn become less frequent.
     """
 
     def __init__(self, view: ProgressView, every_s: float, clock: Callable[[], float]) -> None:
@@ -190,7 +190,7 @@ class RateLimitedView:
         self._shown_s = -every_s
         self._waiting: Progress | None = None
         self._updates = -1
-        self._updated_s = 0.0  # since when it is this number of updates
+        self._updated_s = 0.0  # since when the number of updates has not changed
         self._note = ""
 
     def __call__(self, progress: Progress) -> None:
@@ -221,7 +221,7 @@ class PlainLines(ProgressView):
     """Plain lines, for logs, pipes and batch systems."""
 
     def show(self, progress: Progress) -> None:
-        """Print one line. Which part is the slowest, and what went wrong, is said at the end."""
+        """Print one line; at the end also which part is the slowest, and what went wrong."""
         ended = bool(progress.stop_reason)
         said = slowest_part(progress.stages) if ended else who_waits(progress)
         parts = [main_figures(progress), said, went_wrong(progress.ledger) if ended else ""]
@@ -239,7 +239,7 @@ class NotebookCell:
         self._handle: Any = None
 
     def show(self, text: str, html: str) -> None:
-        """Show this instead of what was shown before. `text` is for where no HTML can be shown."""
+        """Replace the display by this. `text` is for notebooks that can't show HTML."""
         content = {"text/plain": text, "text/html": html}
         if self._handle is None:
             from IPython.display import display
@@ -327,7 +327,7 @@ def main_figures(progress: Progress) -> str:
 
 
 def block_rows(progress: Progress, returns: Sparkline) -> dict[str, str]:
-    """What a block shows below its head, as text by name. `returns`: of the run so far."""
+    """The rows of a block below its head, as text by name. `returns`: returns of the run so far."""
     best = progress.best
     speed = f"{per_second(progress.steps_per_s)} a second"
     evaluated = "" if best is None else f"best evaluation {best[0]:,.1f} at {best[1]:,} env steps"
@@ -344,7 +344,7 @@ def block_rows(progress: Progress, returns: Sparkline) -> dict[str, str]:
 
 
 def how_far(progress: Progress) -> tuple[float | None, str]:
-    """The share of the run that is done, and what to say of it. Of one that ended early no share, but why it ended."""
+    """The share of the run that is done, and words about it. For a run that ended early, no share, and why it ended."""
     took = _clock_time(progress.wall_s)
     if progress.stop_reason == ALL_STEPS_DONE:
         return 1.0, f"100%  done in {took}"

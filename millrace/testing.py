@@ -1,4 +1,4 @@
-"""Tests of what a user writes. `check_algorithm` finds the mistakes of an algorithm; use it with pytest or by itself.
+"""Tests for user code. `check_algorithm` finds mistakes of an algorithm; use it with pytest or by itself.
 
 >>> from millrace.algorithms import PPO
 >>> from millrace.testing import check_algorithm
@@ -32,14 +32,14 @@ def check_algorithm(algorithm: type, *, learns: bool = True, **settings: Any) ->
     - `Config`, the methods, and the shapes and dtypes of weights and metrics are as they must be;
     - `update` calls `pulse`, changes no array of the batch, and learns nothing from rows that are not valid;
     - the same seed and batches give the same bits, whatever the global random numbers are;
-    - a state that is saved and loaded into a new object goes on bit for bit;
+    - a saved state that is loaded into a new object continues bit for bit;
     - `roll_back` restores everything, also after an update that stopped in the middle;
     - a loss that is not finite is raised;
-    - it learns the identity environment, where the right action is what is observed.
+    - it learns the identity environment, where the right action equals the observation.
 
     Arguments:
         algorithm: The class.
-        learns: Whether to try the last of these, which takes longest.
+        learns: Whether to check the last of these, which takes longest.
         **settings: Settings of the algorithm, by name, in place of their defaults.
 
     Raises `AlgorithmMistakes`, which is an AssertionError, with one line for each mistake.

@@ -1,4 +1,4 @@
-"""`millrace bench`: start the benchmarks as a process of their own. They use this package and are not installed with it."""
+"""`millrace bench`: start the benchmarks in their own process. They use this package and are not installed with it."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ def run(argv: list[str]) -> int:
         if asks_for_help(argv):
             show_help("bench", f"{COMMANDS['bench'].about.capitalize()}.", {})
         raise UsageError("bench: not part of the installed package; run it in a clone of the repository (make bench)")
-    # The repository alone is added to the path, and not this folder, whose modules are not ours (-P).
+    # Only the repository is added to the path, and not the current folder, whose modules aren't millrace's (-P).
     path = os.pathsep.join(filter(None, [str(repository), os.environ.get("PYTHONPATH")]))
-    flags = [flag for flag in argv if flag != "--debug"]  # which is a flag of `millrace` itself
+    flags = [flag for flag in argv if flag != "--debug"]  # a flag of `millrace` itself
     command = [sys.executable, "-P", "-m", "benchmarks.program", *flags]
     with subprocess.Popen(command, env={**os.environ, "PYTHONPATH": path}) as process:
         try:

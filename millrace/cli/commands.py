@@ -1,8 +1,10 @@
-"""The commands of `millrace`: their groups, and the function that runs each. Our extras have theirs in the same table.
+"""The commands of `millrace`: their groups, and the function that runs each.
 
-Rule: a command's module is imported when the command runs, so that `--help` answers at once, and a machine that has only a
-worker's packages can run the commands that need no others. Other packages install commands as entry points of the group
-`millrace.commands`, which are read for `--help` and for a name that isn't ours.
+The commands of millrace's extras are in the same table.
+
+Rule: a command's module is imported when the command runs, so that `--help` is fast, and a machine with only a worker's
+packages can run the commands that need no others. Other packages install commands as entry points of the group
+`millrace.commands`, which are read for `--help` and for a name that isn't built in.
 """
 # ruff: noqa: E501
 
@@ -70,13 +72,13 @@ def installed_commands() -> dict[str, Command]:
 
 
 def run_command(name: str, argv: list[str]) -> int:
-    """Run one of our commands with these arguments. Returns the exit code."""
+    """Run a built-in command with these arguments. Returns the exit code."""
     code: int = resolve_name(COMMANDS[name].runs)(argv)
     return code
 
 
 def run_installed(name: str, command: Command, argv: list[str]) -> int:
-    """Run a command of another package. Returns the exit code. Raises `UsageError` for whatever that package does wrong."""
+    """Run a command of another package. Returns the exit code. Raises `UsageError` for any mistake of that package."""
     what = f"command {name} {command.about}"
     function = own_callable(command.runs, what, "mine:run")
     try:

@@ -32,7 +32,7 @@ class NewFlags(KeysFlags, frozen=True, kw_only=True):
     server: Annotated[str, Flag("PUBLIC")] = ""
     """public key of a learner elsewhere: the token is for that learner, which must allow the key that is printed"""
     print_token: bool = False
-    """print the token and nothing else, as for a secret store; whoever sees it can join"""
+    """print only the token, for example for a secret store; anyone who sees it can join"""
 
 
 class ShowFlags(KeysFlags, frozen=True, kw_only=True):
@@ -84,7 +84,7 @@ def keys(argv: list[str]) -> list[str]:
             return [f"{flags.name} may connect"]
         case RevokeFlags():
             folder.revoke(flags.name, now)
-            return [f"{flags.name} is shut out; running learners cut it off within a second or two"]
+            return [f"{flags.name} is revoked; running learners disconnect it within a second or two"]
     return _show(folder)
 
 

@@ -19,7 +19,7 @@ class ListFlags(msgspec.Struct, frozen=True, kw_only=True):
     """List runs: state, return, progress and speed of each, the newest first."""
 
     folders: Annotated[tuple[Path, ...], Flag("[FOLDER ...]", positional=True)] = ()
-    """folders of runs, or run folders; if none is given, runs"""
+    """folders of runs, or run folders; default: the folder runs"""
 
 
 def list_runs(argv: list[str]) -> int:

@@ -1,8 +1,8 @@
 """The command line: finds the command, runs it, and turns an error into one line and an exit code.
 
 Rule: bad usage is one line on stderr and exit code 2. A run that failed is one line (and the worker's traceback below it,
-if there is one) and exit code 1. Ctrl-C is exit code 130. A traceback of millrace itself is shown with --debug only. A run
-goes on if standard error or standard output cannot be written; that text is dropped.
+if there is one) and exit code 1. Ctrl-C is exit code 130. A traceback of millrace itself is shown only with --debug. A run
+continues if standard error or standard output cannot be written; that text is dropped.
 """
 
 from __future__ import annotations
@@ -38,15 +38,15 @@ NOT_IN_WORKERS = {
 def main(argv: list[str] | None = None) -> int:
     """Run the command line. Returns the exit code."""
     argv = sys.argv[1:] if argv is None else argv
-    if argv[:1] == ["--debug"]:  # every command takes it among its own flags
+    if argv[:1] == ["--debug"]:  # every command accepts it among its own flags
         end = argv.index("--") if "--" in argv else len(argv)
         argv = [*argv[1:end], "--debug", *argv[end:]]
     with suppress(OSError):  # the current folder may have been deleted
         here = Path.cwd()
         if any(map(is_run_folder, (here, *here.parents))):
-            sys.path[:] = [entry for entry in sys.path if entry not in ("", str(here))]  # nothing is imported from there
+            sys.path[:] = [entry for entry in sys.path if entry not in ("", str(here))]  # never import from there
         elif str(here) not in sys.path:
-            sys.path.insert(_end_of_installed(), str(here))  # so a user's module is found but hides no installed module
+            sys.path.insert(_end_of_installed(), str(here))  # so that a user's module is found but hides no installed module
     prepare_streams()
     with unfailing("stderr"):
         return _exit_code(argv)
@@ -55,7 +55,7 @@ def main(argv: list[str] | None = None) -> int:
 def _end_of_installed() -> int:
     """Where in `sys.path` the installed modules end: before a clone that millrace is installed from, else at the end.
 
-    A clone has more folders than `millrace`. A `learner.py` or `tests` of the user's must not be taken for one of them.
+    A clone has more folders than `millrace`, which must not hide the user's `learner.py` or `tests`.
     """
     if (INSTALLED_IN / "millrace" / "learner").is_symlink() and str(INSTALLED_IN) in sys.path:
         return len(sys.path) - 1 - sys.path[::-1].index(str(INSTALLED_IN))
@@ -63,7 +63,7 @@ def _end_of_installed() -> int:
 
 
 def _exit_code(argv: list[str]) -> int:
-    """Run the command line and print its error, if there is one."""
+    """Run the command line and print its error, if any."""
     try:
         exit_code = _dispatch(argv)
         sys.stdout.flush()
@@ -76,7 +76,7 @@ def _exit_code(argv: list[str]) -> int:
     except KeyboardInterrupt as interrupt:
         _print_error(last_line("millrace", interrupt, elsewhere=_elsewhere(argv)))
         return _failed(argv, 130)
-    except BrokenPipeError:  # nobody reads our output any more (`| head`), so a message is useless
+    except BrokenPipeError:  # nobody reads the output any more (`| head`), so a message is useless
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except OSError as error:
@@ -91,7 +91,7 @@ def _exit_code(argv: list[str]) -> int:
         if error.name not in NOT_IN_WORKERS:
             return _internal_error(argv, error)
         _print_error(
-            f"millrace: {argv[0]} needs {error.name}, which is not installed: worker, status and keys do without; "
+            f"millrace: {argv[0]} needs {error.name}, which is not installed: worker, status and keys don't need it; "
             "`pip install -e .` in millrace's clone installs the rest"
         )
         return _failed(argv, 2)
@@ -131,11 +131,11 @@ def _overview() -> str:
 
 
 def _print_error(line: str) -> None:
-    print(escaped(line), file=sys.stderr)  # it may quote what a worker said
+    print(escaped(line), file=sys.stderr)  # it may quote a worker
 
 
 def _elsewhere(argv: list[str]) -> bool:
-    """Whether this command line is that of a learner whose workers are started elsewhere: a resumed run stays one."""
+    """Whether this command line starts a learner whose workers are started elsewhere; a resumed run stays such a learner."""
     return argv[:1] == ["learner"]
 
 

@@ -8,7 +8,7 @@ from millrace.terminal import count_line
 
 
 def evaluate(argv: list[str]) -> int:
-    """Play, and print what the policy reached. Returns the exit code."""
+    """Play, and print the policy's result. Returns the exit code."""
     flags = parse_flags(EvaluateFlags, argv, "evaluate")
     from millrace.playing import play  # takes 0.2 s to import: not before the flags are known to be right
 

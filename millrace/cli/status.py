@@ -1,9 +1,9 @@
 """`millrace status ADDRESS|RUN`: ask a learner for the state of its run and print it. Needs only a worker's packages.
 
-Of a run that no process trains, the last state in its folder is printed.
+If no process trains the run, this prints the last state in its folder.
 
-Rule: everybody who may connect may ask, and asking changes nothing. If a learner does not answer within the deadline, the
-error is one line. Names that a peer has chosen cannot control the terminal.
+Rule: anyone who may connect may ask, and asking changes nothing. If a learner doesn't answer within the deadline, the error
+is one line. Names that a peer has chosen can't control the terminal.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class StatusFlags(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def run(argv: list[str]) -> int:
-    """Print it. Returns the exit code."""
+    """Print the status. Returns the exit code."""
     status(argv, sys.stdout)
     return 0
 
@@ -98,7 +98,7 @@ def status(argv: list[str], out: TextIO) -> None:
 
 
 def last_state(run: Path) -> RunLine | None:
-    """What is known of a run that nobody trains; None if somebody seems to, or it is no run."""
+    """The last state of a run that no process trains; None if one seems to train it, or it isn't a run."""
     line = read_line(run, time.time()) if is_run_folder(run) else None
     return None if line is None or line.state in ("training", "unreadable") else line
 
@@ -169,7 +169,7 @@ def last_in_json(line: RunLine) -> str:
 
 
 def as_table(status: Status) -> str:
-    """A line about the run, what holds it up, a table of its workers, how many there could be, and what went wrong."""
+    """A line about the run, who waits for whom, a table of its workers, how many there could be, and what went wrong."""
     late = any(worker.late_actions for worker in status.workers)
     wanted = f"workers: {workers_here(status)}\n" if status.workers_wanted else ""
     held_up = bottleneck(status.progress)

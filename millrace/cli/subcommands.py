@@ -1,4 +1,4 @@
-"""Commands that have commands of their own: which one is meant, and the help that lists them."""
+"""Commands with subcommands: which one is meant, and the help that lists them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Records = Mapping[str, type[msgspec.Struct]]
 
 
 def chosen_subcommand(command: str, about: str, records: Records, argv: Sequence[str]) -> tuple[str, list[str]]:
-    """The subcommand and what follows it. Raises `UsageError`, or SystemExit(0) after `--help`."""
+    """The subcommand and the words after it. Raises `UsageError`, or SystemExit(0) after `--help`."""
     name, *rest = argv or [""]
     if name in HELP_FLAGS:
         sys.stdout.write(_help(command, about, records))

@@ -1,6 +1,6 @@
-"""Shows the progress of a run that a command trains, and prints how it ended, and commands that go on with it.
+"""Shows the progress of a run that a command trains, and prints how it ended, and commands to continue with.
 
-Rule: output that cannot be written is dropped; the run goes on.
+Rule: output that cannot be written is dropped; the run continues.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class ShownRun:
     def __init__(self, argv: list[str], new: Config | None = None, command: str = "train") -> None:
         """`new`: the settings of a new run, whose origin is shown before its first progress.
 
-        `command`: that of millrace which resumes the run.
+        `command`: the millrace command that resumes the run.
         """
         self._log_json = any(typed.name == "log_json" for typed in typed_flags(argv))
         self._new = new
@@ -44,7 +44,7 @@ class ShownRun:
 
     @contextmanager
     def progress(self) -> Iterator[Watch]:
-        """Shows the progress that it is called with, while it is entered."""
+        """While it is entered, shows each progress that it is called with."""
         with unfailing("stdout"), progress_view(self._log_json) as watch:
             yield watch if self._new is None else _after_origin(self._new, watch)
 
@@ -59,7 +59,7 @@ class ShownRun:
 
 
 def _after_origin(config: Config, watch: Callable[[Progress], None]) -> Callable[[Progress], None]:
-    """The same function, which at first logs where the settings come from."""
+    """Wraps a function so that it first logs where the settings come from."""
     lines = iter([origin(config)])
 
     def logged(progress: Progress) -> None:
@@ -71,7 +71,7 @@ def _after_origin(config: Config, watch: Callable[[Progress], None]) -> Callable
 
 
 def result(summary: Summary) -> list[str]:
-    """How a run ended, and what its policy reached."""
+    """How a run ended, and its policy's results."""
     lines = [f"{summary.stop_reason}: {summary.env_steps:,} env steps in {summary.wall_s:.1f} s"]
     if summary.evaluation is not None:
         others = "" if summary.ended_by is None else ", on other episodes than those that ended the run"
@@ -82,7 +82,7 @@ def result(summary: Summary) -> list[str]:
 
 
 def next_commands(run: Path, summary: Summary | None, command: str) -> list[str]:
-    """Commands for a shell: look at the run, play its policy, and train it about twice as long if it made all its steps."""
+    """Shell commands: look at the run, play its policy, and, if it made all its steps, train it about twice as long."""
     where = shlex.quote(str(run))
     evaluated = None if summary is None else summary.evaluation
     against = " --against ANOTHER_RUN" if evaluated is not None and evaluated.score_interval is not None else ""

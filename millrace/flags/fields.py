@@ -1,7 +1,7 @@
 """Turns the fields of a record into flags.
 
 Rule: a field is a flag of the same name, with dashes. Its type says which values are allowed. `Annotated[..., Flag(...)]`
-says what neither name nor type can. A field that is a record of its own is no flag.
+says what neither name nor type can. A field that is itself a record isn't a flag.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ class Flag:
     """What a field says about its flag."""
 
     metavar: str = ""
-    """how the help shows its values; if empty, by the type"""
+    """how the help shows its values; if empty, the type decides"""
     alias: str = ""
     """another name"""
     positional: bool = False
     """an argument without a flag"""
     hidden: bool = False
-    """a process of millrace gives it to another one; the help does not show it"""
+    """one process of millrace passes it to another; the help doesn't show it"""
 
 
 class FlagField(NamedTuple):
@@ -46,7 +46,7 @@ class FlagField(NamedTuple):
 
     @property
     def written(self) -> str:
-        """As the command line names it."""
+        """Its name on the command line."""
         return self.metavar if self.flag.positional else f"--{self.name.replace('_', '-')}"
 
     @property
@@ -61,7 +61,7 @@ class FlagField(NamedTuple):
 
     @property
     def metavar(self) -> str:
-        """How the help shows the values; empty for a flag without."""
+        """How the help shows the values; empty for a flag without values."""
         if self.flag.metavar:
             return self.flag.metavar
         if self.flag.positional:

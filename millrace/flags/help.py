@@ -1,4 +1,4 @@
-"""The help of a command: its usage, what it does, and its flags in groups. Pure but for the width of the terminal."""
+"""The help of a command: its usage, what it does, and its flags in groups. Pure except for the width of the terminal."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from millrace.flags.fields import FlagField, fields_of
 
 WIDEST_COLUMNS = 120
 TEXT_COLUMN = 26  # where the texts begin
-NO_BREAK = "\0"  # a space where no line ends
+NO_BREAK = "\0"  # a space at which no line breaks
 
 Group = tuple[type[msgspec.Struct] | msgspec.Struct, Sequence[str]]
 """A record, or one with the values to show as defaults, and the names of the fields to show"""
@@ -28,11 +28,11 @@ class Entry(NamedTuple):
     default: Any
     """`msgspec.NODEFAULT` if there is none"""
     layered: bool
-    """whether the default may come from a preset or a file, so that a flag can also turn off what is on"""
+    """whether the default may come from a preset or a file, so that there is also a flag to turn it off"""
 
 
 def help_text(command: str, about: str, groups: Mapping[str, Group]) -> str:
-    """The help. Arguments without a flag come first, whichever group they are in."""
+    """The help. Positional arguments come first, whatever their group."""
     width = min(shutil.get_terminal_size().columns, WIDEST_COLUMNS)
     entries = {title: list(_entries(*group)) for title, group in groups.items()}
     arguments = [entry for each in entries.values() for entry in each if entry.field.flag.positional]
@@ -60,7 +60,7 @@ def _entries(record: type[msgspec.Struct] | msgspec.Struct, names: Sequence[str]
 
 
 def _heading(entry: Entry) -> str:
-    """How a field is written: `--steps INT`."""
+    """The heading of a field: `--steps INT`."""
     field = entry.field
     if field.flag.positional:
         return field.metavar if entry.default is msgspec.NODEFAULT else f"[{field.metavar}]"
@@ -83,7 +83,7 @@ def _lines(entry: Entry, width: int) -> list[str]:
 
 
 def _folded(heading: str, width: int) -> list[str]:
-    """The lines of a heading. One that is too wide, as of many choices, goes on behind a comma."""
+    """The lines of a heading. One that is too wide, for example because of many choices, is folded after a comma."""
     if len(heading) <= width or "," not in heading[:width]:
         return [heading]
     end = heading.rindex(",", 0, width) + 1

@@ -1,8 +1,8 @@
 """Parses a command line: its words become the values of its flags.
 
-Rules: a word that begins with a dash and is no number is a flag; other words are values of the flag before them, as many as
-it takes, or arguments. A value that begins with a dash is written behind a sign: `--name=-x`. Of a flag that is given twice
-the last one counts. What the user does wrong is one line.
+Rules: a word that begins with a dash and isn't a number is a flag; other words are values of the flag before them, as many
+as it takes, or arguments. A value that begins with a dash is written after an equals sign: `--name=-x`. If a flag is given
+twice, the last one counts. Errors of the user are one line.
 """
 
 from __future__ import annotations
@@ -19,28 +19,28 @@ from millrace.flags.values import read_words
 from millrace.protocol.errors import UsageError, did_you_mean, unexpected_arguments
 
 HELP_FLAGS = ("-h", "--help")
-EVERYWHERE = (*HELP_FLAGS, "--debug")  # flags that every command takes
+EVERYWHERE = (*HELP_FLAGS, "--debug")  # flags that every command accepts
 
 FlagsT = TypeVar("FlagsT", bound=msgspec.Struct)
 
 
 class Typed(NamedTuple):
-    """A flag as it was typed, and the words behind it up to the next flag."""
+    """A flag as it was typed, and the words after it up to the next flag."""
 
     flag: str
     """`--net`; empty for the words before the first flag"""
     value: str | None
-    """behind a sign, as in `--net=64`; None without a sign"""
+    """the text after an equals sign, as in `--net=64`; None without one"""
     words: list[str]
 
     @property
     def name(self) -> str:
-        """As a field is named."""
+        """The name of its field."""
         return self.flag.lstrip("-").replace("-", "_")
 
 
 def parse_flags(record: type[FlagsT], argv: Sequence[str], command: str) -> FlagsT:
-    """The record that these words describe. Raises `UsageError`, or SystemExit(0) after `--help`."""
+    """The record that these words give. Raises `UsageError`, or SystemExit(0) after `--help`."""
     fields = fields_of(record)
     if asks_for_help(argv):
         show_help(command, " ".join((record.__doc__ or "").split()), {"flags": (record, list(fields))})
@@ -58,18 +58,18 @@ def show_help(command: str, about: str, groups: Mapping[str, Group]) -> NoReturn
 
 
 def asks_for_help(argv: Sequence[str]) -> bool:
-    """Whether the user asks how a command is used."""
+    """Whether the user asks for help."""
     return any(flag in argv for flag in HELP_FLAGS)
 
 
 def cut_at_dashes(argv: Sequence[str]) -> tuple[list[str], list[str]]:
-    """The words before `--`, and those behind it."""
+    """The words before `--`, and the words after it."""
     at = argv.index("--") if "--" in argv else len(argv)
     return list(argv[:at]), list(argv[at + 1 :])
 
 
 def typed_flags(argv: Sequence[str]) -> list[Typed]:
-    """The flags that were typed, in order, whatever flags there are. First come the words before the first flag."""
+    """The flags that were typed, in order, whether they exist or not, preceded by the words before the first flag."""
     flags = [Typed("", None, [])]
     for word in argv:
         if word in EVERYWHERE:
@@ -97,7 +97,7 @@ def given_values(
     command: str,
     hint: Callable[[str], str] = lambda name: "",
 ) -> dict[str, Any]:
-    """The values of the fields that are given. `hint` gets the name of an unknown flag, and ends the error's line."""
+    """The values of the given fields. `hint` gets the name of an unknown flag, and returns the end of the error's line."""
     given: dict[str, Any] = {}
     arguments: list[str] = []
     for typed in flags:
@@ -129,7 +129,7 @@ def given_values(
 
 
 def is_flag(word: str) -> bool:
-    """Whether a word is a flag, and no value."""
+    """Whether a word is a flag, not a value."""
     try:
         float(word)
     except ValueError:

@@ -1,7 +1,7 @@
 """How to type this program's name in the shell that started it, for lines that say what to type next.
 
-Rule: what is printed works when it is typed. `millrace` alone does where the shell finds this very program under that name;
-in a clone whose virtual environment is not active, it does not.
+Rule: printed commands work when typed. `millrace` works if the shell finds this very program under that name; in a clone
+whose virtual environment isn't active, it doesn't.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """Turns a word of `NAME VALUE ...` into a value, and a value into such a word.
 
-Rule: a word in which TOML reads a value is that value, as in a config file. Any other word is text. But a word in which
-another language reads a value (`None`, `True`, `.5`) is refused, because as text it would be a value that nobody meant: the
-text "False" is true.
+Rule: a word that is a value in TOML is that value, as in a config file. Any other word is text. But a word that is a value
+in another language (`None`, `True`, `.5`) is refused, because nobody means it as text: the text "False" is true.
 """
 
 from __future__ import annotations
@@ -18,12 +17,12 @@ from millrace.protocol.errors import UsageError
 IN_TOML = {
     "true": "true", "yes": "true", "on": "true", "false": "false", "no": "false", "off": "false", "nan": "nan",
 }  # fmt: skip
-"""What to write for a word of another language, in small letters."""
+"""What to write for a word of another language, in lower case."""
 NOTHING = ("none", "null", "nil", "undefined")
 
 
 def read_word(word: str) -> object:
-    """The value of a word. Raises `UsageError` for a word that is a value in another language; it says what to write."""
+    """The value of a word. Raises `UsageError`, which says what to write, for a word that is a value in another language."""
     try:
         # in a table of one line, so that the word can neither begin a comment nor another key
         table = tomllib.loads(f"one = {{value = {word}}}")
@@ -38,12 +37,12 @@ def read_word(word: str) -> object:
 
 
 def as_text(word: str) -> str:
-    """What to type in a shell for the text of this word, whatever TOML would read in it."""
+    """What to type in a shell for this word as text, whatever it means in TOML."""
     return one_line(shlex.quote(_in_toml(word)), 60)
 
 
 def written(value: object) -> str:
-    """The word in which `read_word` reads this value."""
+    """The word that `read_word` reads as this value."""
     try:
         if isinstance(value, str) and read_word(value) == value:
             return value
@@ -63,7 +62,7 @@ def _in_toml(value: object) -> str:
 
 
 def _what_to_write(word: str) -> str:
-    """What has the value in TOML that this word has in another language; empty if it has none there."""
+    """The TOML for the value that this word has in another language; empty if it has none."""
     if word.lower() in IN_TOML:
         return f"write {IN_TOML[word.lower()]}"
     if word.lower() in NOTHING:

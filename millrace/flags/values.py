@@ -1,8 +1,8 @@
 """Turns words of a command line, or a keyword argument, into the value of a field, and values into a record.
 
 Rules: a whole number may be written as 1e6 or 1_000_000, and several as 64 64 or 64,64. The values of a table are written as
-in TOML (toml_words.py); those of any other field are read as its type. Values of Python and TOML are not read: the text
-"2.5" is no number.
+in TOML (toml_words.py); those of any other field are parsed as its type. Values from Python and TOML are not parsed: the
+text "2.5" isn't a number.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ RecordT = TypeVar("RecordT", bound=msgspec.Struct)
 
 
 def read_words(field: FlagField, words: Sequence[str]) -> Any:
-    """The value that these words say. Raises `UsageError`."""
+    """The value that these words give. Raises `UsageError`."""
     if field.optional and list(words) in (["none"], ["None"]):
         return None
     match get_origin(field.kind):
@@ -56,7 +56,7 @@ def read_words(field: FlagField, words: Sequence[str]) -> Any:
 
 
 def with_whole_numbers(field: FlagField, value: Any) -> Any:
-    """A value with the whole numbers that a user wrote as text or as a float, if the field has such; else as it is."""
+    """The value, with whole numbers that the user wrote as text or as a float converted, if the field has whole numbers."""
     if not field.whole:
         return value
     if not field.many:
@@ -81,9 +81,9 @@ def _whole(value: Any) -> Any:
 
 
 def convert(values: Mapping[str, Any], record: type[RecordT], origins: Mapping[str, str]) -> RecordT:
-    """The record of these values of Python's or TOML's. Raises `UsageError`.
+    """The record of these values from Python or TOML.
 
-    `origins`: what an error calls each value, by its name: `--max-lag`, or `my.toml: max_lag`.
+    Raises `UsageError`. `origins`: how an error refers to each value, by its name: `--max-lag`, or `my.toml: max_lag`.
     """
     try:
         return msgspec.convert(values, record, dec_hook=_path)
@@ -95,14 +95,14 @@ def convert(values: Mapping[str, Any], record: type[RecordT], origins: Mapping[s
 
 
 def _path(kind: Any, value: object) -> Path:
-    """The path that text says. `kind` is `Path`, the only type of a field that msgspec does not know."""
+    """The path in a text. `kind` is `Path`, the only field type that msgspec doesn't know."""
     if not isinstance(value, str | os.PathLike):
         raise TypeError("Expected `text or a path`")
     return Path(value)
 
 
 def what_was_expected(message: str, hint: Any) -> str:
-    """What a value should have been, from msgspec's message and the type of the field."""
+    """What was expected of a value, from msgspec's message and the type of the field."""
     if message.startswith("Invalid enum value") or (hint is not None and is_choice(hint)):
         return f"expected one of {', '.join(choices(hint))}"
     text = message.partition(" - at ")[0].replace(" | null", ' or "none"').replace("`object`", "table")

@@ -1,1 +1,1 @@
-"""What starts a learner, with workers on this machine or elsewhere. Learner and workers do not import it."""
+"""Starts a learner, with workers on this machine or elsewhere. Learner and workers don't import it."""

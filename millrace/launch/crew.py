@@ -44,7 +44,7 @@ class Crew:
 
     count: int = 0
     evaluating: int = 0
-    """the last so many of them only evaluate"""
+    """this many of them, the last ones, only evaluate"""
     logs: Path | None = None
     """the folder of their logs; None: they write to this process's stderr"""
     cores: Sequence[int] = ()
@@ -56,7 +56,7 @@ class Crew:
         return int(worker.removeprefix("w")) >= self.count - self.evaluating
 
     def log_of(self, worker: str) -> Path | None:
-        """The file for what this worker writes to stderr."""
+        """The file for this worker's stderr."""
         return None if self.logs is None else self.logs / f"{worker}.log"
 
     def descriptors_of(self, worker: str) -> InheritedDescriptors | None:
@@ -74,7 +74,10 @@ class Crew:
 
 
 def crew_of_run(config: Config, run: Path) -> Crew:
-    """The workers of a run on this machine, whose logs are in the run folder. Raises `UsageError` if they can't be there."""
+    """The workers of a run on this machine, whose logs are in the run folder.
+
+    Raises `UsageError` if the logs can't be there.
+    """
     count = config.workers + config.eval_workers
     if config.transport == "inproc":
         return Crew(count, config.eval_workers)
@@ -83,7 +86,7 @@ def crew_of_run(config: Config, run: Path) -> Crew:
 
 
 def _log_folder(run: Path) -> Path:
-    """The folder of the workers' logs, which are files of ours, or are made."""
+    """The folder of the workers' logs, which are regular files or don't exist yet."""
     try:
         logs = subfolder(run, "workers")
         for log in logs.glob("*.log"):
@@ -98,8 +101,8 @@ def worker_cores(config: RolloutConfig) -> list[int]:
 
     New weights wake all workers at once, while the learner still runs. Linux then often puts two workers on one core and
     leaves another core idle, for too short a time to move them. If there are fewer workers than cores, they are not
-    pinned: Linux finds a free core for each, and pinned workers could share a core with the workers of another run. Nor are
-    they with a lag, where it gains nothing.
+    pinned: Linux finds a free core for each, and pinned workers could share a core with the workers of another run. With a
+    lag they aren't pinned either, because it gains nothing.
     """
     if not hasattr(os, "sched_setaffinity"):
         return []

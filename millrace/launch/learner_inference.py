@@ -1,8 +1,8 @@
 """A pool whose workers only step env copies: the policy acts in this process, for all copies at once.
 
 The learner collects from a single worker, which is a thread of this process. The env copies of this worker belong to a
-vector environment, whose workers are processes. So tickets, ledger, rows, checkpoints and errors are those of every run, and
-a lane gets the same seeds and random numbers as in a worker that acts itself.
+vector environment, whose workers are processes. So tickets, ledger, rows, checkpoints and errors work as in every run, and a
+lane gets the same seeds and random numbers as in a worker that acts itself.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ NEVER_S = 1e9  # the timeout of an order that may take any time
 
 @dataclass(frozen=True)
 class ActingSettings:
-    """What acts in this process, and on which env copies."""
+    """Settings of acting in this process, and of its env copies."""
 
     copies: VectorEnvSettings
     lanes: int
@@ -64,7 +64,10 @@ class ActingSettings:
 
 
 def settings_of_run(config: Config, env: EnvSpec, where: BindSettings, workers: int) -> ActingSettings:
-    """Those of a training run, whose workers join at `where` if they are started elsewhere. `workers`: to wait for."""
+    """The settings of a training run, whose workers join at `where` if they are started elsewhere.
+
+    `workers`: how many to wait for.
+    """
     copies = VectorEnvSettings(
         env,
         config.envs,
@@ -90,7 +93,7 @@ def settings_of_run(config: Config, env: EnvSpec, where: BindSettings, workers: 
 
 
 def _longest_order_s(config: Config) -> float:
-    """How long an order may take: to make and to reset every copy. A worker whose environment hangs is ended before that."""
+    """How long an order may take: making and resetting every copy. A worker whose environment hangs is ended before that."""
     timeouts = config.call_timeouts()
     each_s = 2 * timeouts.start_s + timeouts.step_s
     return each_s * config.envs if timeouts.start_s and timeouts.step_s else NEVER_S
@@ -100,7 +103,7 @@ class SteppingPool:
     """A pool whose policy acts in a thread of this process. It is a `millrace.launch.worker_pool.WorkerPool`."""
 
     def __init__(self, settings: ActingSettings, stepping: VectorEnvPool, own: ActingPool) -> None:
-        """`stepping`: where workers step. `own`: where the thread joins."""
+        """`stepping`: the pool of stepping workers. `own`: the pool that the thread joins."""
         self._settings = settings
         self._stepping = stepping
         self._own = own
@@ -110,12 +113,12 @@ class SteppingPool:
 
     @property
     def bound(self) -> Bound:
-        """Where the workers join that step."""
+        """The address where the stepping workers join."""
         return self._stepping.bound
 
     @contextmanager
     def start(self, crew: Crew, before: LobbySettings) -> Iterator[Lobby]:
-        """The lobby of the workers that step: of the crew, as many as there are copies for."""
+        """The lobby of the stepping workers: as many of the crew as there are copies for."""
         self._before = before
         with self._stepping.start(crew, before) as lobby:
             try:
@@ -135,14 +138,14 @@ class SteppingPool:
         return Lobby(self._own.bound.link, processes, self._before)
 
     def report(self, status: Callable[[float], Status]) -> None:
-        """`millrace status` asks where workers join, and the hub of the run is elsewhere."""
+        """Answer `millrace status` at the address where workers join, because the run's hub listens elsewhere."""
         assert self._env is not None, "begin comes first"
         self._env.hub.status_of_run = status
 
     def stop(self, within_s: float) -> None:
         """Stop the thread, then the workers that step for it."""
         if self._thread is not None:
-            self._thread.ask_to_leave()  # `stop` asks a second time: then the worker leaves at once
+            self._thread.ask_to_leave()  # `stop` asks a second time, so that the worker leaves at once
             self._thread.stop(within_s)
         if self._env is not None:
             self._env.close()
@@ -163,7 +166,7 @@ class SteppingPool:
 
 @contextmanager
 def open_stepping_pool(settings: ActingSettings) -> Iterator[SteppingPool]:
-    """Bind the address where workers join that only step. Raises `UsageError`."""
+    """Bind the address where the stepping workers join. Raises `UsageError`."""
     with open_worker_pool(BindSettings(), "inproc") as own, ExitStack() as of_env:
         yield SteppingPool(settings, open_vector_env_pool(settings.copies, of_env), own)
 
@@ -215,19 +218,20 @@ def acting_policy(spec: PolicySpec, device: str, images: ActingDtype) -> Policy:
 
 
 class _BeforeWaits:
-    """Call it before each wait for `env`: it calls the pulse during the wait. The first wait is for workers to join.
+    """Call it before each wait for `env`: it calls the pulse during the wait.
 
-    Rule: a wait raises `NoWorkers` once no worker has been there for `timeout_s`, however long an order may take.
+    The first wait is for workers to join. Rule: a wait raises `NoWorkers` once there has been no worker for `timeout_s`,
+    however long an order may take.
     """
 
     def __init__(self, env: ZmqVectorEnv, workers: int, timeout_s: float) -> None:
         self._env = env
         self._workers = workers
         self._timeout_s = timeout_s
-        self._there_s = 0.0  # when a worker was there, or the wait began
+        self._there_s = 0.0  # when there was last a worker, or the wait began
 
     def __call__(self, pulse: Pulse) -> None:
-        """A wait begins."""
+        """Begin a wait."""
         self._there_s = monotonic()
         self._env.hub.while_waiting = partial(self._during, pulse)
         if self._workers:

@@ -25,7 +25,7 @@ from millrace.workers.supervise.supervisor import STOP_WITHIN_S
 
 @dataclass(frozen=True)
 class PlayingWorkers:
-    """Which workers play."""
+    """The workers that play."""
 
     workers: int = 2
     """Number of local workers to start."""
@@ -42,7 +42,7 @@ class PlayingWorkers:
 
 @contextmanager
 def policy_player(policy: SavedPolicy, which: PlayingWorkers, watch: Callable[[str], None]) -> Iterator[PolicyPlayer]:
-    """A player with its workers. `watch` gets how far it is. Raises `UserFacingError`, or `KeyboardInterrupt`."""
+    """A player with its workers. `watch` gets the progress. Raises `UserFacingError`, or `KeyboardInterrupt`."""
     with ExitStack() as stack:
         interrupts = stack.enter_context(Interrupts())
         if which.inference == "learner" or which.transport == "inproc":
@@ -103,5 +103,5 @@ def _pool(policy: SavedPolicy, which: PlayingWorkers) -> AbstractContextManager[
 
 
 def _log_folder(which: PlayingWorkers, stack: ExitStack) -> Path | None:
-    """A folder for the logs of workers that are started here, which is removed at the end."""
+    """A folder for the logs of local workers, which is removed at the end."""
     return None if which.bind else Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="millrace-")))

@@ -1,4 +1,4 @@
-"""The address at which local workers join: of a socket file, of TCP on loopback, or within this process.
+"""The address where local workers join: a socket file, TCP on loopback, or within this process.
 
 Rule: a socket file is in its own folder, which only this user can enter (0700). The folder is removed with it.
 """
@@ -13,7 +13,7 @@ from contextlib import ExitStack
 
 from millrace.protocol.errors import UsageError, safe_repr
 
-LONGEST_FOLDER = 80  # bytes of its path: that of a socket file in it has 107 at most
+LONGEST_FOLDER = 80  # bytes of its path: the path of a socket file in it has at most 107
 
 
 def private_address(transport: str, stack: ExitStack) -> str:

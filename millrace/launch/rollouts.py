@@ -35,9 +35,9 @@ def start(
     listens: bool,
     past: PastRollouts | None = None,
 ) -> tuple[Hub, RunSpec, DescribedEnv]:
-    """A hub whose workers have joined, with its run and environment. Closing `resources` releases all that was acquired.
+    """A hub whose workers have joined, with its run and environment. Closing `resources` releases everything.
 
-    `listens`: wait for workers elsewhere at `config.bind`, and start none. Raises `UserFacingError`.
+    `listens`: wait for workers elsewhere at `config.bind`, instead of starting some. Raises `UserFacingError`.
     """
     workers = workers_to_wait_for(config, None if listens else config.workers)
     code = env.called_code or ("a policy's factory" if isinstance(policy, OwnPolicy) else "")

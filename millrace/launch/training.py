@@ -1,4 +1,4 @@
-"""A run: the learner in this process, and workers that it starts on this machine or that join from elsewhere."""
+"""A run: the learner in this process, and workers that are started on this machine or join from elsewhere."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ log = logging.getLogger("millrace.learner")
 
 
 def train(config: Config, resume: Path | None, watch: Watch, env: EnvSpec | None = None, *, elsewhere: bool = False) -> Path:
-    """Train. Returns the run folder. `env`: the environment, if the settings do not name one that workers find.
+    """Train. Returns the run folder. `env`: the environment, unless the settings name one that workers find.
 
     `elsewhere`: the workers are started elsewhere and join at `config.bind`. Raises `UserFacingError`, or `Interrupted` if
     the user stopped the run.
@@ -53,7 +53,7 @@ def _train(config: Config, resume: Resumption | None, watch: Watch, env: EnvSpec
     stepping = min(config.workers, config.envs) if acts else config.workers
     workers = workers_to_wait_for(config, None if elsewhere else stepping)
     with ExitStack() as stack:
-        # A run to resume is locked before the address is bound: of two learners of one run, the second is told so.
+        # A run to resume is locked before the address is bound, so that a second learner of the run gets the right error.
         folder = None if resume is None else stack.enter_context(run_folder(config, resume))
         pool = stack.enter_context(_pool(config, env, workers, elsewhere=elsewhere))
         observer = stack.enter_context(prometheus_observer(config))
@@ -67,9 +67,9 @@ def _train(config: Config, resume: Resumption | None, watch: Watch, env: EnvSpec
         lobby = pool.begin(known.described, masked=known.spaces.masked)
         interrupts = Interrupts(config.grace_s)
         stack.callback(lambda: pool.stop(interrupts.at_most(STOP_WITHIN_S)))
-        folder = folder or stack.enter_context(run_folder(config, None))  # not before a worker elsewhere has come
+        folder = folder or stack.enter_context(run_folder(config, None))  # not before a worker elsewhere has joined
         from millrace.learner.open_run import (
-            open_run,  # imports PyTorch, as was done while a worker described the environment
+            open_run,  # imports PyTorch, unless it was imported while a worker described the environment
         )
 
         with interrupts, one_thread():

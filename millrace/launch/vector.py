@@ -1,6 +1,6 @@
 """Start a vector environment: with worker processes on this machine, or with workers that are started elsewhere.
 
-Rule: whatever happens, no worker, socket file or folder of ours is left behind.
+Rule: whatever happens, no worker, socket file or folder is left behind.
 """
 
 from __future__ import annotations
@@ -76,35 +76,37 @@ def make_vec(
 
     Args:
         env: anything `gymnasium.make` takes, a callable that returns an environment, or a list with one of these for each
-            env copy. What only your script or notebook has (a callable, an id that it registers) is code: it is sent over
-            TCP only to workers that have a key.
-        num_envs: number of env copies; by default 1, or the length of the list. With several agents, as PettingZoo's
-            environments have, each of a copy has a row of its own, and the attribute `num_envs` counts rows; see `step`.
+            env copy. If only your script or notebook has the environment (as a callable or a registered id), it is sent as
+            code: over TCP only to workers that have a key.
+        num_envs: number of env copies; by default 1, or the length of the list. With several agents, as in PettingZoo's
+            environments, each agent of a copy has its own row, and the attribute `num_envs` counts rows; see `step`.
         workers: number of worker processes to start on this machine; by default one for each core that this process may
             use, at most `num_envs`. They end with the vector environment.
-        lanes: number of groups of env copies. A group lives in one worker. By default there is one for each worker.
-        bind: an address for workers that are started elsewhere with `millrace worker ADDRESS`. The default is local workers.
+        lanes: number of groups of env copies. A group is in one worker. By default there is one for each worker.
+        bind: an address for workers that are started elsewhere with `millrace worker ADDRESS`. By default, local workers are
+            started.
         keys: the folder of the keys. An address that other machines can reach needs keys; they are made if there are none.
         insecure: use no keys.
-        advertise: the host name by which other machines reach this one.
-        transport: how messages travel to local workers. With `inproc` the worker is a thread of this process,
+        advertise: host name of this machine for other machines.
+        transport: how messages are sent to local workers. With `inproc` the worker is a thread of this process,
             which then runs the environment. Otherwise only workers do.
-        shared_memory: local workers get actions and return results through shared memory. It is faster; results are equal.
+        shared_memory: local workers get actions and return results through shared memory, which is faster and gives equal
+            results.
         autoreset_mode: as in gymnasium: "NextStep", "SameStep" or "Disabled".
         observation_mode: as in gymnasium: with "different", the bounds of observations may differ between env copies, and a
             tuple has the observation spaces of the batch and of a single copy.
         on_worker_loss: "truncate" returns the env copies of a lost worker as truncated, with `worker_lost` in their infos,
             and continues with new copies on another worker. "raise" raises `WorkerLost`.
-        timeout: seconds that a worker may take to answer; then it is given up.
-        max_env_failures: how many deaths of workers in the environment's code are survived, counted as in a training run: in
-            a row and, in proportion to env copies and hours, within an hour.
+        timeout: seconds that a worker may take to answer; after that it counts as lost.
+        max_env_failures: how many times workers may die in the environment's code, counted as in a training run: in a row
+            and, in proportion to env copies and hours, within an hour.
         copy: return copies of the observations. Without it the next step overwrites them.
         render_mode: passed on to the environment.
         wrappers: applied to every env copy in its worker, the first one innermost: classes, functions, or names as
             "gymnasium.wrappers:FlattenObservation".
         kwargs: passed on to the environment.
 
-    A worker elsewhere is also given up if it sends no heartbeat for 5 s while this process waits for it. A long step does
+    A worker elsewhere also counts as lost if it sends no heartbeat for 5 s while this process waits for it. A long step does
     not stop heartbeats, unless it holds Python's global interpreter lock. The time between two calls is not limited for
     local workers. Workers elsewhere wait for ten minutes; then they join again, and their env copies are lost.
 
@@ -146,7 +148,7 @@ def make_vec(
 
     def died(event: Failed) -> None:
         for lane in event.lanes if event.worked_s is not None else ():
-            deaths.collected(lane)  # every step is a result of its own
+            deaths.collected(lane)  # every step is a result by itself
         if line := deaths.count(event, time.monotonic()):
             logging.getLogger("millrace.learner").warning("%s", line)
 

@@ -1,11 +1,11 @@
 """The pool of workers of a learner: they are started here, or join from elsewhere.
 
 The order is: open the pool, which binds its address; make or open the folder that the workers write to; `start` the workers,
-or log how one is started elsewhere; let a worker in the lobby describe the environment; `begin` with those who collect.
+or log how to start one elsewhere; let a worker in the lobby describe the environment; `begin` with the workers that collect.
 
-Rule: whatever happens, no worker or thread outlives `start`, and no socket file or folder of ours outlives the pool. Workers
-that still run at the end of `start` are stopped at once. So whoever has let them work calls `stop` first, with the time that
-they may take.
+Rule: whatever happens, no worker or thread outlives `start`, and no socket file or folder outlives the pool. Workers that
+still run at the end of `start` are stopped at once. So code that lets them work calls `stop` first, with the time that they
+may take.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from millrace.workers.supervise.supervisor import Running, Supervisor
 from millrace.workers.supervise.worker_process import WorkerCommand, WorkerProcess
 from millrace.workers.worker_thread import WorkerThread
 
-STOP_BEFORE_RUN_S = 0.5  # if no run has begun: a worker in the constructor of its environment hears nothing
+STOP_BEFORE_RUN_S = 0.5  # if no run has begun: a worker in the constructor of its environment doesn't listen
 
 
 class WorkerPool(Protocol):
@@ -46,25 +46,26 @@ class WorkerPool(Protocol):
         ...
 
     def start(self, crew: Crew, before: LobbySettings) -> AbstractContextManager[Lobby]:
-        """The lobby of these workers, which are started, or join from elsewhere. Call it once.
+        """The lobby of these workers, which are started, or join from elsewhere.
 
-        `before`: settings that hold until the run begins.
+        Call it once. `before`: settings until the run begins.
         """
         ...
 
     def begin(self, described: DescribedEnv, *, masked: bool) -> Lobby:
-        """The run may begin. Returns the lobby of those who collect for it. Call it once.
+        """Let the run begin.
 
-        `described`: the environment, as one in the first lobby described it. `masked`: whether masks are used.
+        Returns the lobby of the workers that collect for it. Call it once. `described`: the environment as a worker in the
+        first lobby described it. `masked`: whether masks are used.
         """
         ...
 
     def report(self, status: Callable[[float], Status]) -> None:
-        """From now on, `millrace status` gets the answer of the run."""
+        """Answer `millrace status` with the run's status from now on."""
         ...
 
     def stop(self, within_s: float) -> None:
-        """Ask all that was started here to leave, and end what still runs after this time."""
+        """Ask all local workers and threads to leave, and end those that still run after this time."""
         ...
 
 
@@ -80,7 +81,7 @@ class ActingPool:
     processes: WorkerProcesses = field(default_factory=WorkerProcesses)
     """The workers that were started here."""
     lobby: Lobby | None = None
-    """Once they were."""
+    """Their lobby, once they were started."""
 
     @contextmanager
     def start(self, crew: Crew, before: LobbySettings) -> Iterator[Lobby]:
@@ -101,7 +102,7 @@ class ActingPool:
         return self.lobby
 
     def report(self, status: Callable[[float], Status]) -> None:
-        """Nothing is to do: the hub of the run answers at this address."""
+        """Do nothing: the hub of the run answers at this address."""
 
     def stop(self, within_s: float) -> None:
         """Stop the workers that were started here."""
@@ -119,9 +120,9 @@ def _started(bound: Bound, token: Token | None, crew: Crew, name: str) -> Runnin
 
 @contextmanager
 def open_worker_pool(where: BindSettings, transport: str, code: str = "") -> Iterator[ActingPool]:
-    """Bind `where.bind`, or without one an address of this transport for local workers.
+    """Bind `where.bind`, or if it is empty an address of this transport for local workers.
 
-    `code`: as of `millrace.learner.members.bound.bind`. Raises `UsageError`.
+    `code`: see `millrace.learner.members.bound.bind`. Raises `UsageError`.
     """
     with ExitStack() as resources:
         if where.bind:
@@ -159,7 +160,7 @@ class _LocalProcesses(WorkerProcesses):
         return self._supervisor.said()
 
     def left(self, *, collecting: bool) -> float:
-        if not self.expected:  # none was asked for: others join
+        if not self.expected:  # no local ones were requested: others join
             return math.inf
         return sum(not (collecting and self._crew.evaluates(name)) for name in self._supervisor.names)
 

@@ -98,7 +98,7 @@ def test_the_layout_is_the_declared_one() -> None:
         ):
             with pytest.raises(millrace.UsageError, match=message):
                 service.publish(wrong)
-        with pytest.raises(millrace.UsageError, match="expected initial values of your own"):
+        with pytest.raises(millrace.UsageError, match="expected your own initial values"):
             service.policy.initial()
 
 

@@ -315,7 +315,7 @@ def test_agents_that_do_not_act_at_every_step_are_refused(make: Any) -> None:
 
 
 def test_a_wrapper_of_gymnasiums_is_refused_with_agents() -> None:
-    with pytest.raises(UsageError, match=r"wrapper_class: expected none with agents; give PettingZoo's as wrappers="):
+    with pytest.raises(UsageError, match=r"wrapper_class: expected none with agents; pass PettingZoo wrappers as wrappers="):
         make_vec_env(RandomTeam, 2, wrapper_class=TenTimes, transport="inproc")
 
 

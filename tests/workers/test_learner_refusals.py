@@ -398,7 +398,7 @@ NO_ENVIRONMENT_CAN: dict[str, str] = {
     "and gymnasium makes their shapes equal",
     "{}: expected a dtype of whole numbers, got {}": "gymnasium refuses such a space",
     "{}: expected values that fit {}, got {} to {}": "gymnasium refuses such a space",
-    "Dict space: expected a key of its own for each of {} spaces, got {}": "keys of a dict differ",
+    "Dict space: expected a different key for each of {} spaces, got {}": "keys of a dict differ",
     "generators: expected one for each of {} spaces, got {}": "the worker describes the one of each space, or none",
     "rows of ticket {}: expected an episode below {}, got {}": COUNTS,
     "expected {} episodes, got {} and {} marks of cut ones": COUNTS,

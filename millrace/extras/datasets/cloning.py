@@ -1,10 +1,11 @@
-"""Cloning: before its first rollouts, a policy learns to act as demonstrations do, and its critic to predict their returns.
+"""Cloning: before its first rollouts, a policy learns to imitate demonstrations, and its critic to predict their returns.
 
     L = −E[log π(a|o)] + vf_coef · E[(V(o) − G)²]     (SAC and TD3: without the critic)
     G = Σ γⁱ r over the rest of the episode, + γᵏ V(its last observation) if it was truncated
 
-Rule: a gradient step depends on the demonstrations and on the algorithm's saved state alone, which counts the steps made. So
-cloning that was interrupted goes on with the same bits. Hence the order of each epoch is drawn from the seed and its number.
+Rule: a gradient step depends only on the demonstrations and the algorithm's saved state, which counts the steps made. So
+    interrupted cloning continues with the same bits. Therefore the order of each epoch is drawn from the seed and the
+    epoch's number.
 """
 
 from __future__ import annotations
@@ -28,15 +29,15 @@ from millrace.protocol.policy.torch_distributions import policy_log_prob
 from millrace.protocol.random_streams import Purpose, generator
 from millrace.protocol.rollout import Batch
 
-BATCH_SIZE = 64  # rows of a minibatch; that of updates is often larger, and here it would take more epochs
-LEARNING_RATE = 1e-3  # that of updates is often lower, so that they change little; here it would take more epochs
+BATCH_SIZE = 64  # rows of a minibatch; the batch size of updates is often larger, and would need more epochs here
+LEARNING_RATE = 1e-3  # that of updates is often lower, so that they change little; it would need more epochs here
 
 
 def clone(algorithm: Algorithm, episodes: Iterable[Batch], pulse: Callable[[], None]) -> dict[str, float]:
-    """Make those gradient steps of cloning these episodes (`clone_epochs`) that are not made yet.
+    """Make the gradient steps of cloning these episodes (`clone_epochs`) that have not been made yet.
 
     `episodes`: each a batch of one column. Calls `pulse`, which may save the state, between gradient steps. Returns the loss
-    over all steps, and how near the most probable actions are: `clone/loss`, and `clone/accuracy` (choices and bits) or
+    over all steps, and how close the most probable actions are: `clone/loss`, and `clone/accuracy` (choices and bits) or
     `clone/mean_absolute_error` (numbers), or both.
 
     Raises `UsageError` if the algorithm derives from neither `ActorCritic` nor `Continuous`, and `RunError` if a loss or a
@@ -73,8 +74,8 @@ def clone(algorithm: Algorithm, episodes: Iterable[Batch], pulse: Callable[[], N
 def center_critic(algorithm: ActorCritic, parts: Sequence[Demonstrations]) -> None:
     """Add a number δ to all values, so that the mean error over these steps is 0: E[V(o) + δ] = E[G + γᵏ δ].
 
-    Otherwise the critic would have to reach the level of the returns by gradient steps. They would saturate its units, which
-    then learn little in the updates. If γ is 1 and no episode was terminated, no δ does it, and nothing changes.
+    Otherwise the critic would have to reach the level of the returns by gradient steps, which would saturate its units, so
+    that they learn little in the updates. If γ is 1 and no episode was terminated, there is no such δ, and nothing changes.
     """
     error = weight = 0.0
     for rows in parts:
@@ -87,7 +88,7 @@ def center_critic(algorithm: ActorCritic, parts: Sequence[Demonstrations]) -> No
 
 
 def cloning_loss(algorithm: ActorCritic | Continuous, rows: Demonstrations) -> tuple[Tensor, Tensor]:
-    """The loss, a tensor of no dimension, and the params [B, P] of the action distribution."""
+    """The loss, a 0-dimensional tensor, and the params [B, P] of the action distribution."""
     inputs = _inputs(algorithm, rows)
     action = algorithm.tensor(rows.action)
     if isinstance(algorithm, Continuous):
@@ -104,7 +105,7 @@ def _inputs(algorithm: ActorCritic | Continuous, rows: Demonstrations) -> tuple[
 
 
 def _returns(algorithm: ActorCritic, rows: Demonstrations) -> Tensor:
-    """G [B] under the present critic, without a gradient."""
+    """G [B] with the current critic, without a gradient."""
     with torch.no_grad():
         last_value = algorithm.net.value(*algorithm.inputs(rows.obs(rows.last)))
     return algorithm.tensor(rows.returns) + algorithm.tensor(rows.discount) * last_value
@@ -116,7 +117,7 @@ def _parts(rows: Demonstrations, count: int) -> list[Demonstrations]:
 
 
 def _measured(algorithm: ActorCritic | Continuous, parts: Sequence[Demonstrations]) -> dict[str, float]:
-    """The metrics over all steps."""
+    """The metrics, over all steps."""
     size = sum(len(rows.at) for rows in parts)
     with torch.no_grad():
         sums = [_sums(algorithm, rows) for rows in parts]

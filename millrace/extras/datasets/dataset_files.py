@@ -1,8 +1,8 @@
 """Reads the files of a Minari dataset as data: its spaces from metadata.json, its episodes from main_data.hdf5.
 
-Rule: a dataset may come from a stranger. Nothing that it names is made, imported or called, and what metadata.json says is
-compared with the arrays before it is believed. (Minari itself makes the environment of a dataset that has no spaces, and so
-runs whatever its entry point names. It also follows links to other files, and lets Pillow open images of any format.)
+Rule: a dataset may come from a stranger. Nothing that it names is made, imported or called, and the content of metadata.json
+is checked against the arrays before it is trusted. (Minari itself makes the environment of a dataset that has no spaces, and
+so runs whatever its entry point names. It also follows links to other files, and lets Pillow open images of any format.)
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class StoredEpisode(NamedTuple):
 
 
 class _Metadata(msgspec.Struct):
-    """What is used of metadata.json."""
+    """The used part of metadata.json."""
 
     data_format: str
     total_episodes: Natural
@@ -177,7 +177,7 @@ def _read(stored: Any, rows: int, leaf: Leaf) -> Array:
         got = f"{dtype}{list(stored.shape)}"
         raise UnfitFile(f"{stored.name}: expected {expected}, got {got}")
     raw: Array = stored[()]
-    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite then is refused
+    with np.errstate(over="ignore", invalid="ignore"):  # values that become infinite are refused
         array = raw.astype(leaf.dtype, copy=False)
     if array.dtype.kind != "f" and (changed := array != raw).any():
         raise UnfitFile(f"{stored.name}: expected {leaf.dtype}, got {raw[changed][0]}")
@@ -196,7 +196,7 @@ def _read_images(stored: Any, shape: tuple[int, ...]) -> Array:
     for row, content in enumerate(stored):
         file = io.BytesIO(np.asarray(content, np.uint8).tobytes())
         try:
-            image = Image.open(file, formats=["JPEG"])  # of those that Pillow would recognize, one starts another program
+            image = Image.open(file, formats=["JPEG"])  # one of Pillow's other formats starts another program
         except UnidentifiedImageError:
             raise UnfitFile(f"{stored.name}: expected JPEG images, got others") from None
         if (image.size, image.mode) != ((width, height), mode):

@@ -1,6 +1,6 @@
-"""Demonstrations as arrays: what was observed and done, and the discounted rewards that followed. Pure.
+"""Demonstrations as arrays: observations, actions, and discounted returns. Pure.
 
-Rule: each observation is held once, so that images take no more memory than the dataset.
+Rule: each observation is stored once, so that images take no more memory than in the dataset.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ class Demonstrations(NamedTuple):
 
     leaves: tuple[Array, ...]
     at: npt.NDArray[np.int64]
-    """[B] where the observation is"""
+    """[B] index of the observation"""
     last: npt.NDArray[np.int64]
-    """[B] where the last observation of the episode is"""
+    """[B] index of the last observation of the episode"""
     action: Array
     """[B, *action] as rollouts store it"""
     returns: Floats
@@ -33,7 +33,7 @@ class Demonstrations(NamedTuple):
 
     @classmethod
     def of(cls, batches: Iterable[Batch], scaled: Callable[[Floats], Floats], gamma: float) -> Demonstrations:
-        """All steps of these episodes, each a batch of one column. `scaled`: makes rewards what the critic learns."""
+        """All steps of these episodes, each a batch of one column. `scaled`: scales rewards as for the critic."""
         leaves: list[list[Array]] = []
         rows: list[tuple[Array, ...]] = []
         start = 0
@@ -50,10 +50,10 @@ class Demonstrations(NamedTuple):
         return cls(tuple(map(np.concatenate, zip(*leaves, strict=True))), *columns)
 
     def select(self, some: Array) -> Demonstrations:
-        """These steps alone."""
+        """Only these steps."""
         columns: list[Any] = [column[some] for column in self[1:]]
         return Demonstrations(self.leaves, *columns)
 
     def obs(self, at: npt.NDArray[np.int64]) -> list[Array]:
-        """The observations that are there, [B, *leaf] each; `at` is `self.at` or `self.last`."""
+        """The observations at these indices, [B, *leaf] each; `at` is `self.at` or `self.last`."""
         return [leaf[at] for leaf in self.leaves]

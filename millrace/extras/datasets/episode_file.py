@@ -1,8 +1,8 @@
 """Appends episodes to the HDF5 file of a Minari dataset, in Minari's layout.
 
-Rule: HDF5 never learns that a write failed. If it does, as on a full disk, it cannot close the file, and the process ends in
-a segmentation fault. So HDF5 writes through a file that remembers the first error, and keeps in memory what could not be
-written until HDF5 has closed it. Only then the error is raised.
+Rule: HDF5 never learns that a write failed. Otherwise, for example on a full disk, it can't close the file, and the process
+    ends with a segmentation fault. So HDF5 writes through a file that remembers the first error, and keeps the unwritten
+    data in memory until HDF5 has closed it. Only then is the error raised.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from millrace.protocol.arrays import Array
 
 
 def append_episodes(path: Path, first: int, episodes: Sequence[Any]) -> None:
-    """Append episodes (Minari's `EpisodeBuffer`), of which the first one gets this number. With 0, the file is made.
+    """Append episodes (Minari's `EpisodeBuffer`); the first one gets this number.
 
-    Raises `OSError` if the file cannot be written; it is of no use then.
+    With 0, the file is made. Raises `OSError` if the file can't be written; it is then unusable.
     """
-    # Ctrl-C raises in the main thread, wherever that is. HDF5 must not see that either.
+    # Ctrl-C raises in the main thread, whatever it is doing. HDF5 must not see that either.
     with ThreadPoolExecutor(1, "recording") as writer:
         writer.submit(_append, path, first, episodes).result()
 
@@ -71,7 +71,7 @@ def _add(group: Any, name: str, data: Any) -> None:
 
 
 class _RememberingFile(io.RawIOBase):
-    """A file for h5py that every write seems to reach."""
+    """A file for h5py to which every write seems to succeed."""
 
     def __init__(self, descriptor: int) -> None:
         super().__init__()
@@ -79,10 +79,10 @@ class _RememberingFile(io.RawIOBase):
         """the first one"""
         self._descriptor = descriptor
         self._at = 0
-        self._unwritten: list[tuple[int, bytes]] = []  # where, what; in the order of the writes
+        self._unwritten: list[tuple[int, bytes]] = []  # offset and data, in the order of the writes
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        """Go to a place, counted from the beginning, from here, or from the end."""
+        """Go to an offset from the beginning, the current position, or the end."""
         match whence:
             case os.SEEK_CUR:
                 offset += self._at
@@ -118,7 +118,7 @@ class _RememberingFile(io.RawIOBase):
         return length
 
     def flush(self) -> None:
-        """Nothing waits to be written."""
+        """Do nothing: no write is buffered."""
 
     def close(self) -> None:
         """Close it. Some file systems say only now that there is no space."""
@@ -135,7 +135,7 @@ class _RememberingFile(io.RawIOBase):
             done += os.pwrite(self._descriptor, view[done:], self._at + done)
 
     def _tried(self, write: Callable[[], object]) -> bool:
-        """Whether it could be written. After the first error nothing more is."""
+        """Whether the write succeeded. After the first error, nothing more is written."""
         if self.error is None:
             try:
                 write()

@@ -1,10 +1,10 @@
 """Assembles whole episodes from the rows of rollouts. Pure: arrays in, arrays out.
 
 Rule: every valid row is in exactly one whole episode, or waits for its episode to end (`waiting`), or is counted as left out
-(`left_out`). A reset row is not part of an episode. An episode that spans several rollouts is assembled only if all of them
-arrived, in order, and each continues the one before, so no episode has a hole. (The first rollout of an incarnation does, if
-another worker goes on with the lane. A client that owns its loop makes steps between two rollouts: then the first row of the
-second one is not valid.)
+    (`left_out`). A reset row is not part of an episode. An episode that spans several rollouts is assembled only if all of
+    them arrived, in order, and each continues the previous one, so no episode has a gap. (The first rollout of an
+    incarnation does so if another worker continues the lane. A client that owns its loop makes steps between two rollouts:
+    then the first row of the second one is not valid.)
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class _LaneState:
     """The unfinished episodes of a lane."""
 
     incarnation: int
-    sequence: int  # of the next rollout
+    sequence: int  # sequence number of the next rollout
     running: list[list[_Fragment] | None] = field(default_factory=list)
     """[N] the unfinished episode of each env copy. It is None until the next end if its beginning is missing."""
     last_obs: tuple[Array, ...] = ()  # [N, *leaf] each
@@ -68,7 +68,7 @@ class _LaneState:
         return sum(len(fragment.reward) for fragments in self.running for fragment in fragments or ())
 
     def continued_by(self, rollout: Rollout) -> Bools:
-        """[N] whether it begins where the last one ended, with a reset row if, and only if, an episode ended there."""
+        """[N] whether the rollout begins where the last one ended, with a reset row exactly if an episode ended there."""
         continued: Bools = rollout.valid[0] != self.ended
         for last, leaf in zip(self.last_obs, rollout.obs, strict=True):
             continued &= (last == leaf[0]).reshape(len(last), -1).all(1)
@@ -81,7 +81,7 @@ class EpisodeAssembler:
     def __init__(self, to_env_action: Callable[[Array], tuple[Array, ...]]) -> None:
         """`to_env_action` converts the actions of a rollout [k, *action] to arrays [k, *part] that the environment took."""
         self.left_out = 0
-        """number of valid rows in episodes that cannot be whole, because a rollout was dropped or the lane moved"""
+        """number of valid rows of episodes that stay incomplete, because a rollout was dropped or the lane moved"""
         self._to_env_action = to_env_action
         self._lanes: dict[int, _LaneState] = {}
 
@@ -102,10 +102,10 @@ class EpisodeAssembler:
         begins = rollout.valid[0] & (rollout.sequence == 0)
         new: list[list[_Fragment] | None] = [[] if one else None for one in begins.tolist()]
         follows = lane is not None and (incarnation, rollout.sequence) == (lane.incarnation, lane.sequence)
-        if lane is None or not (follows or rollout.sequence == 0):  # a rollout between was dropped
+        if lane is None or not (follows or rollout.sequence == 0):  # a rollout in between was dropped
             self.left_out += lane.waiting if lane is not None else 0
             lane = self._lanes[rollout.lane] = _LaneState(incarnation, rollout.sequence, new)
-        else:  # another worker may go on with the lane, with some of its copies or with all
+        else:  # another worker may continue the lane, with some of its copies or all
             waiting = lane.waiting
             continued = lane.continued_by(rollout)
             running = [one if continued[n] else new[n] for n, one in enumerate(lane.running)]
@@ -125,7 +125,7 @@ class EpisodeAssembler:
         valid = rollout.valid[:, n]
         ended = rollout.terminated[:, n] | rollout.truncated[:, n]
         for t in np.flatnonzero(ended | ~valid).tolist():
-            if not valid[t]:  # the next row begins an episode; after the first row, only if it was to reset the copy
+            if not valid[t]:  # the next row begins an episode; after the first row, only if that row had to reset the copy
                 lane.running[n] = [] if t else lane.running[n]
                 start = t + 1
                 continue

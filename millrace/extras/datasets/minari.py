@@ -1,7 +1,7 @@
 """Writes a Minari dataset. Minari is an optional dependency and is imported only when it is needed.
 
-Rule: the dataset is complete, or there is none: if writing fails, everything that Minari made for it is removed. Episodes
-take at most about `CHUNK_BYTES` of memory. Images are stored unchanged, not as JPEG.
+Rule: the dataset is complete, or doesn't exist: if writing fails, everything that Minari made for it is removed. Episodes
+    take at most about `CHUNK_BYTES` of memory. Images are stored losslessly, not as JPEG.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from millrace.protocol.envs.spaces import make_unflatten
 from millrace.protocol.errors import RunError, UsageError, first_line
 
 CHUNK_BYTES = 64 * 2**20
-OF_NAMESPACE = "namespace_metadata.json"  # the file that makes a folder one of Minari's namespaces
+OF_NAMESPACE = "namespace_metadata.json"  # the file that marks a folder as a Minari namespace
 
 
 class MinariDataset:
@@ -58,8 +58,8 @@ class MinariDataset:
         self._id = dataset_id
         self._env = env
         self._about = about
-        self._storage: Any = None  # the dataset's files, once an episode is to be written
-        self._episodes = self._steps = 0  # that are in them
+        self._storage: Any = None  # the dataset's files, made with the first episode to write
+        self._episodes = self._steps = 0  # in these files
         self._chunk: list[Any] = []
         self._chunk_bytes = 0
 
@@ -142,7 +142,7 @@ class MinariDataset:
             action_space=self._env.action_space,
             env_spec=spec,
             data_format="hdf5",
-            jpeg_encoding=False,  # images as they were
+            jpeg_encoding=False,  # store images losslessly
         )
         about = {"dataset_id": self._id, "algorithm_name": "millrace", "description": self._about}
         storage.update_metadata(about | {"minari_version": minari.__version__})

@@ -1,6 +1,6 @@
 """Writes a .npy file with a row [observation, action] for each step: float32, flattened.
 
-Rule: the file is complete, or there is none.
+Rule: the file is complete, or doesn't exist.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Plays episodes with workers and keeps their rows. Each episode is a ticket of its own, and depends on its seed alone."""
+"""Plays episodes with workers and keeps their rows. Each episode has its own ticket, and depends only on its seed."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Played(NamedTuple):
     result: PlayedEpisode
     """its figures, and whether it was stopped because it was too long"""
     frames: list[Array]
-    """[H, W, 3] uint8 for each of the first observations, if they were asked for"""
+    """[H, W, 3] uint8 for each of the first observations, if requested"""
 
 
 class PlayedEpisodes:
@@ -52,7 +52,8 @@ class PlayedEpisodes:
     def until(self, steps: int) -> Iterator[tuple[RecordedEpisode, bool]]:
         """Episodes until they have this number of steps, and whether each was cut.
 
-        The last one is finished. Only if it would double the number of steps it is cut, and its last step marked truncated.
+        The last one is finished, unless it would double the number of steps: then it is cut, and its last step marked
+        truncated.
         """
         taken = 0
         while taken < steps:
@@ -65,7 +66,7 @@ class PlayedEpisodes:
                     break
 
     def play(self, number: int, longest: int, *, frames: bool = False) -> list[Played]:
-        """The next episodes, of at most `longest` steps each, with `frames` if wanted. There must be so many seeds."""
+        """The next episodes, of at most `longest` steps each, with `frames` if wanted. There must be enough seeds."""
         seeds = [next(self._seeds) for _ in range(number)]
         rows: list[list[EpisodeRows]] = [[] for _ in seeds]
         plan = EvaluationPlan(
@@ -87,7 +88,7 @@ class PlayedEpisodes:
         return played
 
     def _wanted(self, steps: int) -> int:
-        """Number of episodes to play next, if so many steps are missing."""
+        """Number of episodes to play next, if this many steps are missing."""
         if not self._episodes:
             return FIRST_EPISODES
         by_steps = -(-steps * self._episodes // self._steps)

@@ -1,8 +1,7 @@
 """Reads a Minari dataset as batches from which an algorithm can learn. Minari is an optional dependency.
 
-Rule: a dataset is used only if its observations and actions are those of the run's policy, and if all of its numbers are
-finite and of their spaces. Each episode becomes one batch with a single column, so its rows follow the row format and no row
-is left out.
+Rule: a dataset is used only if its spaces are those of the run's policy, and if all of its numbers are finite and in their
+spaces. Each episode becomes one batch with a single column, so its rows follow the row format and no row is left out.
 """
 
 from __future__ import annotations
@@ -73,7 +72,7 @@ class PriorDataset(PriorData):
                 raise UsageError(f"{where}: {name}: {why}")
         if (terminated | truncated)[:-1].any():
             raise UsageError(
-                f"{where}: expected an end in its last step alone, got one in step {int((terminated | truncated).argmax())}"
+                f"{where}: expected an end only in its last step, got one in step {int((terminated | truncated).argmax())}"
             )
         truncated = truncated.copy()
         truncated[-1] |= ~terminated[-1]

@@ -1,4 +1,4 @@
-"""What `millrace.record` and the command `record` start: episodes of a run's policy, played by workers, as a dataset."""
+"""`millrace.record` and the command `record`: episodes of a run's policy, played by workers, as a dataset."""
 
 from __future__ import annotations
 
@@ -11,11 +11,14 @@ from millrace.protocol.errors import UsageError
 
 
 def write_dataset(flags: RecordFlags, watch: ShowPlayed, given: Given | None = None) -> RecordedDataset:
-    """Write a dataset. Raises `UserFacingError`, or `KeyboardInterrupt` if the user stops it; then it leaves no files."""
+    """Write a dataset.
+
+    Raises `UserFacingError`, or `KeyboardInterrupt` if the user stops it; in both cases no files are left.
+    """
     saved = policy_to_play(flags, given)
     for found, why in ((saved.seats, f"{saved.env.id} has several agents"), (saved.spec.critic, "the run has critic_keys")):
         if found:
-            raise UsageError(f"record: {why}, which a dataset has not")
+            raise UsageError(f"record: {why}, which a dataset can't have")
     with policy_player(saved, playing_workers(flags, flags.workers, 1), watch) as player:
         return record_episodes(
             player, flags.run, flags.out, flags.steps, flags.seed, stochastic=flags.stochastic, npy=flags.npy

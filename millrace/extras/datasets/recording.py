@@ -1,6 +1,6 @@
 """Writes episodes of a run's policy as a Minari dataset and, if you ask, as a .npy file of rows.
 
-Rule: a dataset consists of whole episodes with raw rewards. It is complete, or there is none. Episodes are played one after
+Rule: a dataset consists of whole episodes with raw rewards. It is complete, or doesn't exist. Episodes are played one after
 another on one env copy, so that short episodes are not favored. Each has its own reset seed, which is stored with it. The
 last episode is finished, so a dataset may have more steps than requested. If this would double the number of steps, the
 episode is cut, and its last step is marked as truncated.
@@ -33,8 +33,8 @@ def record_episodes(
 ) -> RecordedDataset:
     """Have the workers of `player` play the policy of this run folder, and write a dataset of at least `steps` env steps.
 
-    `stochastic`: draw actions from the policy; otherwise take the most probable ones. `npy`: also write this file.
-    Raises `UserFacingError`; then it leaves no files.
+    `stochastic`: sample actions from the policy; otherwise take the most probable ones. `npy`: also write this file. Raises
+    `UserFacingError`; in that case no files are left.
     """
     if npy is not None and not npy.parent.is_dir():
         raise UsageError(f"{npy} cannot be written: no such folder {npy.parent}")

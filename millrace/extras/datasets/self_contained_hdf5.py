@@ -1,8 +1,7 @@
-"""Reads groups and arrays of an HDF5 file that may come from a stranger, and of no other file.
+"""Reads groups and arrays of an HDF5 file that may come from a stranger, and never of another file.
 
-Rule: nothing leads out of the file. A link is not followed, wherever it leads, and the data of an array are all in the
-file, compressed only by what h5py brings with it. So memory is bounded by the size of the file: an array has at most
-`MOST_EXPANSION` times as many bytes.
+Rule: nothing leads out of the file. No link is followed, and all data of an array must be in the file, compressed only with
+h5py's own filters. So memory is bounded by the size of the file: an array has at most `MOST_EXPANSION` times as many bytes.
 """
 
 from __future__ import annotations
@@ -16,8 +15,8 @@ from typing import Any, Self
 
 from millrace.learner.run_folder.regular_files import open_regular
 
-MOST_EXPANSION = 1_032  # deflate makes at most so many bytes of one; no other filter that is read makes more
-FILTERS = {1, 2, 3, 32_000}  # deflate, shuffle, fletcher32, lzf. Any other may be a plug-in, which the file would choose
+MOST_EXPANSION = 1_032  # the largest ratio of deflate; no other supported filter has a larger one
+FILTERS = {1, 2, 3, 32_000}  # deflate, shuffle, fletcher32, lzf. Any other may be a plug-in that the file would choose
 
 
 class UnfitFile(Exception):
@@ -28,7 +27,7 @@ class SelfContainedHDF5:
     """An open file. Its methods raise `UnfitFile`; h5py raises other errors, of several types, if the file is damaged."""
 
     def __init__(self, file: Any, most_bytes: int) -> None:
-        """`most_bytes`: of each of its arrays."""
+        """`most_bytes`: largest size of each array."""
         self.root = file
         self.most_bytes = most_bytes
 
@@ -83,7 +82,7 @@ class SelfContainedHDF5:
 
 
 def _is_whole(array: Any) -> bool:
-    """Whether the file has all data of an array. HDF5 returns a fill value for what was never written."""
+    """Whether the file has all data of an array. HDF5 returns a fill value for data that was never written."""
     if not array.chunks:
         return bool(array.id.get_storage_size() >= array.nbytes)
     sides = zip(array.shape, array.chunks, strict=True)

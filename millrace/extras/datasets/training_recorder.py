@@ -1,6 +1,6 @@
 """`--record`: a callback that writes the whole episodes of training as a Minari dataset.
 
-Rule: a dataset that cannot be written costs no training. It is removed, the run goes on, and fails at its end.
+Rule: a dataset that can't be written doesn't stop training. It is removed, the run continues, and fails at its end.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ log = logging.getLogger("millrace.learner")
 
 
 class TrainingRecorder(Callback):
-    """Writes every whole episode of training into a dataset, with the actions as they were taken.
+    """Writes every whole episode of training into a dataset, with the actions that the environment took.
 
-    Steps of episodes that cannot be whole are counted instead. Without a whole episode, no dataset is written.
+    Steps of incomplete episodes are counted instead. Without a whole episode, no dataset is written.
     """
 
     def __init__(self, dataset_id: str, env: DescribedEnv, run: RunSpec, about: str) -> None:
@@ -56,7 +56,8 @@ class TrainingRecorder(Callback):
     def on_end(self, progress: Progress) -> None:
         """Finish the dataset, and log one line that describes it.
 
-        Raises `RunError` if it could not be written, now or earlier, and nothing else ended the run; then it is removed.
+        Raises `RunError` if it could not be written, now or earlier, and nothing else ended the run; the dataset is then
+        removed.
         """
         if self._refused is None:
             self._finish()
@@ -77,7 +78,7 @@ class TrainingRecorder(Callback):
 
 
 class EnvironmentOfDataset(gymnasium.Env[Any, Any]):
-    """What Minari reads of an environment: its spaces and its spec. Nobody steps it."""
+    """The part of an environment that Minari reads: its spaces and its spec. It is never stepped."""
 
     def __init__(self, env: DescribedEnv, *, masked: bool = False) -> None:
         """`env`: the environment as a worker described it. `masked`: a mask in its observations is not recorded."""

@@ -1,8 +1,7 @@
 """`millrace evaluate --video`: greedy episodes as mp4 files. Workers play and render; this file only encodes.
 
-Rule: the episodes are the first ones that `millrace evaluate` plays with the same seed. A video has each frame. It is
-in the folder whole or not at all. Its name has the seed and the number of the episode, so the same episode overwrites its
-old video.
+Rule: the episodes are the first ones that `millrace evaluate` plays with the same seed. A video has every frame, and is
+    written atomically. Its name has the seed and the number of the episode, so the same episode overwrites its old video.
 """
 
 from __future__ import annotations
@@ -24,8 +23,8 @@ from millrace.protocol.errors import EnvironmentFailed, RunError, UsageError, fi
 
 AT_ONCE = 2  # episodes whose frames are in memory
 LONGEST_EPISODE = 20_000  # env steps; the worker sends frames of the first 1,500
-FRAMES_PER_S = 30  # if the environment names no rate
-# Bounds of the rate that an environment names, which a worker sends. moviepy writes two decimals.
+FRAMES_PER_S = 30  # if the environment doesn't name a rate
+# Bounds of the rate that a worker sends for its environment. moviepy writes two decimals.
 LEAST_FRAMES_PER_S = 0.01
 MOST_FRAMES_PER_S = 1_000
 FOLDER = "videos"
@@ -34,7 +33,7 @@ FOLDER = "videos"
 def prepare_videos() -> RecordVideos:
     """Let pygame render without a screen, and return `record_videos`. Call it before workers start.
 
-    Raises `UsageError` if no video could be made.
+    Raises `UsageError` if videos can't be made.
     """
     try:
         import moviepy  # noqa: F401
@@ -50,10 +49,9 @@ def record_videos(
 ) -> tuple[Evaluation, list[Path]]:
     """Have the workers of `player` play episodes, and write a video of each, whose name begins with `prefix`.
 
-    `seed`: of the episodes, as of `EvaluationPlan.of`. `max_steps`: env steps of all episodes together at most; each gets an
-    equal share, and at most `LONGEST_EPISODE`.
-    Returns the evaluation and the paths of the videos. Raises `UserFacingError`, with a one-line message, if videos cannot
-    be made.
+    `seed`: seed of the episodes; see `EvaluationPlan.of`. `max_steps`: largest number of env steps of all episodes together;
+    each gets an equal share, and at most `LONGEST_EPISODE`. Returns the evaluation and the paths of the videos. Raises
+    `UserFacingError`, with a one-line message, if videos cannot be made.
     """
     env_id = player.policy.env.id
     env = player.describe("rgb_array")
@@ -72,7 +70,7 @@ def record_videos(
         subfolder(run, FOLDER)
         with tempfile.TemporaryDirectory(dir=folder, prefix=".new-") as new:
             while len(results) < episodes:
-                at_once = max(AT_ONCE, len(player.teams))  # the episodes of a plan are shared out among the teams
+                at_once = max(AT_ONCE, len(player.teams))  # the episodes of a plan are divided among the teams
                 count = min(at_once, episodes - len(results))
                 for one in episodes_played.play(count, longest, frames=True):
                     video = Path(new, f"{prefix}seed-{seed}-episode-{len(results)}.mp4")

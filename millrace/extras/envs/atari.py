@@ -1,12 +1,12 @@
 """Atari games with the preprocessing of Mnih et al. (2015): every fourth screen, grayscale, 84 × 84, the last four.
 
-Rule: an observation is a stack of screens [4, 84, 84], whichever program steps the game. A single game, the vectorized
-form of the emulator and envpool differ only in their random numbers, and in the frames before an episode's first screen:
-zeros, except that envpool repeats the first screen.
+Rule: an observation is a stack of screens [4, 84, 84], whichever program steps the game. The single game, the emulator's
+vectorized form and envpool differ only in their random numbers, and in the frames before an episode's first screen: zeros,
+except that envpool repeats the first screen.
 
 Keyword arguments of the environment are the fields of `GameSettings`, and further arguments of the emulator. Scores with
-different settings cannot be compared. Life loss and clipped rewards are settings of training: `eval_env_kwargs` takes them
-back for evaluations.
+different settings cannot be compared. Life loss and clipped rewards are settings of training: `eval_env_kwargs` undoes them
+for evaluations.
 """
 
 from __future__ import annotations
@@ -42,19 +42,19 @@ class GameSettings:
     Sticky actions make games harder.
     """
     noop_max: int = 30
-    """A game starts with up to so many no-op actions, a random number. 0: it always starts in the same state."""
+    """A game starts with a random number of no-op actions, at most this many. 0: it always starts in the same state."""
     fire_on_reset: bool = False
-    """A game starts with the action FIRE, where the game has it."""
+    """Start a game with the action FIRE, if the game has it."""
     fire_after_life_loss: bool = False
-    """The action after each lost life is FIRE, where the game has it, whatever the policy chose. Otherwise the policy must
-    press it in games that wait for it, such as Breakout.
+    """After each lost life, take FIRE, if the game has it, whatever the policy chose. Otherwise the policy must press it in
+    games that wait for it, such as Breakout.
     """
     terminal_on_life_loss: bool = False
-    """An episode ends with each life, and the next one goes on with the same game. Returns are then those of lives:
-    evaluate without it. envpool makes no-op actions after each life.
+    """An episode ends with each life, and the next one continues the same game. Returns are then per life: evaluate without
+    it. envpool makes no-op actions after each life.
     """
     clip_rewards: bool = False
-    """Rewards are clipped to ±1. Returns are then no scores: evaluate without it."""
+    """Clip rewards to ±1. Returns are then not scores: evaluate without it."""
 
     @staticmethod
     def split(kwargs: dict[str, Any]) -> tuple[GameSettings, dict[str, Any]]:
@@ -110,14 +110,14 @@ def make_games(num_envs: int, **kwargs: Any) -> VectorEnv[Any, Any, Any]:
 
 
 class _Joystick(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """Takes the actions NOOP and FIRE also in a game with continuous actions (`continuous=True`)."""
+    """Accepts the actions NOOP and FIRE even in a game with continuous actions (`continuous=True`)."""
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         return self.env.step(JOYSTICK_FIRE * action if isinstance(action, int) else action)
 
 
 class _StartsGames(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """Presses FIRE for one screen after a reset, in games that have it."""
+    """Presses FIRE for one screen after a reset, in games with this action."""
 
     def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
         super().__init__(env)
@@ -132,12 +132,12 @@ class _StartsGames(gymnasium.Wrapper[Any, Any, Any, Any]):
 
 
 class _FiresAfterLives(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """Plays FIRE in the step after a lost life, in place of the action that it is given."""
+    """Plays FIRE in the step after a lost life, in place of the given action."""
 
     def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
         super().__init__(env)
         self._lives = 0
-        self._fires = False  # in the next step
+        self._fires = False  # whether to fire in the next step
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         first = self.env.reset(seed=seed, options=options)
@@ -154,12 +154,12 @@ class _FiresAfterLives(gymnasium.Wrapper[Any, Any, Any, Any]):
 
 
 class _VectorFiresAfterLives(VectorWrapper):
-    """The same for the emulator's vectorized form. A step that resets a game ignores its action."""
+    """Like `_FiresAfterLives`, for the emulator's vectorized form. A step that resets a game ignores its action."""
 
     def __init__(self, env: VectorEnv[Any, Any, Any]) -> None:
         super().__init__(env)
         self._lives = np.zeros(env.num_envs, int)
-        self._fires = np.zeros(env.num_envs, bool)  # in the next step
+        self._fires = np.zeros(env.num_envs, bool)  # whether to fire in the next step
         self._fire = JOYSTICK_FIRE if isinstance(env.single_action_space, Box) else FIRE
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
@@ -207,16 +207,16 @@ class _EndsWithLives(gymnasium.Wrapper[Any, Any, Any, Any]):
 
 
 class _StepAfterLives(VectorWrapper):
-    """Makes the step after a lost life one that only resets, as in a loop over copies: it has no reward and no end.
+    """Makes the step after a lost life only a reset, as in a loop over copies: it has no reward and no end.
 
-    The emulator goes on with the game in it, by the action of the policy. If the game, or a life, ends in that very step,
+    The emulator continues the game in this step, with the policy's action. If the game, or a life, ends in that very step,
     the next step ends the episode, which has one step.
     """
 
     def __init__(self, env: VectorEnv[Any, Any, Any]) -> None:
         super().__init__(env)
         self._ended = np.zeros(env.num_envs, bool)  # in the newest step
-        self._hidden = np.zeros(env.num_envs, bool)  # an end in the newest step that its row did not show
+        self._hidden = np.zeros(env.num_envs, bool)  # whether the newest step hid an end
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         self._ended[:] = self._hidden[:] = False

@@ -181,7 +181,7 @@ class CartDoublePendulum(gymnasium.Env[Floats, Floats]):
     Reward: 1 − 0.3 (x / track)² − 0.3 (θ² + φ²) / 2 angle_limit² − 0.05 action² of a step after which both links are up,
     so from 0.35 to 1; otherwise 0.
     Terminated: |x| above `track_m`, or |θ| or |φ| above `angle_limit_rad`, or a speed above `SPEED_LIMIT`. Truncated: never,
-    but `gymnasium.make` adds a time limit of 500 steps (10 s). With `linearised`, it moves as the linear model does.
+    but `gymnasium.make` adds a time limit of 500 steps (10 s). With `linearised`, it moves like the linear model.
     Other keyword arguments are those of `Physics`.
     """
 

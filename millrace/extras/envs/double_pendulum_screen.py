@@ -86,7 +86,7 @@ class Screen:
         draw.circle(canvas, "#f6f4ef", joint, 7)
 
     def _rod(self, start: tuple[float, float], end: tuple[float, float], color: str) -> None:
-        """A thick line whose ends are at right angles to it, which those of pygame's line are not."""
+        """A thick line with perpendicular ends, unlike pygame's line."""
         (x1, y1) = start
         (x2, y2) = end
         across = 8 / (math.hypot(x2 - x1, y2 - y1) or 1)

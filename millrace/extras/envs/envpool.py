@@ -1,8 +1,7 @@
 """envpool's compiled environments under gymnasium's ids.
 
 Rule: an id means the same environment as in gymnasium. Spaces that differ from gymnasium's are an error, and gymnasium's
-time limit applies. This file maps ids to envpool tasks and makes the env copies; the row format is kept by
-`envpool_copies.py`.
+time limit applies. This file maps ids to envpool tasks and makes the env copies; `envpool_copies.py` keeps the row format.
 """
 
 from __future__ import annotations
@@ -72,7 +71,7 @@ def envpool_spec(env: EnvSpec) -> EnvpoolSpec:
     try:
         task, options = _task_and_options(env, known)
         if task not in envpool.list_all_envs():
-            raise UsageError(f"environment {env.id}: envpool has none of this name; {instead_of_vector(env.id)}")
+            raise UsageError(f"environment {env.id}: envpool has no environment of this name; {instead_of_vector(env.id)}")
         with _ignore_warnings():
             made = envpool.make_spec(task, **options)
             observation = made.gymnasium_observation_space
@@ -80,7 +79,7 @@ def envpool_spec(env: EnvSpec) -> EnvpoolSpec:
             if isinstance(action, spaces.Box):  # envpool casts actions to float32
                 action = spaces.Box(action.low.astype(np.float32), action.high.astype(np.float32))
     except (TypeError, AssertionError) as error:
-        says = str(error).strip().partition("() ")  # the name of a function that takes no such argument
+        says = str(error).strip().partition("() ")  # the name of a function that doesn't take the argument
         raise UsageError(f"environment {env.id}: envpool cannot make it: {says[2] or says[0]}; use --vector loop") from error
     limit = options.get("max_episode_steps") or known.max_episode_steps or made.config.max_episode_steps
     return EnvpoolSpec(task, {**options, "max_episode_steps": min(limit + 1, MAX_EPISODE_STEPS)}, limit, observation, action)
@@ -89,7 +88,7 @@ def envpool_spec(env: EnvSpec) -> EnvpoolSpec:
 def _task_and_options(env: EnvSpec, known: gymnasium.envs.registration.EnvSpec) -> tuple[str, dict[str, Any]]:
     """Task and options in envpool: from the entry point's attribute `envpool`, or the same as in gymnasium.
 
-    The task is empty if the id of an envpool task was registered by another package: it is another environment.
+    The task is empty if another package registered the id of an envpool task, because it is another environment.
     """
     creator = load_env_creator(known.entry_point) if isinstance(known.entry_point, str) else known.entry_point
     if (translate := getattr(creator, "envpool", None)) is not None:

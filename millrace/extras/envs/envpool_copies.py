@@ -37,7 +37,7 @@ class EnvpoolCopies:
         self._activity = activity()
         self._env: VectorEnv[Any, Any, Any] | None = None
         self._read = make_flatten(self.observation_space)
-        self._truncated = np.zeros(copies, bool)  # [N] truncated here, which envpool does not know
+        self._truncated = np.zeros(copies, bool)  # [N] truncated here without envpool's knowledge
 
     def reset(self, seeds: Sequence[int], pulse: Pulse) -> Leaves:
         """Start episodes in all copies, with a seed for each."""
@@ -95,7 +95,7 @@ class EnvpoolCopies:
         raise CopyFailed(None, line="envpool's env copies have no attributes")
 
     def close(self) -> None:
-        """Close the pool and its threads. What it raises is ignored."""
+        """Close the pool and its threads, ignoring exceptions."""
         if self._env is not None:
             close_copy(self._env)
             self._env = None

@@ -33,7 +33,7 @@ def open_envpool(run: RunSpec, first: EnvCopy, pulse: Pulse) -> EnvpoolCopies:
 
 
 def native_spaces(env: EnvSpec) -> tuple[gymnasium.Space[Any], gymnasium.Space[Any]]:
-    """Observation and action space of one copy, of a vector environment that is made for it and closed."""
+    """Observation and action space of one copy, from a vector environment that is made for this and closed."""
     made = make_copy(FIRST_COPY, lambda: make_native(env, 1))
     spaces = made.single_observation_space, made.single_action_space
     close_copy(made)

@@ -58,7 +58,7 @@ class VectorCopies:
         self._batched = make_batched(self.action_space)
 
     def reset(self, seeds: Sequence[int], pulse: Pulse) -> Leaves:
-        """Start episodes in all copies, with a seed for each, or the first seed where the environment takes only one."""
+        """Start episodes in all copies, with a seed for each, or the first seed if the environment takes only one."""
         pulse()
         if len(seeds) != self._env.num_envs:
             raise UsageError(f"vector environment {self._env}: expected {len(seeds)} copies, got {self._env.num_envs}")
@@ -112,7 +112,7 @@ class VectorCopies:
             raise missing_leaf(None, observation, error) from error
 
     def assign(self, name: str, packed: bytes, pulse: Pulse) -> None:
-        """Set an attribute of the vector environment, or of each of its copies where it has them (`SyncVectorEnv`)."""
+        """Set an attribute of the vector environment, or of each of its copies if it has any (`SyncVectorEnv`)."""
         with self._activity.during(STEPPING):
             copies = getattr(self._env.unwrapped, "envs", None)
             if isinstance(copies, list | tuple):
@@ -127,5 +127,5 @@ class VectorCopies:
         return of_ended(facts_of_copies(self._facts, infos, self._env.num_envs), ended)
 
     def close(self) -> None:
-        """Close it. What it raises is ignored."""
+        """Close it, ignoring exceptions."""
         close_copy(self._env)

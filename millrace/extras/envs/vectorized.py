@@ -27,7 +27,7 @@ def make_native(env: EnvSpec, copies: int) -> VectorEnv[Any, Any, Any]:
 
 
 def check_unwrapped_id(env: EnvSpec, vector: str) -> None:
-    """Raises `UsageError` for what has no vectorized form: a callable, and anything in a wrapper."""
+    """Raises `UsageError` for environments without a vectorized form: a callable, and anything in a wrapper."""
     if env.wrappers:
         raise UsageError(
             f"environment {env.id}: vector {vector}: wrappers are applied to single env copies; use --vector loop"

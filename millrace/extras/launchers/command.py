@@ -17,7 +17,7 @@ ABOUT = "Start a learner and workers on a cluster. Put flags of `millrace learne
 
 
 def run(argv: list[str]) -> int:
-    """Print what starts it, or with Ray, train. Returns the exit code."""
+    """Print the manifest or script, or with Ray, train. Returns the exit code."""
     launcher, rest = chosen_subcommand("launch", ABOUT, LAUNCHERS, argv)
     match launcher:
         case "kubernetes":

@@ -1,4 +1,4 @@
-"""The command line of a launcher: its own flags, and behind `--` the flags of the learner that it starts.
+"""The command line of a launcher: its own flags, and after `--` the flags of the learner that it starts.
 
 Rule: settings that a cluster would refuse later are refused here, before anything is written or started.
 """
@@ -29,16 +29,16 @@ def read_flags(
     own, rest = cut_at_dashes(argv)
     flags = parse_flags(kind, own, f"launch {launcher}")
     if not DNS_LABEL.fullmatch(flags.name):
-        raise UsageError(f"name {flags.name!r}: expected small letters, digits and dashes, at most 40, as in my-run")
+        raise UsageError(f"name {flags.name!r}: expected lowercase letters, digits and dashes, at most 40, as in my-run")
     for flag in rest:
         if flag.partition("=")[0].removeprefix("--").replace("_", "-") in set_by_launcher:
-            raise UsageError(f"launch {launcher}: {flag} is the launcher's to set; leave it out")
+            raise UsageError(f"launch {launcher}: {flag} is set by the launcher; leave it out")
     read_config("learner", [flags.env, "--bind", "tcp://0.0.0.0:5555", *rest])  # without --resume
     return flags, rest
 
 
 def learner_flags(env: str, rest: Sequence[str], workers: int, *, bind: str, runs: str) -> list[str]:
-    """The flags of a learner on a cluster, for which so many `workers` are started.
+    """The flags of a learner on a cluster, for which this number of `workers` is started.
 
     It resumes the newest run, and waits ten minutes for workers to be started.
     """

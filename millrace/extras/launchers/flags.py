@@ -19,14 +19,14 @@ class LaunchFlags(msgspec.Struct, frozen=True, kw_only=True):
     workers: Count = 4
     """number of worker processes; with Ray, of actors"""
     name: str = "millrace"
-    """name of the run on the cluster: small letters, digits and dashes"""
+    """name of the run on the cluster: lowercase letters, digits and dashes"""
 
 
 class KubernetesFlags(LaunchFlags, frozen=True, kw_only=True):
     """Print a Kubernetes manifest with a learner and workers: millrace launch kubernetes ENV > k8s.yaml."""
 
     keys: str = ""
-    """key folder to write into the manifest as a Secret; the manifest is then secret itself"""
+    """key folder to write into the manifest as a Secret; then the manifest itself is secret"""
     learner_image: str = "millrace-learner"
     """image built from docker/Dockerfile, target learner, as the cluster finds it"""
     worker_image: str = "millrace-worker"
@@ -57,14 +57,14 @@ class SlurmFlags(LaunchFlags, frozen=True, kw_only=True):
     partition: str = ""
     """partition of the cluster; if not given, the cluster's default"""
     python: Path = Path()
-    """the Python interpreter that has millrace, on every node; if not given, the one that runs this"""
+    """the Python interpreter with millrace, on every node; if not given, the one that runs this command"""
 
 
 class RayFlags(LaunchFlags, frozen=True, kw_only=True):
     """Train with workers on a Ray cluster: the learner here, each worker in an actor (pip install ray)."""
 
     address: str = "auto"
-    """address of the cluster, as HOST:PORT; auto is the environment variable RAY_ADDRESS, or the cluster of this machine"""
+    """address of the cluster, HOST:PORT; auto is the environment variable RAY_ADDRESS, or the cluster of this machine"""
     processes: int = 1
     """worker processes in each actor; the actor takes as many of Ray's cores"""
     port: int = 5555

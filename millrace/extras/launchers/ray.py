@@ -1,7 +1,6 @@
 """`millrace launch ray`: the learner runs in this process, on a node of a Ray cluster; the workers run in Ray actors.
 
-Rule: an actor runs the worker program and nothing else. Only Ray restarts actors and chooses their nodes. When the
-learner has ended, the actors have ended, too.
+Rule: an actor runs only the worker program. Only Ray restarts actors and chooses their nodes. Actors end with the learner.
 """
 
 from __future__ import annotations

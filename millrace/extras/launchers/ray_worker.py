@@ -7,7 +7,7 @@ import os
 from millrace.protocol.keys.worker_token import TOKEN_VARIABLE
 from millrace.workers.__main__ import main as run_worker
 
-FINAL_EXIT_CODES = (0, 2)  # the learner asked it to leave, or refused it; after any other code it is started again
+FINAL_EXIT_CODES = (0, 2)  # the learner asked it to leave, or refused it; after any other code it is restarted
 
 
 class WorkerHost:

@@ -1,6 +1,6 @@
-"""Every number that metrics.jsonl and TensorBoard show: what it is called, its unit and its meaning. Pure.
+"""Every number in metrics.jsonl and TensorBoard: its label, unit and meaning.
 
-The dashboard and reference/metrics.md are made of it.
+Pure. The dashboard and reference/metrics.md are made from it.
 
 Rule: a number that millrace itself logs has an entry here. In a name, `NAME` stands for a name that the user chose.
 """
@@ -16,7 +16,7 @@ class Meaning(NamedTuple):
     unit: str
     text: str
     label: str = ""
-    """what it is called, where its name does not say it"""
+    """its label, if its name doesn't say it"""
 
 
 STEPS = "env steps"
@@ -39,7 +39,7 @@ METRICS: dict[str, dict[str, Meaning]] = {
     },
     "Evaluations": {
         "eval/mean_reward": Meaning(REWARD, "Mean return of the greedy episodes, in raw rewards.", "return of evaluations"),
-        "eval/env_steps": Meaning(STEPS, "With `--eval-workers`: those of the evaluated policy.", "env steps evaluated"),
+        "eval/env_steps": Meaning(STEPS, "With `--eval-workers`: env steps of the evaluated policy.", "env steps evaluated"),
         "eval/mean_ep_length": Meaning(STEPS, "Mean length of these episodes.", "episode length of evaluations"),
         "eval/NAME": Meaning("its own", "Mean over these episodes of a number of `--info-keys`."),
         "eval/NAME_missing": Meaning(EPISODES, "How many of these episodes did not report the number."),
@@ -47,16 +47,16 @@ METRICS: dict[str, dict[str, Meaning]] = {
     "Self-play": {
         "self_play/elo": Meaning("Elo", "Rating of the policy, 1200 at first, by episodes against snapshots and programs."),
         "self_play/snapshots": Meaning("versions", "Earlier versions of the policy that are kept.", "snapshots"),
-        "rollout/score": Meaning(NONE, "Share of the last 100 training episodes that were won; those that tie share it."),
+        "rollout/score": Meaning(NONE, "Share of the last 100 training episodes that were won; in a tie it is divided."),
         "eval/score": Meaning(
-            NONE, "Share of the evaluation's episodes that were won; those that tie share it.", "score of evaluations"
+            NONE, "Share of the evaluation's episodes that were won; in a tie it is divided.", "score of evaluations"
         ),
     },
     "Progress and speed": {
         "time/total_timesteps": Meaning(STEPS, "Env steps that updates have used: the x axis of the curves.", "env steps"),
         "time/iterations": Meaning("updates", "Updates so far.", "updates"),
         "time/time_elapsed": Meaning(
-            SECONDS, "Seconds of training, those before a resume included. Evaluations do not count.", "time of training"
+            SECONDS, "Seconds of training, including those before a resume. Evaluations do not count.", "time of training"
         ),
         "time/fps": Meaning(
             "env steps/s", "Env steps for each second of training, since this process started.", "env steps per second"
@@ -71,7 +71,7 @@ METRICS: dict[str, dict[str, Meaning]] = {
         "ledger/used": Meaning(TICKETS, "Tickets whose rollout an update used.", "tickets used"),
         "ledger/outstanding": Meaning(TICKETS, "Tickets that are neither used nor given up.", "tickets outstanding"),
         "ledger/lost": Meaning(
-            TICKETS, "Those whose worker was lost, left or sent an unusable rollout, or whose update failed.", "tickets lost"
+            TICKETS, "Their worker was lost, left or sent an unusable rollout, or their update failed.", "tickets lost"
         ),
         "ledger/transitions_received": Meaning(TRANSITIONS, "Env steps that reached the learner."),
         "ledger/transitions_used": Meaning(TRANSITIONS, "Env steps that updates used."),
@@ -84,7 +84,7 @@ METRICS: dict[str, dict[str, Meaning]] = {
             TRANSITIONS, "Env steps of rollouts that broke the row format or did not fit the run. They were dropped."
         ),
         "ledger/messages_bad": Meaning("messages", "Messages that could not be read.", "messages that could not be read"),
-        "ledger/late_actions": Meaning("actions", "Actions that came too late for a program that owns its loop."),
+        "ledger/late_actions": Meaning("actions", "Actions that arrived too late for a program that owns its loop."),
     },
     "Where the time goes (worker stages: all workers together)": {
         "stage/learner_wait": Meaning(SECONDS, "Time for which the learner waited for rollouts."),
@@ -97,7 +97,7 @@ METRICS: dict[str, dict[str, Meaning]] = {
         "stage/worker_wait": Meaning(SECONDS, "Time in which workers waited for a ticket or for weights."),
         "stage/worker_evaluate": Meaning(SECONDS, "Time in which workers played evaluations."),
     },
-    "Cloning, in a row of its own before the first update": {
+    "Cloning, in its own row before the first update": {
         "clone/loss": Meaning(NONE, "Loss of the cloned policy and its critic, on the whole dataset.", "loss of cloning"),
         "clone/accuracy": Meaning(NONE, "Discrete actions: fraction of the steps whose action is the most probable one."),
         "clone/mean_absolute_error": Meaning(NONE, "Box actions: error of the greedy ones; with replay, in [-1, 1]."),
@@ -105,14 +105,14 @@ METRICS: dict[str, dict[str, Meaning]] = {
     "Updates: all algorithms": {
         "train/learning_rate": Meaning(NONE, "Learning rate of this update."),
         "train/n_updates": Meaning(NONE, "PPO: epochs; with replay: gradient steps; others: updates.", "learning rounds"),
-        "train/grad_norm": Meaning(NONE, "Its norm before it is clipped, mean over the update.", "norm of the gradient"),
+        "train/grad_norm": Meaning(NONE, "Before clipping, mean over the update.", "norm of the gradient"),
     },
     "Updates: actor-critic algorithms": {
         "train/policy_gradient_loss": Meaning(NONE, "Loss of the policy. Mean over the gradient steps of the update."),
         "train/value_loss": Meaning(NONE, "Loss of the critic. Mean over the gradient steps of the update."),
         "train/entropy_loss": Meaning("nats", "Negative mean entropy of the policy."),
         "train/explained_variance": Meaning(
-            NONE, "Share of the variance of the targets that the critic predicted. 1: all of it."
+            NONE, "Share of the targets' variance that the critic predicted. 1: all of it."
         ),
         "train/std": Meaning(NONE, "Box actions: of the Gaussian, mean over the action's elements.", "standard deviation"),
         "train/approx_kl": Meaning("nats", "PPO: from the policy that acted, in the last epoch.", "estimated KL divergence"),
@@ -140,13 +140,16 @@ METRICS: dict[str, dict[str, Meaning]] = {
         "custom/NAME": Meaning("its own", "A number that a callback logs with `progress.log(\"NAME\", value)`."),
     },
 }  # fmt: skip
-"""The numbers in groups, each by the name under which it is logged"""
+"""The numbers in groups, by the names under which they are logged"""
 
 ENTRIES = {name: (title, meaning) for title, group in METRICS.items() for name, meaning in group.items()}
 
 
 def described(metric: str) -> tuple[str, Meaning]:
-    """Group and meaning of a number by the name under which it is logged, which may be any text. Its label is not empty."""
+    """Group and meaning of a number, from the name under which it is logged, which may be any text.
+
+    Its label is not empty.
+    """
     group, _, name = metric.partition("/")
     of_user = f"{group}/NAME_missing" if name.endswith("_missing") else f"{group}/NAME"
     of_anybody = OWN, Meaning(NONE, f"Logged as {metric}.")
@@ -155,5 +158,5 @@ def described(metric: str) -> tuple[str, Meaning]:
 
 
 def label(metric: str) -> str:
-    """What a number is called."""
+    """The label of a number."""
     return described(metric)[1].label

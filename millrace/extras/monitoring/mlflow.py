@@ -1,6 +1,7 @@
-"""Logs a run to MLflow: settings as parameters, metrics by env steps. A resumed run goes on in the same MLflow run.
+"""Logs a run to MLflow: settings as parameters, metrics by env steps.
 
-It uses a client of its own, so it neither starts nor ends the active run of `mlflow`.
+A resumed run continues in the same MLflow run. It uses its own client, so it neither starts nor ends the active run of
+`mlflow`.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ class MlflowCallback(RowCallback):
     """
 
     def __init__(self, experiment: str = "millrace", tracking_uri: str | None = None, every_s: float = 1.0) -> None:
-        """`tracking_uri`: that of `mlflow`, if not given. `every_s`: least number of seconds between two rows.
+        """`tracking_uri`: by default, the one of `mlflow`. `every_s`: least number of seconds between two rows.
 
         Raises `UsageError` if MLflow is not installed.
         """

@@ -1,8 +1,8 @@
 """The learner's `/metrics` for Prometheus, by Prometheus's naming conventions.
 
-Rule: the training loop publishes a whole snapshot in one assignment now and then, and never waits. The server's threads
-read the newest snapshot and nothing else. Labels have few values: ours, and at most `MAX_FACTS` names of `info_keys`; no
-names of workers, paths or keys.
+Rule: the training loop publishes a whole snapshot in one assignment now and then, and never waits. The server's threads read
+    only the newest snapshot. Labels have few values: millrace's own, and at most `MAX_FACTS` names of `info_keys`; no names
+    of workers, paths or keys.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class MetricsCollector(Collector):
     """Keeps the newest snapshot and turns it into metrics."""
 
     def __init__(self, config: Config, clock: Callable[[], float] = time.time, observed: Observed | None = None) -> None:
-        """`clock` tells seconds since 1970. `observed` is what there is to show until the hub is observed."""
+        """`clock`: seconds since 1970. `observed`: the snapshot to show until the hub is observed."""
         self._clock = clock
         self._observed = observed
         self._updates_before: int | None = None  # updates of earlier learners, if the run was resumed
@@ -87,8 +87,8 @@ class MetricsCollector(Collector):
         """All metrics. Called in a thread of the server, once for each scrape."""
         yield InfoMetricFamily("millrace_build", "Versions of millrace and of what decides its results.", versions())
         yield InfoMetricFamily("millrace_run", "What is trained.", self._about)
-        # Also before the first worker is there: an autoscaler may start none without it.
-        wanted = "Workers with which each lane has one of its own: the number to scale to."
+        # Also before the first worker has joined: an autoscaler may start none without it.
+        wanted = "Workers with which each lane has its own: the number to scale to."
         yield GaugeMetricFamily("millrace_workers_wanted", wanted, self._wanted)
         if (observed := self._observed) is not None:
             at_s, hub = observed
@@ -149,13 +149,13 @@ def _of_facts(facts: Mapping[str, FactMean]) -> Iterator[Metric]:
 
 def _of_ledger(ledger: Mapping[str, int]) -> Iterator[Metric]:
     yield CounterMetricFamily("millrace_tickets_issued", "Tickets dealt, since the run began.", ledger["issued"])
-    yield _by_reason("millrace_tickets", "Tickets by what became of them.", {name: ledger[name] for name in TICKET_ENDS})
+    yield _by_reason("millrace_tickets", "Tickets by how they ended.", {name: ledger[name] for name in TICKET_ENDS})
     yield GaugeMetricFamily("millrace_tickets_outstanding", "Tickets neither used nor given up.", ledger["outstanding"])
     yield CounterMetricFamily(
         "millrace_transitions_received", "Transitions that reached the learner.", ledger["transitions_received"]
     )
     ends = {name: ledger[f"transitions_{name}"] for name in TRANSITION_ENDS}
-    yield _by_reason("millrace_transitions", "Transitions by what became of them.", ends)
+    yield _by_reason("millrace_transitions", "Transitions by how they ended.", ends)
     yield GaugeMetricFamily("millrace_transitions_waiting", "Transitions not yet used.", ledger["transitions_waiting"])
 
 
@@ -183,7 +183,7 @@ def _of_link(hub: HubSnapshot) -> Iterator[Metric]:
     ledger = hub.ledger.counts()
     refused = {"unreadable": ledger["messages_bad"], "key": hub.refused_messages}
     yield _by_reason("millrace_refused_messages", "Messages that were not used, by reason.", refused)
-    late = "Actions that came too late for a program that owns its loop."
+    late = "Actions that arrived too late for a program that owns its loop."
     yield CounterMetricFamily("millrace_late_actions", late, ledger["late_actions"])
     yield CounterMetricFamily("millrace_refused_handshakes", "Connections that were not let in.", hub.refused_handshakes)
 

@@ -151,7 +151,7 @@ def test_a_dataset_that_is_not_there_is_refused_with_those_that_are(store: Store
         ({"actions": np.array([0, 1, 2])}, "episode 0: action: expected 0 to 1, got 2 at step 2"),
         (
             {"terminations": np.array([True, False, True])},
-            "episode 0: expected an end in its last step alone, got one in step 0",
+            "episode 0: expected an end only in its last step, got one in step 0",
         ),
     ],
 )

@@ -218,8 +218,8 @@ SUTTON = EnvSpec("CartPole-v1", {"sutton_barto_reward": True, "max_episode_steps
             EnvSpec("test/Other-v0"),
             r"vector native: its copies have other spaces than itself, Box.*\(2,\).*; use --vector loop",
         ),
-        ("envpool", EnvSpec(f"{TOY}Countdown-v0"), "envpool has none of this name; use --vector loop"),
-        ("envpool", EnvSpec("Acrobot-v1"), "envpool has none of this name"),  # it means somebody else's
+        ("envpool", EnvSpec(f"{TOY}Countdown-v0"), "envpool has no environment of this name; use --vector loop"),
+        ("envpool", EnvSpec("Acrobot-v1"), "envpool has no environment of this name"),  # it means somebody else's
         ("envpool", EnvSpec.of(Countdown), "vector envpool: expected an id that gymnasium registers, got a callable"),
         ("envpool", SUTTON, "cannot make it: .*'sutton_barto_reward'; use --vector loop"),
         ("envpool", EnvSpec("CartPole-v1", {"max_episode_steps": 3}), ""),

@@ -57,10 +57,10 @@ def launched(capsys: pytest.CaptureFixture[str], *argv: str) -> str:
         ([""], "launch: which command? expected one of kubernetes, slurm, ray"),
         (["kubernetes"], "missing"),
         (["kubernetes", "CartPole-v1", "--workers", "0"], "workers: expected int >= 1, got 0"),
-        (["kubernetes", "CartPole-v1", "--name", "My_Run"], "expected small letters, digits and dashes"),
+        (["kubernetes", "CartPole-v1", "--name", "My_Run"], "expected lowercase letters, digits and dashes"),
         (["kubernetes", "CartPole-v1", "--", "--lerning-rate", "1"], "unknown flag --lerning-rate"),
-        (["kubernetes", "CartPole-v1", "--", "--bind=tcp://*:1"], "--bind=tcp://*:1 is the launcher's to set"),
-        (["kubernetes", "CartPole-v1", "--", "--metrics-bind", "*:1"], "--metrics-bind is the launcher's to set"),
+        (["kubernetes", "CartPole-v1", "--", "--bind=tcp://*:1"], "--bind=tcp://*:1 is set by the launcher"),
+        (["kubernetes", "CartPole-v1", "--", "--metrics-bind", "*:1"], "--metrics-bind is set by the launcher"),
         (["slurm", "CartPole-v1", "--folder", "/a folder"], "sbatch takes no spaces, quotes or %"),
         (
             ["slurm", "CartPole-v1", "--folder", "~nobody.here/x"],

@@ -99,7 +99,7 @@ def test_a_module_in_a_run_folder_is_not_imported(
         (run / "policy.json").write_text(json.dumps(card | ({"env": name} if named == "env" else {"wrappers": [name]})))
         readers.append(load_policy)
     for read in readers:
-        with pytest.raises(UsageError, match=f"{name} would be imported from the run folder, and nothing is"):
+        with pytest.raises(UsageError, match=f"{name} would be imported from the run folder, which is refused"):
             read(run)
 
 

@@ -355,7 +355,7 @@ def test_a_worker_at_another_kind_of_server_says_so(net: Net) -> None:
 def test_a_worker_at_a_name_that_nobody_knows_says_so(net: Net) -> None:
     worker = net.worker("tcp://no.such.host.invalid:5555", token())
     assert worker.problem == ConnectionProblem(
-        "the host of tcp://no.such.host.invalid:5555 is not known here; is it spelt right?"
+        "the host of tcp://no.such.host.invalid:5555 is not known here; is it spelled right?"
     )
 
 

@@ -112,7 +112,7 @@ def test_one_that_is_different_here_is_refused() -> None:
         ("no.such:one", "no module named no; is it installed, or its folder on PYTHONPATH?"),
         (f"{HERE}:one", "module tests.support.users_code.custom_encoders has no one"),
         (f"{HERE}:not_a_module", "expected it to return a torch.nn.Module, got int"),
-        (f"{HERE}:with_statistics", "expected parameters alone, got the buffer 1.running_mean; use LayerNorm, say"),
+        (f"{HERE}:with_statistics", "expected only parameters, got the buffer 1.running_mean; use LayerNorm, say"),
         (f"{HERE}:of_doubles", "expected float32 parameters, got another dtype in weight"),
         (f"{HERE}:of_one_dimension", r"expected float32[2, K] of two observations, got torch.float32[2]"),
         (f"{HERE}:wants_more", "raised RuntimeError: mat1 and mat2 shapes cannot be multiplied"),

@@ -236,7 +236,7 @@ def test_a_default_stands_at_the_end_alone() -> None:
 def test_what_is_wrong_in_a_head_is_named(content: object, says: str) -> None:
     with pytest.raises(BadMessage) as caught:
         decode_to_learner(head(content))
-    assert str(caught.value) == f"head is not a message of ours: ValidationError: {says}" or says.startswith("Invalid")
+    assert str(caught.value) == f"head is not a message of millrace: ValidationError: {says}" or says.startswith("Invalid")
     assert says in str(caught.value)
 
 
@@ -382,12 +382,12 @@ def test_the_hand_made_weights_are_good_ones() -> None:
         (head(None), "head is not a message of ours"),
         ([*sent(WEIGHTS), b"more"], "Weights: expected 2 arrays, got 3 frames"),
         (sent(WEIGHTS)[:-1], "array frame expected 1 to 1, got 2"),
-        (weights(["|O", [1], 2], bytes(8)), "array dtype expected one of ours"),
-        (weights(["<U3", [1], 2], bytes(12)), "array dtype expected one of ours"),
-        (weights([">f4", [3], 2], bytes(12)), "array dtype expected one of ours"),
-        (weights(["<f4,<f4", [1], 2], bytes(8)), "array dtype expected one of ours"),
-        (weights(["|V8", [1], 2], bytes(8)), "array dtype expected one of ours"),
-        (weights(["<c8", [1], 2], bytes(8)), "array dtype expected one of ours"),
+        (weights(["|O", [1], 2], bytes(8)), "array dtype expected a supported one"),
+        (weights(["<U3", [1], 2], bytes(12)), "array dtype expected a supported one"),
+        (weights([">f4", [3], 2], bytes(12)), "array dtype expected a supported one"),
+        (weights(["<f4,<f4", [1], 2], bytes(8)), "array dtype expected a supported one"),
+        (weights(["|V8", [1], 2], bytes(8)), "array dtype expected a supported one"),
+        (weights(["<c8", [1], 2], bytes(8)), "array dtype expected a supported one"),
         (weights([["<f4"], [3], 2], bytes(12)), "array expected [dtype, shape, index]"),
         (weights(["<f4", [3], 3], bytes(12)), "array frame expected 1 to 2"),
         (weights(["<f4", [3], 0], bytes(12)), "array frame expected 1 to 2"),

@@ -430,7 +430,7 @@ def test_packings_are_undone_in_one_order_only() -> None:
 def test_a_learner_that_cannot_decompress_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "zstandard", None)
     assert not has_zstd()
-    with pytest.raises(BadMessage, match="zstd was not asked for"):
+    with pytest.raises(BadMessage, match="zstd was not requested"):
         unpack_array(ZEROS, ["zstd"], U1, SHAPE)
 
 

@@ -116,8 +116,8 @@ def test_sighup_ends_a_run_as_sigterm_does(tmp_path: Path) -> None:
     running.send_signal(signal.SIGHUP)
     _, said = running.communicate(timeout=WITHIN_S)
     assert running.returncode == 130
-    resume = rf"\S*python\S* -m millrace train --resume {re.escape(str(folder(tmp_path)))}"
-    go_on = rf"millrace: interrupted; continue with: {resume}\n"
+    command = rf"\S*python\S* -m millrace train --resume {re.escape(str(folder(tmp_path)))}"
+    go_on = rf"millrace: interrupted; continue with: {command}\n"
     assert re.fullmatch(go_on, said.decode())
     assert is_whole(tmp_path)
 

@@ -58,7 +58,7 @@ def test_a_policy_is_saved_loaded_and_evaluated_without_them(tmp_path: Path) -> 
     policy = millrace.load(run)
     assert policy({"seen": np.array([0.5, -0.5], np.float32)}) in (0, 1)
     assert millrace.evaluate(run, episodes=4).episodes == 4
-    with pytest.raises(UsageError, match=r"^record: the run has critic_keys, which a dataset has not"):
+    with pytest.raises(UsageError, match=r"^record: the run has critic_keys, which a dataset can't have"):
         millrace.record(run, "some/data-v0", steps=10)
 
 

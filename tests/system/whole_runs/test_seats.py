@@ -188,5 +188,5 @@ def test_so_is_what_a_saved_policy_of_theirs_cannot_do(tmp_path: Path) -> None:
     run = trained(tmp_path, "ChainGame", steps=100, rollout_steps=16)
     with pytest.raises(UsageError, match=r"^inference learner: .*ChainGame has several agents, and workers must act"):
         millrace.evaluate(run, episodes=1, inference="learner")
-    with pytest.raises(UsageError, match=r"^record: .*ChainGame has several agents, which a dataset has not"):
+    with pytest.raises(UsageError, match=r"^record: .*ChainGame has several agents, which a dataset can't have"):
         millrace.record(run, "some/data-v0", steps=10)

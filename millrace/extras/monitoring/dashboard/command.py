@@ -23,7 +23,8 @@ class DashboardFlags(msgspec.Struct, frozen=True, kw_only=True):
     bind: str = "127.0.0.1:0"
     """where the page is served, as HOST:PORT; port 0 is a free one"""
     insecure: bool = False
-    """serve it also at an address that others reach: who learns the page's address sees all that is in these runs"""
+    """also serve it at an address that others can reach: anyone who learns the page's address sees everything in these runs
+    """
 
 
 def dashboard(argv: list[str]) -> int:
@@ -32,7 +33,7 @@ def dashboard(argv: list[str]) -> int:
     folders = flags.folders or (Path("runs"),)
     host, port = where_to_listen(flags.bind, insecure=flags.insecure)
     for folder in flags.folders:
-        find_runs([folder])  # a name that is misspelt is an error; the folder `runs` may not be there yet
+        find_runs([folder])  # a misspelled name is an error; the folder `runs` may not exist yet
 
     def listening(address: str) -> None:
         print(f"dashboard of {', '.join(map(str, folders))}: {address}", flush=True)
@@ -42,13 +43,13 @@ def dashboard(argv: list[str]) -> int:
 
 
 def where_to_listen(bind: str, *, insecure: bool) -> tuple[str, int]:
-    """Host and port. Raises `UsageError` for an address that others reach, unless that is asked for."""
+    """Host and port. Raises `UsageError` for an address that others can reach, unless `insecure`."""
     host, _, port = bind.rpartition(":")
     if not (host and port.isascii() and port.isdecimal() and int(port) < 65_536):
         raise UsageError(f"dashboard: bind {bind}: expected HOST:PORT, as in 127.0.0.1:8080")
     if not (insecure or is_local(f"tcp://{bind}")):
         raise UsageError(
-            f"dashboard: bind {bind}: others reach this address, and who learns the page's address sees settings, logs and "
-            "films of these runs, unencrypted; use an ssh tunnel (ssh -L), or add --insecure"
+            f"dashboard: bind {bind}: others can reach this address, and anyone who learns the page's URL sees settings, logs and "
+            "videos of these runs, unencrypted; use an ssh tunnel (ssh -L), or add --insecure"
         )
     return host, int(port)

@@ -1,8 +1,8 @@
-"""HTTP as far as the dashboard needs it: a request in, an answer out. Pure.
+"""The part of HTTP that the dashboard needs: a request in, an answer out. Pure.
 
-Rule: a request is refused unless its method, its Host and the token at the beginning of its path are right. A wrong token
-is answered as a wrong path is, so that nothing tells how near a guess was. Every answer forbids the browser all that its
-page does not need.
+Rule: a request is refused unless its method, its Host and the token at the beginning of its path are right. A wrong token is
+    answered like a wrong path, so that nothing shows how close a guess was. Every answer forbids the browser everything that
+    its page doesn't need.
 """
 
 from __future__ import annotations
@@ -39,32 +39,32 @@ REASONS = {
 }
 MOST_FIELDS = 100  # of a query
 PART_BYTES = 1 << 18
-RANGE = re.compile(r"bytes=([0-9]{0,15})-([0-9]{0,15})")  # one part; of several, the whole is sent
+RANGE = re.compile(r"bytes=([0-9]{0,15})-([0-9]{0,15})")  # one part; for several, the whole body is sent
 
 
 class PageRequest(NamedTuple):
-    """What a browser asks for."""
+    """A browser's request."""
 
     method: str
     path: tuple[str, ...]
     """the parts of the path, the token among them"""
     query: Mapping[str, list[str]]
     headers: Mapping[str, str]
-    """by names in small letters"""
+    """by lowercase name"""
 
 
 class StoredBody(NamedTuple):
-    """A body of which no more than the part that is wanted is read."""
+    """A body of which only the requested part is read."""
 
     tag: str
-    """other content has another one"""
+    """differs if the content differs"""
     size: int
     read: Callable[[int, int], bytes]
-    """from a place up to another"""
+    """reads from one offset up to another"""
 
 
 class PageAnswer(NamedTuple):
-    """What it gets."""
+    """The answer to a browser."""
 
     body: bytes | StoredBody
     content_type: str = "text/html; charset=utf-8"
@@ -72,12 +72,12 @@ class PageAnswer(NamedTuple):
 
 
 def refusal(status: int) -> PageAnswer:
-    """An answer that says no more than its status."""
+    """An answer with only its status."""
     return PageAnswer(f"{status} {REASONS[status]}\n".encode(), "text/plain; charset=utf-8", status)
 
 
 def parsed(head: bytes) -> PageRequest | None:
-    """The request of these lines; None if they are none."""
+    """The request in these lines; None if they aren't one."""
     first, *lines = head.decode("latin-1").split("\r\n")
     method, _, rest = first.partition(" ")
     target, _, version = rest.partition(" ")
@@ -98,20 +98,21 @@ def parsed(head: bytes) -> PageRequest | None:
 
 
 def why_refused(request: PageRequest | None, token: str, hosts: Collection[str]) -> int:
-    """The status with which a request is refused; 0 if it is not. `hosts`: what Host may be; none given: anything."""
+    """The status with which a request is refused; 0 if it is not. `hosts`: allowed values of Host; empty: any."""
     if request is None:
         return 400
     if hosts and request.headers.get("host", "").lower() not in hosts:
-        return 421  # a page of another site that has its name point here
+        return 421  # DNS rebinding: the name of another site points here
     if request.method not in ("GET", "HEAD"):
         return 405
     return 0 if hmac.compare_digest(request.path[0].encode(), token.encode()) else 404
 
 
 def answer_parts(request: PageRequest | None, answer: PageAnswer) -> Iterator[bytes]:
-    """The answer as it is sent, part by part. The first has the head, and a body is read as far as it is sent.
+    """The answer in the parts in which it is sent.
 
-    If the browser has the same already, or asked for the head only, it gets no body.
+    The first has the head, and a body is read as it is sent. If the browser already has the same content, or requested only
+    the head, it gets no body.
     """
     headers = dict(HEADERS)
     whole = _stored(answer.body)
@@ -122,7 +123,7 @@ def answer_parts(request: PageRequest | None, answer: PageAnswer) -> Iterator[by
         if request.headers.get("if-none-match") == tag:
             status = 304
         elif request.method == "GET" and (wanted := _wanted_part(request.headers, tag, whole.size)) is not None:
-            status = 206 if wanted else 416  # a film is played from the middle
+            status = 206 if wanted else 416  # a video is played from the middle
             part = wanted
             headers["Content-Range"] = f"bytes {f'{part.start}-{part.stop - 1}' if part else '*'}/{whole.size}"
     if status == 405:
@@ -145,7 +146,7 @@ def _stored(body: bytes | StoredBody) -> StoredBody:
 
 
 def _wanted_part(headers: Mapping[str, str], tag: str, size: int) -> range | None:
-    """The bytes that a Range asks for, none if there are no such bytes; None if all are wanted (RFC 9110, section 14)."""
+    """The bytes that a Range requests, empty if they don't exist; None if all are requested (RFC 9110, section 14)."""
     match = RANGE.fullmatch(headers.get("range", ""))
     if match is None or not any(match.groups()) or headers.get("if-range", tag) != tag:
         return None

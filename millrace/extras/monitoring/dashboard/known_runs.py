@@ -1,7 +1,7 @@
-"""The runs that the dashboard shows, read from their folders again and again.
+"""The runs that the dashboard shows, read from their folders repeatedly.
 
-Rule: what has not changed is not read again, and of a long metrics.jsonl a bounded number of rows is kept. A run has a key,
-which stands in addresses instead of its path.
+Rule: unchanged files are not read again, and only a bounded number of rows of a long metrics.jsonl is kept. A run has a key,
+which addresses contain instead of its path.
 """
 
 from __future__ import annotations
@@ -51,11 +51,11 @@ class KnownRuns:
 
     @property
     def only(self) -> Path | None:
-        """The run folder, if the dashboard is of this one alone."""
+        """The run folder, if the dashboard shows only this one."""
         return self._folders[0] if len(self._folders) == 1 and is_run_folder(self._folders[0]) else None
 
     def find(self) -> dict[str, Path]:
-        """The runs by their keys, the newest first. Folders that are not there any more hold none."""
+        """The runs by their keys, the newest first. Folders that don't exist any more have none."""
         runs: list[Path] = []
         for folder in self._folders:
             try:
@@ -65,7 +65,7 @@ class KnownRuns:
         return {key_of(run): run for run in runs}
 
     def line(self, run: Path) -> RunLine:
-        """What one line says about it."""
+        """Its line in a list of runs."""
         now = self._clock()
         changed = _changes(run)
         before, line = self._lines.get(run, (None, None))
@@ -75,7 +75,10 @@ class KnownRuns:
         return line
 
     def content(self, run: Path) -> RunContent:
-        """All that its page shows of its folder. Raises `UsageError`, with a one-line message, if it cannot be read."""
+        """The content of its folder that its page shows.
+
+        Raises `UsageError`, with a one-line message, if it cannot be read.
+        """
         changed = _changes(run)
         before, content = self._read.pop(run, (None, None))
         if content is None or before != changed:
@@ -88,7 +91,7 @@ class KnownRuns:
                 raise UsageError(f"run {run}: {METRICS_FILE} cannot be read: {reason(error)}") from error
             rows = tail.rows
             content = RunContent(read_run(run, rows), rows)
-        self._read[run] = changed, content  # last in the table: the run that was not asked for longest stands first
+        self._read[run] = changed, content  # last in the table: the first is the run that was not requested for longest
         while len(self._read) > MOST_KEPT:
             oldest = next(iter(self._read))
             del self._read[oldest]
@@ -97,12 +100,12 @@ class KnownRuns:
 
 
 def key_of(run: Path) -> str:
-    """What stands for a run in addresses."""
+    """The key of a run in addresses."""
     return blake2b(os.fsencode(run.absolute()), digest_size=6).hexdigest()
 
 
 def newest_logs(run: Path) -> list[tuple[str, str]]:
-    """Name and last lines of the logs of local workers that were written last."""
+    """Name and last lines of the most recently written logs of local workers."""
     logs = regular_files(run, "workers/*.log")
     ends_of_logs = []
     for path in sorted(logs, key=_written, reverse=True)[:MOST_LOGS]:
@@ -126,7 +129,7 @@ def _written(path: Path) -> int:
 
 
 def _changes(run: Path) -> tuple[object, ...]:
-    """What is different whenever one of its files was written."""
+    """A value that changes whenever one of its files was written."""
     stamps: list[object] = []
     for name in CHANGES:
         try:

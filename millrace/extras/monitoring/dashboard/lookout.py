@@ -1,7 +1,7 @@
-"""Asks the learners of the runs that somebody looks at, twice a second, and remembers the answers of the last minutes.
+"""Asks the learners of the runs on open pages twice a second, and remembers the answers of the last minutes.
 
-Rule: a learner is asked as `millrace status` asks it, with the same rights, and only while a page of its run is open. What
-is remembered of a run is bounded, and forgotten when nobody looks. An open page asks for it once a second (`page.js`).
+Rule: a learner is asked like by `millrace status`, with the same rights, and only while a page of its run is open. The
+memory for a run is bounded, and freed when no page is open. An open page requests it once a second (`page.js`).
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from millrace.protocol.wire.codec import encode
 from millrace.protocol.wire.worker_link import OF_OBSERVER, WorkerLink
 
 ASK_EVERY_S = 0.5
-LOOKED_AT_S = 10.0  # a page that is open asks each second
+LOOKED_AT_S = 10.0  # an open page asks each second
 FORGOTTEN_S = 300.0
 SILENT_S = 5.0
-PAUSE_S = 10.0  # who sends a message without an end fills our memory until we close the connection
+PAUSE_S = 10.0  # a message without an end fills the memory until the connection is closed
 SAMPLES = 400
-MOST_LANES = 64  # that are shown
+MOST_LANES = 64  # largest number of lanes shown
 ANSWER_WITHIN_S = 0.5
-MOST_ANSWERS = 4  # that are read each second: a learner may send more than it is asked for
+MOST_ANSWERS = 4  # most answers read each second: a learner may send more than requested
 
 LEARNER: dict[str, str] = {
     "gathering": "waiting",
@@ -40,7 +40,7 @@ LEARNER: dict[str, str] = {
     "evaluating": "evaluating",
     "starting": "starting",
 }
-"""What a learner does in each phase, in the words of the picture"""
+"""What a learner is doing in each phase, in the words of the picture"""
 WORKER = {
     "stepping": "collecting",
     "repeating": "resetting",
@@ -54,11 +54,11 @@ WORKER = {
     "closing": "resetting",
     "waiting": "waiting",
 }
-"""What a lane does while its worker does this"""
+"""What a lane is doing for each activity of its worker"""
 
 
 class LaneSample(NamedTuple):
-    """What everybody did at one moment."""
+    """What the learner and all lanes were doing at one moment."""
 
     at_s: float
     learner: str
@@ -66,7 +66,7 @@ class LaneSample(NamedTuple):
 
 
 class Seen(NamedTuple):
-    """What is known of a running learner."""
+    """What is known about a running learner."""
 
     status: Status | None = None
     """its newest answer"""
@@ -77,7 +77,7 @@ class Seen(NamedTuple):
 
 @dataclass
 class _Watched:
-    """A run that somebody looks at, or did a short while ago."""
+    """A run whose page is open, or was a short while ago."""
 
     looked_s: float
     link: WorkerLink | None = None
@@ -85,14 +85,14 @@ class _Watched:
     status: Status | None = None
     answered_s: float = 0.0
     silent_since_s: float = 0.0
-    """since its newest answer, or since we connected"""
+    """since its newest answer, or since the connection"""
     ask_again_s: float = 0.0
     problem: str = ""
     samples: deque[LaneSample] = field(default_factory=lambda: deque(maxlen=SAMPLES))
 
 
 def sample(status: Status, now: float) -> LaneSample:
-    """What an answer says about the learner and each lane."""
+    """What the learner and each lane were doing, from an answer."""
     lanes = {lane: _doing(worker) for worker in status.workers for lane in worker.lanes}
     shown = {lane: lanes.get(lane, "no worker") for lane in range(min(status.workers_wanted, MOST_LANES))}
     return LaneSample(now, LEARNER.get(status.progress.phase, ""), shown)
@@ -123,7 +123,7 @@ class Lookout:
         self._thread.join()
 
     def look(self, run: Path) -> Seen:
-        """What is known of the learner of this run. It is asked from now on, as long as somebody looks."""
+        """What is known about the learner of this run. It is asked from now on, as long as a page of it is open."""
         with self._lock:
             watched = self._watched.setdefault(run, _Watched(self._clock()))
             watched.looked_s = self._clock()

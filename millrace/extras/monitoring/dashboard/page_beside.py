@@ -1,4 +1,4 @@
-"""Starts a dashboard beside a program or a run, in a process of its own, so that neither has to wait for it."""
+"""Starts a dashboard beside a program or a run, in its own process, so that neither has to wait for it."""
 
 from __future__ import annotations
 
@@ -28,8 +28,7 @@ log = logging.getLogger("millrace.learner")
 class Dashboard:
     """Runs in a browser, until it is closed or this program ends. A notebook shows it in the cell.
 
-    Its `address` is one of this machine; whoever has it sees all that is in these runs. Raises `RunError` if it does not
-    start.
+    Its `address` is on this machine; anyone who has it sees everything in these runs. Raises `RunError` if it doesn't start.
 
     >>> from millrace.extras.monitoring.dashboard import Dashboard
     >>> with Dashboard("runs") as dashboard:
@@ -57,7 +56,7 @@ class Dashboard:
         self.address = self._process.stdout.readline().decode().strip() if said else ""
         if not self.address.startswith("http://"):
             self.close()
-            raise RunError(f"dashboard: it did not start: {self.address or 'it said nothing'}")
+            raise RunError(f"dashboard: it did not start: {self.address or 'it printed nothing'}")
 
     def close(self) -> None:
         """End it at once."""
@@ -65,7 +64,7 @@ class Dashboard:
         self._process.communicate()
 
     def let_end(self) -> None:
-        """Let it end a short while after this call: pages that are open show how a run has ended."""
+        """Let it end a short while after this call, so that open pages show how a run has ended."""
         threading.Thread(target=self._process.communicate, name="dashboard-ends", daemon=True).start()
 
     def __enter__(self) -> Self:
@@ -85,7 +84,7 @@ class Dashboard:
 
 @contextmanager
 def page_of_run(run: Path) -> Iterator[None]:
-    """Serve the page of a run while this is entered, and say where. A run goes on without it if it does not start."""
+    """Serve the page of a run while this is entered, and log its address. A run continues without it if it doesn't start."""
     page = _started(run)
     try:
         if page is not None:

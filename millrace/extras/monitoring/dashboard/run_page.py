@@ -1,7 +1,7 @@
-"""The parts of the page of one run that a report does not have: what it does now, its workers, a curve of any metric. Pure.
+"""The parts of a run's page that a report doesn't have: its current state, its workers, a curve of any metric. Pure.
 
-Rule: text from run folders and from learners is escaped. What stands on the page are words that a person would write; the
-names of fields stand beside them where a reader may look for them elsewhere.
+Rule: text from run folders and from learners is escaped. The page uses plain words; the names of fields are next to them if
+    a reader may look for them elsewhere.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from millrace.protocol.bounds import escaped
 from millrace.protocol.messages import Status, WorkerStatus
 
 WIDE = 1080, 360
-SHOWN_S = 180.0  # of who waits for whom
+SHOWN_S = 180.0  # seconds in the picture of who waits for whom
 LEAST_SHOWN_S = 30.0
 COLORS = {
     "collecting": "b1",
@@ -50,17 +50,17 @@ COLORS = {
     "waiting": "wait",
     "no worker": "gone",
 }
-"""Class in the style sheet of what a lane or the learner does"""
+"""Class in the style sheet for each activity of a lane or the learner"""
 COLUMNS = {"Worker": "", "Process": "late", "Doing": "", "Lanes": "", "Steps/s": "number", "Weights": "",
            "Heard": "number", "Memory": "number"}  # fmt: skip
-"""Of the table of workers, with their classes in the style sheet"""
+"""Columns of the table of workers, with their classes in the style sheet"""
 MOST_SMOOTHED = 100
-MOST_LINES = 10  # of evaluations
+MOST_LINES = 10  # most lines of evaluations
 MIB = 2**20
 
 
 class Choice(NamedTuple):
-    """Which curve the reader has chosen."""
+    """The curve that the reader has chosen."""
 
     metric: str = RETURN_KEY
     over_time: bool = False
@@ -69,7 +69,7 @@ class Choice(NamedTuple):
 
     @staticmethod
     def of(query: Mapping[str, Sequence[str]]) -> Choice:
-        """What the query of an address chooses; what it does not say, or not rightly, is as by default."""
+        """The choice in the query of an address; missing or wrong parts are the defaults."""
 
         def first(name: str, default: str) -> str:
             return query.get(name, [default])[0]
@@ -80,7 +80,7 @@ class Choice(NamedTuple):
 
 
 def head(line: RunLine, seen: Seen, report: ReportedRun | None, home: str) -> str:
-    """Which run it is, in one sentence what it does, or how it ended, and its newest warning.
+    """Which run it is, one sentence on what it is doing or how it ended, and its newest warning.
 
     `home`: the page of all runs, if it shows others.
     """
@@ -95,7 +95,7 @@ def head(line: RunLine, seen: Seen, report: ReportedRun | None, home: str) -> st
 
 
 def now_sentence(line: RunLine, problem: str) -> str:
-    """What the run does now, and what holds it up or is wrong with it. `problem`: why its learner does not answer."""
+    """What the run is doing now, and what slows it down or is wrong. `problem`: why its learner doesn't answer."""
     if line.state != "training":
         return headline(line)
     held_up = f"Who waits for whom is not known: {problem}." if problem else bottleneck(line.progress)
@@ -159,7 +159,7 @@ def curve(rows: Sequence[Mapping[str, Any]], choice: Choice) -> str:
 
 
 def smoothed(y: Doubles, rows: int) -> Doubles:
-    """The mean of each value and of those before it, of so many rows at most."""
+    """The mean of each value and the values before it, over at most this many rows."""
     sums = np.concatenate([[0.0], np.cumsum(y / rows)])
     ends = np.arange(1, len(y) + 1)
     begins = np.maximum(0, ends - rows)
@@ -233,7 +233,7 @@ def _worker(worker: WorkerStatus, status: Status) -> str:
 
 
 def who_waits(seen: Seen) -> str:
-    """A row for the learner and for each lane: what each did in the last minutes."""
+    """A row for the learner and for each lane, with its activities in the last minutes."""
     if not seen.samples:
         return ""
     end_s = seen.samples[-1].at_s
@@ -272,14 +272,14 @@ def _segments(samples: Sequence[LaneSample], kinds: Sequence[str]) -> list[Segme
 
 
 def evaluations(rows: Sequence[Mapping[str, Any]], kept: Best | None = None) -> str:
-    """The newest evaluations, and which was the best of all.
+    """The newest evaluations, and the best of all.
 
-    `kept`: that of a run that has ended, as its results have it. It may be of the final policy, which has no row here.
+    `kept`: the best one in the results of a run that has ended. It may be that of the final policy, which has no row here.
     """
     returns, lengths = (points(rows, key) for key in (EVALUATION_KEY, EVALUATION_LENGTH_KEY))
     if not len(returns):
         return ""
-    best = len(returns) - 1 - int(returns[::-1, 1].argmax())  # of equally good ones the newest, as the run keeps it
+    best = len(returns) - 1 - int(returns[::-1, 1].argmax())  # the newest among equally good ones, like the run
     at, highest = returns[best] if kept is None else (kept.env_steps, kept.chosen_by)
     length_at = dict(lengths.tolist())
     which = f"The best of {len(returns)}" if kept is None else "The best of all, that at the end included,"
@@ -301,7 +301,7 @@ def logs(newest: Sequence[tuple[str, str]]) -> str:
 
 
 def join(line: RunLine) -> str:
-    """The command by which one more worker joins from another machine."""
+    """The command with which one more worker joins from another machine."""
     if line.owner is None:
         return ""
     if not line.owner.address.startswith("tcp://"):

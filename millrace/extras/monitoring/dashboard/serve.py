@@ -1,4 +1,6 @@
-"""Serves the dashboard. As a program, it serves one for the program that started it, until that ends or closes its input.
+"""Serves the dashboard.
+
+As a program, it serves one for the program that started it, until that program ends or closes its input.
 
 `python -m millrace.extras.monitoring.dashboard.serve RUNS ...` prints the address of the first page, or why there is none.
 """
@@ -28,7 +30,7 @@ LINGER_S = 2.5  # so that pages which are open show the end
 def serve(folders: Sequence[Path], host: str, port: int, listening: Callable[[str], None]) -> None:
     """Serve until Ctrl-C. `listening` is called with the address of the first page. Raises `UsageError`.
 
-    What trains on this machine goes first: the process is nicer than any other.
+    Training on this machine goes first: this process has the lowest priority.
     """
     os.nice(19)
     with Lookout() as lookout, Interrupts() as interrupts:
@@ -39,7 +41,10 @@ def serve(folders: Sequence[Path], host: str, port: int, listening: Callable[[st
 
 
 async def _until_stopped(serving: Coroutine[None, None, None], interrupts: Interrupts) -> None:
-    """Serve until a signal has come. It is looked for: an exception in a handler would end whatever runs at that moment."""
+    """Serve until a signal has come.
+
+    Signals are polled, because an exception in a handler would end whatever runs at that moment.
+    """
     task = asyncio.ensure_future(serving)
     while not interrupts.received and not task.done():
         await asyncio.wait([task], timeout=LOOK_FOR_SIGNALS_S)
@@ -52,7 +57,7 @@ async def _until_stopped(serving: Coroutine[None, None, None], interrupts: Inter
 def _end_with_input() -> None:
     sys.stdin.buffer.read()
     time.sleep(LINGER_S)
-    os._exit(0)  # nothing of it is kept
+    os._exit(0)  # there is nothing to save
 
 
 def _say(line: str) -> None:

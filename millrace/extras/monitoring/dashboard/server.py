@@ -1,7 +1,7 @@
-"""The dashboard's sockets: connections in, what `site.py` answers out. Nothing is written to any file.
+"""The dashboard's sockets: connections in, answers of `site.py` out.
 
-Rule: nobody can hold it up. A connection carries one request; its head, and each part of the answer, have a deadline and a
-size. Of too many connections, the one that has been open for longest is closed. Pages are made one at a time in a thread.
+No files are written. Rule: no client can block it. A connection has one request; its head, and each part of the answer, have
+a deadline and a size. If there are too many connections, the oldest one is closed. Pages are made one at a time in a thread.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ MakePage = Callable[[PageRequest], PageAnswer]
 
 
 class DashboardServer:
-    """Listens, and answers whoever knows the token."""
+    """Listens, and answers clients that know the token."""
 
     def __init__(self, make: MakePage, token: str = "") -> None:
         self._make = make

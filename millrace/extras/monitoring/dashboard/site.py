@@ -1,9 +1,9 @@
-"""The pages of the dashboard: from a request to HTML. All that it reads comes through `KnownRuns` and `Lookout`.
+"""The pages of the dashboard: from a request to HTML. It reads everything through `KnownRuns` and `Lookout`.
 
 /TOKEN/                         all runs
 /TOKEN/run/KEY?metric=…         one run
 /TOKEN/compare?run=KEY&run=KEY  several runs, as `millrace report` shows them
-/TOKEN/file/KEY/FOLDER/NAME     a film or a picture of a run
+/TOKEN/file/KEY/FOLDER/NAME     a video or a picture of a run
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ MOST_COMPARED = 50
 MEDIA = {".mp4": "video/mp4", ".png": "image/png"}
 
 Look = Callable[[Path], Seen]
-"""What is known of the learner of a run, which is asked from now on"""
+"""What is known about the learner of a run, which is asked from now on"""
 
 
 class Site:
-    """Makes the page that a request asks for."""
+    """Makes the page for a request."""
 
     def __init__(self, runs: KnownRuns, look: Look) -> None:
         self._runs = runs
@@ -127,7 +127,7 @@ class Site:
         return "\n".join(filter(None, parts))
 
     def _file(self, key: str, parts: Sequence[str]) -> PageAnswer:
-        """A file that a page of its run shows, and no other one."""
+        """A file that a page of its run shows, and never another one."""
         run = self._runs.find().get(key)
         try:
             shown = self._runs.content(run).report if run is not None else None
@@ -159,7 +159,7 @@ def _stored(path: Path) -> StoredBody:
 
 
 def comparison(report: ReportData) -> list[str]:
-    """What a report says, without its films."""
+    """The parts of a report, without its videos."""
     parts = [
         sections.results,
         sections.curves,

@@ -1,6 +1,6 @@
 """Charts as SVG text: axes, lines, bands, dots. Pure. The style sheet sets the colors, by class, so that dark mode works.
 
-Rule: a line looks like no other up to 56 of them. After the seven colors of the style sheet, each comes again with dashes.
+Rule: up to 56 lines look different. After the seven colors of the style sheet, each is used again with dashes.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ RIGHT = 14
 TOP = 10
 BOTTOM = 40
 MOST_POINTS = 500
-LEAST_SPAN = 1e-300  # steps of less are no numbers
+LEAST_SPAN = 1e-300  # smaller steps aren't numbers
 ON_A_PHONE = 420, 300
 MINUS = "\N{MINUS SIGN}"
 
@@ -32,7 +32,7 @@ class Series(NamedTuple):
     kind: str
     """line (bold), thin, band or dots; also its class in the style sheet"""
     color: int
-    """its number; it says the dashes too"""
+    """number of the color and of the dashes"""
     x: Doubles  # [K]
     y: Doubles  # [K], or [K, 2] of a band
     tooltip: str = ""
@@ -65,7 +65,7 @@ def chart(all_series: Sequence[Series], width: int, height: int, x_label: str, d
     ys = [series.y for series in all_series if series.y.size]
     low, high = (min(float(y.min()) for y in ys), max(float(y.max()) for y in ys)) if ys else (0.0, 1.0)
     if low == high:
-        margin = max(1.0, 1e-9 * abs(low))  # beside a very large number, 1 is lost
+        margin = max(1.0, 1e-9 * abs(low))  # added to a very large number, 1 is lost
         low = low - margin
         high = high + margin
     room = 0.05 * (high - low)
@@ -99,7 +99,7 @@ def chart(all_series: Sequence[Series], width: int, height: int, x_label: str, d
 
 
 def chart_for_all_widths(all_series: Sequence[Series], wide: tuple[int, int], x_label: str, describe: str) -> str:
-    """The same chart in two sizes, of which the style sheet shows one, because text must not shrink with its chart."""
+    """The chart in two sizes, one of which the style sheet shows, because text must not shrink with its chart."""
     sizes = {"for-wide": wide, "for-narrow": ON_A_PHONE}
     return "".join(f'<div class="{css}">{chart(all_series, *size, x_label, describe)}</div>' for css, size in sizes.items())
 
@@ -112,7 +112,7 @@ def key(color: int) -> str:
 
 
 DOT_KEY = '<svg class="key" width="34" height="10"><g class="dots"><circle cx="17" cy="5" r="3.2"/></g></svg>'
-"""A dot of no group, for legends"""
+"""A dot without a group, for legends"""
 
 
 class Segment(NamedTuple):
@@ -128,7 +128,7 @@ class Segment(NamedTuple):
 
 
 def bar(segments: Iterable[Segment]) -> str:
-    """A bar of colored segments, as wide as the page allows. Its sizes are attributes, not styles, which pages forbid."""
+    """A bar of colored segments, as wide as the page allows. Its sizes are attributes, because pages forbid styles."""
     parts = []
     for each in segments:
         x = f"{100 * each.begin:.2f}%"
@@ -157,7 +157,7 @@ def _svg(series: Series, x: Doubles, y: Doubles) -> str:
 
 
 def _subsampled(x: Doubles, y: Doubles) -> tuple[Doubles, Doubles]:
-    """About 500 of the points, the last one included. More would not be visible."""
+    """About 500 of the points, including the last one. More would not be visible."""
     every = math.ceil(len(x) / MOST_POINTS)
     keep = np.unique([*range(0, len(x), every), len(x) - 1])
     return x[keep], y[keep]

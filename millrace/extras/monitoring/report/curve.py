@@ -35,12 +35,12 @@ class RunRecord(NamedTuple):
     """The configuration (config.toml) and the rows of metrics of one run folder."""
 
     env: str
-    """The environment's name: with keyword arguments that its preset does not set, it is another environment."""
+    """The environment's name, with keyword arguments that its preset doesn't set, because they make another environment."""
     algo: str
     seed: int
     config: dict[str, Any]
     workers_elsewhere: bool
-    """Whether its workers were started elsewhere: then the setting `workers` means nothing."""
+    """Whether its workers were started elsewhere: then the setting `workers` has no meaning."""
     rows: list[dict[str, Any]]
 
     def curve(self) -> Curve | None:
@@ -52,7 +52,7 @@ class RunRecord(NamedTuple):
 def points(rows: Sequence[Mapping[str, Any]], key: str, *, over_time: bool = False) -> Doubles:
     """Env steps, or seconds of training, and value of this metric: [K, 2], for the K rows that have both.
 
-    Numbers are cut to ±1e300: axes are longer. The env steps of an evaluation are those of the policy that was evaluated.
+    Numbers are cut to ±1e300: axes are longer. The env steps of an evaluation are those of the evaluated policy.
     """
 
     def at(row: Mapping[str, Any]) -> Any:
@@ -65,7 +65,10 @@ def points(rows: Sequence[Mapping[str, Any]], key: str, *, over_time: bool = Fal
 
 
 def read_run_files(run: Path, rows: list[dict[str, Any]] | None = None) -> RunRecord:
-    """Read a run folder. `rows`: of its metrics, if they are read already. Raises `UsageError`, with a one-line message."""
+    """Read a run folder.
+
+    `rows`: the rows of its metrics, if they have been read already. Raises `UsageError`, with a one-line message.
+    """
     RunFolder.open(run)
     elsewhere = check_format(run).workers_elsewhere
     config = read_config(run)

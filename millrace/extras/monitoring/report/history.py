@@ -10,16 +10,16 @@ from millrace.learner.run_folder.json_log import LoggedLine
 from millrace.protocol.bounds import escaped
 
 MOST_HISTORY = 30  # lines
-AT_ONCE = 8  # of them; the others are in a block that is closed at first
+AT_ONCE = 8  # lines shown; the others are in a closed block
 
 
 def history(report: ReportData) -> str:
-    """What the runs warned of, the newest first."""
+    """The warnings of the runs, the newest first."""
     names = report.short_names() if len(report.runs) > 1 else [""]
     lines = [(line, name) for name, (_, run) in zip(names, report.runs, strict=True) for line in reversed(run.log)]
     lines.sort(key=lambda each: each[0].time, reverse=True)
     items = [_logged(line, name) for line, name in lines[:MOST_HISTORY]]
-    about = "What the learner warned of or gave notice of, the newest first." if lines else "There was nothing to warn of."
+    about = "Warnings and notices of the learner, the newest first." if lines else "There were no warnings."
     if len(lines) > MOST_HISTORY:
         about += f" {len(lines) - MOST_HISTORY} earlier lines are in log.jsonl of the run folder."
     first, more = (f'<ol class="history">{"".join(part)}</ol>' * bool(part) for part in (items[:AT_ONCE], items[AT_ONCE:]))
@@ -28,7 +28,7 @@ def history(report: ReportData) -> str:
 
 
 def clock_time(line: LoggedLine) -> str:
-    """When it was said, by the clock here."""
+    """The local time of the line."""
     return f"{line.time:%Y-%m-%d %H:%M:%S}"
 
 

@@ -18,7 +18,7 @@ def ledgers(report: ReportData) -> str:
     """The ledger: the number of tickets and transitions that ended in each state, as sums."""
     tables = _balance(report, "Tickets", "", TICKETS) + _balance(report, "Transitions", "transitions_", TRANSITIONS)
     bad = sum(run.progress.ledger.get("messages_bad", 0) for _, run in report.runs)
-    about = "What became of every ticket that was dealt, and of every transition that reached the learner."
+    about = "How every ticket that was dealt, and every transition that reached the learner, ended."
     if bad:
         about += f" {bad:,} messages could not be read."
     return section("Ledger", about, f'<div class="scroll">{tables}</div>')

@@ -1,8 +1,8 @@
-"""Reads a metrics.jsonl that may grow: from where it was read last, keeping a bounded number of its rows.
+"""Reads a metrics.jsonl that may grow, from where the last read ended, and keeps a bounded number of its rows.
 
-Rule: of a long file, rows at equal distances are kept, every one with an evaluation as long as there are few of these, and
-the newest. The newest row is read again each time, because a run may add to it. A file that was replaced, as a resumed run
-does, is read from its beginning.
+Rule: of a long file, it keeps rows at equal distances, all rows with an evaluation as long as these are few, and the newest
+row. The newest row is read again each time, because a run may add to it. A file that was replaced, as a resumed run does, is
+read from its beginning.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from millrace.learner.run_folder.regular_files import MOST_BYTES, open_regular
 from millrace.learner.run_folder.results import EVALUATION_KEY
 from millrace.protocol.arrays import Ints
 
-MOST_ROWS = 256  # at least, and twice as many at most: a chart has 500 points
+MOST_ROWS = 256  # least number of rows; at most twice as many are kept: a chart has 500 points
 CHUNK_BYTES = 1 << 22
 NEWLINE = 10
 OF_AN_EVALUATION = b'"%s"' % EVALUATION_KEY.encode()
@@ -32,13 +32,13 @@ class MetricsTail:
     def __init__(self, run: Path, most: int = MOST_ROWS) -> None:
         self._path = run / METRICS_FILE
         self._most = most
-        self._seen: tuple[int, ...] = ()  # which file it was, its size and time
+        self._seen: tuple[int, ...] = ()  # identity, size and time of the file
         self._newest: bytes | None = None
         self._begin_anew()
 
     @property
     def rows(self) -> list[dict[str, Any]]:
-        """The rows that are kept, in their order."""
+        """The kept rows, in order."""
         lines = self._all.lines | self._evaluations.lines
         if self._newest is not None:
             lines[self._all.count] = self._newest
@@ -88,7 +88,7 @@ class MetricsTail:
 
 
 class _Thinned:
-    """At most twice `most` of the lines that are added, at equal distances."""
+    """At most twice `most` of the added lines, at equal distances."""
 
     def __init__(self, most: int) -> None:
         self._most = most
@@ -111,7 +111,7 @@ class _Thinned:
 
 
 def _places(text: bytes, part: bytes) -> Iterator[int]:
-    """Where this part stands in the text."""
+    """The offsets of this part in the text."""
     place = text.find(part)
     while place >= 0:
         yield place

@@ -1,8 +1,8 @@
-"""What learning curves show, in the report and in the picture of `millrace plot`: lines, bands, dots and legends. Pure.
+"""The contents of learning curves, in the report and in the picture of `millrace plot`: lines, bands, dots and legends.
 
-There is a panel for each environment, and a color for each group of runs. Of a group of several runs, each run is a thin
-line, their mean is a bold line, and a band reaches from the worst to the best. A run that an error or an interrupt ended is
-a thin line and in no mean; the legend says so.
+Pure. There is a panel for each environment, and a color for each group of runs. In a group of several runs, each run is a
+thin line, their mean is a bold line, and a band reaches from the worst to the best. A run that an error or an interrupt
+ended is a thin line and not part of a mean; the legend says so.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class Panel(NamedTuple):
     env: str
     series: list[Series]
     legend: list[tuple[str, str]]
-    """of each text, what stands before it, as SVG"""
+    """pairs of an SVG key and its text"""
 
 
 def panels(report: ReportData) -> list[Panel]:
@@ -44,7 +44,7 @@ def panels(report: ReportData) -> list[Panel]:
 
 
 def how_it_is_drawn(report: ReportData) -> str:
-    """What bold and thin lines and bands are; empty if there is no mean."""
+    """Explains bold and thin lines and bands; empty if there is no mean."""
     if not any(group.averaged for group in report.groups):
         return ""
     return "Bold: the mean over seeds, as far as the shortest of them goes. Band: from the worst to the best. Thin: a seed."

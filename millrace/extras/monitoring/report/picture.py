@@ -1,7 +1,7 @@
 """The picture that `millrace plot` draws: the learning curves of the report as one SVG, or that SVG as a PNG.
 
 Rule: lines, colors and legends are those of the report. The SVG has its own style, in light colors. The PNG is the same on
-every machine, because its letters are those of a font that Pillow brings; a machine needs fonts only for other scripts.
+every machine, because its font comes with Pillow; a machine needs fonts only for other scripts.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ HEIGHT = 380
 MARGIN = 28
 HEAD = 50
 LINE = 20
-LETTERS = 92  # as many as fit into WIDTH, or a little fewer
+LETTERS = 92  # about as many as fit into WIDTH
 ZOOM = 2  # pixels of the PNG for each of the SVG
 OWN_STYLE = (
     ".picture { font: 13px system-ui, sans-serif; color: var(--soft); }",
@@ -62,7 +62,7 @@ class Drawing:
         with NamedTemporaryFile(suffix=".ttf") as file:
             file.write(font.font_bytes)
             file.flush()
-            text = self.svg.replace(MINUS, "-")  # the font has no other
+            text = self.svg.replace(MINUS, "-")  # the font has no other minus sign
             png: bytes = svg_to_bytes(text, zoom=ZOOM, font_files=[file.name], sans_serif_family=font.getname()[0])
         return png
 
