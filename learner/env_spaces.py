@@ -50,14 +50,14 @@ class EnvSpaces(NamedTuple):
         keys = observation.spaces.keys() if isinstance(observation, spaces.Dict) else ()
         given = f"critic_keys {' '.join(critic_keys)}"
         if unknown := [key for key in critic_keys if key not in keys]:
-            there = f"its keys are {', '.join(keys)}" if keys else f"the observation is no Dict, but {observation}"
+            there = f"its keys are {', '.join(keys)}" if keys else f"the observation is not a Dict, but {observation}"
             raise UsageError(f"{given}: no key {unknown[0]}; {there}{did_you_mean(unknown[0], keys)}")
         if critic_keys and len(keys) == len(critic_keys):
             raise UsageError(f"{given}: expected one more key of the observation for the actor, got {', '.join(keys)}")
         everything = observation_leaves(with_last(observation, critic_keys))
         critic = tuple(leaf for leaf in everything if leaf.path.partition("/")[0] in critic_keys)
         if any(leaf.is_image for leaf in critic):
-            raise UsageError(f"{given}: expected arrays that are no images, got {observation}")
+            raise UsageError(f"{given}: expected arrays that aren't images, got {observation}")
         leaves = everything[: len(everything) - len(critic)]
         paths = [leaf.path for leaf in leaves]
         if not leaves:

@@ -20,7 +20,7 @@ class ImportsAhead:
     """The imports of one run, which begin at once."""
 
     def __init__(self, algo: str) -> None:
-        # The module of an algorithm of the user's own was imported for its settings.
+        # The module of a user-defined algorithm was imported for its settings.
         self._modules = (*MODULES, ALGORITHMS[algo].partition(":")[0]) if algo in ALGORITHMS else MODULES
         self._error: BaseException | None = None
         # Not a daemon: a thread that the interpreter ends in the middle of importing PyTorch can crash the process.

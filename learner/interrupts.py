@@ -3,7 +3,7 @@
 Rule: the first signal lets the current update end; `time_is_up` says when it must be given up, so that the rest of the
 grace time is enough to save. A second SIGINT (Ctrl-C) ends the run at once. If there is a grace time, SIGTERM and SIGHUP may
 come again and change nothing: they often go to a process and to its group, and the time is limited already. SIGHUP says that
-the terminal is gone. A learner that was told to ignore it (`nohup`) goes on ignoring it.
+the terminal is gone. A learner that was told to ignore it (`nohup`) continues to ignore it.
 
 Rule: where there is nothing to save, a signal ends the program too, with the same exit code (`stopped_by_signals`).
 """
@@ -29,7 +29,7 @@ Handler = Callable[[int, FrameType | None], None] | signal.Handlers
 class Stopped(KeyboardInterrupt):
     """A signal has stopped the program.
 
-    A class of its own: after a plain KeyboardInterrupt has passed through `exec`, as of a dataclass that is being made,
+    A separate class: after a plain KeyboardInterrupt has passed through `exec`, as of a dataclass that is being made,
     Python ends as if the signal had killed it, whatever the program does with the exception.
     """
 

@@ -35,7 +35,7 @@ def open_hub(
     """The hub of a run, for the workers in this lobby, and for those that join later. It takes the lobby's place.
 
     An update takes one rollout for each lane. `check_interrupt` is called while the hub waits: what it
-    raises ends the wait. `observer` is called each time the hub has listened. `past`: of a run that goes on.
+    raises ends the wait. `observer` is called each time the hub has listened. `past`: from the checkpoint of a resumed run.
     `opponents`: those of a run with teams.
     """
     past = past or PastRollouts(Ledger(), ())

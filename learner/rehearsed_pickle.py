@@ -93,4 +93,4 @@ def _cost(called: object, arguments: object) -> int:
         case _Function(name), _:
             raise Unfit(f"expected a pickle of tensors and plain data, got a call of {name.replace(' ', '.')}")
         case _:
-            raise Unfit("expected a pickle of tensors and plain data, got a call of what is no function")
+            raise Unfit("expected a pickle of tensors and plain data, got a call of something that isn't a function")

@@ -55,7 +55,7 @@ def policy_to_start_from(config: Config) -> StoredPolicy:
 def check_settings(config: Config, run: Path) -> list[str]:
     """Check that the run in this folder can be resumed with these settings. Returns lines about what will be different.
 
-    Raises `UsageError` that names the fixed settings that differ, or if this is no run folder.
+    Raises `UsageError`, which names the fixed settings that differ, or if this isn't a run folder.
     """
     RunFolder.open(run)
     before = _with_present_names(config_of_run(run, config.algo), config)
@@ -124,7 +124,7 @@ def _is_finished(config: Config, folder: RunFolder) -> bool:
 def _differences(before: Config, config: Config, changed: Sequence[Change]) -> list[str]:
     same_copies = before.envs // before.lanes == config.envs // config.lanes
     goes_on = same_copies and config.lost_lanes == "continue"
-    episodes = "lanes that the run had go on" if goes_on else "every lane begins new episodes"
+    episodes = "lanes that the run had continue" if goes_on else "every lane begins new episodes"
     lines = [
         f"{name}: {given} now, {had} before; {episodes}"
         for name, on_resume, had, given in changed

@@ -91,7 +91,7 @@ class RunLine(NamedTuple):
 
 
 def find_runs(folders: Iterable[Path]) -> list[Path]:
-    """The run folders among these and directly in them, the newest first. Raises `UsageError` if one is no folder."""
+    """The run folders among these and directly in them, the newest first. Raises `UsageError` if one isn't a folder."""
     runs: dict[Path, None] = {}
     for folder in folders:
         try:
@@ -166,7 +166,7 @@ def in_sentences(line: RunLine) -> str:
 
 
 def algorithm_label(algo: str) -> str:
-    """The name of an algorithm in a legend: PPO, or the class of one of the user's own."""
+    """The name of an algorithm in a legend: PPO, or the class of a user-defined one."""
     _, own, name = algo.rpartition(":")
     return name if own else algo.upper()
 

@@ -27,7 +27,7 @@ def run_spec(config: Config, env: EnvSpec, spaces: EnvSpaces) -> RunSpec:
     for given, why in ((spaces.seats, f"{config.env} has several agents"), (spaces.critic, "the run has critic_keys")):
         for setting in ("prior", "record"):
             if given and getattr(config, setting):
-                raise UsageError(f"{setting}: expected none, because {why}, which a dataset has not")
+                raise UsageError(f"{setting}: expected none, because {why}, which a dataset can't have")
         if given and config.inference == "learner":
             raise UsageError(f"inference learner: {why}, and workers must act; use --inference workers")
     teams = _teams(config, spaces.seats)

@@ -57,7 +57,7 @@ class RunState(msgspec.Struct, kw_only=True):
     acting: Any = ()
     """The weights of open rounds, without the newest, `Weights`."""
     episodes: list[Episode] = []
-    """Those of the `EpisodeWindow`."""
+    """The episodes of the `EpisodeWindow`."""
     facts: list[str] = []
     """Names of the facts of these episodes."""
     env_attributes: AttributesState = msgspec.field(default_factory=AttributesState)
@@ -91,7 +91,7 @@ class RunState(msgspec.Struct, kw_only=True):
         return {"past": past, **tensors, **records, "algorithm": algorithm.state_dict()}
 
     def past_rollouts(self) -> PastRollouts:
-        """With which the hub goes on."""
+        """The state from which the hub continues."""
         return PastRollouts(self.ledger, self.incarnations, self.rounds, self.lanes, self.acting)
 
 

@@ -8,7 +8,7 @@ workers already collect the next rollouts while the learner learns. The loop is 
 
 Rule: whatever ends the run, the state after the last whole update is saved first, and the run fails if the disk refuses it.
 An update is taken back if it raises, or makes weights that are not finite or that no worker could act with, or returns
-metrics that are no numbers; so is one whose rollouts a callback does not accept.
+metrics that aren't numbers; so is one whose rollouts a callback does not accept.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ def train(run: OpenRun, workers: int, cores: CrowdedCores) -> str:
 
     `workers`: number of workers to wait for before the first rollout. `cores` watches the updates.
 
-    If the run cannot go on (no worker is left, the environment raised too often, the user interrupted the run, a loss is not
-    finite, the user's code raised), the state after the last whole update is saved. Then the error is raised.
+    If the run cannot continue (no worker is left, the environment raised too often, the user interrupted the run, a loss is
+    not finite, the user's code raised), the state after the last whole update is saved. Then the error is raised.
     """
     algorithm = run.parts.algorithm
     policy = run.parts.spec.policy

@@ -162,10 +162,10 @@ class TrainKeywords(RolloutKeywords, total=False):
     eval_every: int | float
     """Env steps between evaluations during training. 0: evaluate only at the end."""
     eval_workers: int
-    """Number of workers that only evaluate, so that training goes on meanwhile: train starts them in addition to workers;
-    a learner doesn't wait for any, and uses those that `millrace worker --evaluate` starts. The result counts at the
-    next evaluation, or at the end, when the learner waits for it. If no such worker is left by then, the others play.
-    0: all workers evaluate, and training waits.
+    """Number of workers that only evaluate, so that training continues meanwhile: train starts them in addition to
+    workers; a learner doesn't wait for any, and uses those that `millrace worker --evaluate` starts. The result counts
+    at the next evaluation, or at the end, when the learner waits for it. If no such worker is left by then, the others
+    play. 0: all workers evaluate, and training waits.
     """
     eval_copies: int
     """Number of evaluation episodes that a worker plays at the same time, each on its own env copy. The last bits of

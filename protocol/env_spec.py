@@ -89,7 +89,7 @@ REGISTER_IT = (
 
 
 class PickledCallable:
-    """A callable, pickled by cloudpickle. It travels in a frame of its own."""
+    """A callable, pickled by cloudpickle. It is sent in its own frame."""
 
     __slots__ = ("data",)
 

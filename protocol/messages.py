@@ -199,9 +199,9 @@ class Heartbeat(Message, frozen=True):
     resident_bytes: Natural
     """resident memory of the worker's process; 0 if it is not known"""
     late_actions: Natural = 0
-    """how often since the worker started a program that owns its loop took an action of its own, because none had come"""
+    """how often since the worker started a program that owns its loop chose its own action, because none had arrived"""
     note: Line = ""
-    """what whoever trains should know of the environment, if the worker has seen something; the learner says it once"""
+    """what the user should know about the environment, if the worker has noticed something; the learner logs it once"""
     waits: bool = False
     """true: the worker knows of no run, because its `Welcome` brought a `WaitSpec`, and no second one has come
     (rule HEARTBEAT_WAITS)"""
@@ -466,7 +466,7 @@ class Status(Message, frozen=True):
     workers: tuple[WorkerStatus, ...]
     """in the order in which they joined; of very many, the first"""
     workers_wanted: int = 0
-    """number of workers with which each lane has one of its own, and none is spare; 0 while the environment is described"""
+    """number of workers with which each lane has its own, and none is spare; 0 while the environment is described"""
     workers_left_out: int = 0
     """number of workers that are not in `workers`, because the message would be too long"""
     version: int = -1

@@ -234,10 +234,10 @@ class WaitSpec(msgspec.Struct, frozen=True, tag=True):
     """
 
     call_timeouts: CallTimeouts = CallTimeouts()
-    """how long a call of the user's code may take before the worker's supervisor ends it; ignored by a worker without one"""
+    """how long a call of user code may take before the worker's supervisor ends it; ignored by a worker without one"""
     heartbeat_s: float = HEARTBEAT_S
     learner_timeout_s: float = 600.0
-    """a worker whose Heartbeat was followed by no message of the learner for so long says Hello again. The learner may read
+    """a worker says Hello again if no message of the learner has followed its Heartbeat for this long. The learner may read
     a checkpoint or a dataset for long before the run begins, without reading messages
     """
 
@@ -275,14 +275,14 @@ class RunSpec(msgspec.Struct, frozen=True, tag=True):
     """with opponents: the seats of each team, all of one size. In each copy the policy plays one team, and rollouts have the
     rows of that one alone. Empty: it plays all seats"""
     scripted: tuple[str, ...] = ()
-    """opponents that are no weights: each is a callable that makes a policy (`protocol/policy/called_policy.py`)"""
+    """opponents that aren't weights: each is a callable that makes a policy (`protocol/policy/called_policy.py`)"""
     opponent: PolicySpec | None = None
     """the policy of opponents, if it is not `policy`"""
     call_timeouts: CallTimeouts = CallTimeouts()
-    """how long a call of the user's code may take before the worker's supervisor ends it; ignored by a worker without one"""
+    """how long a call of user code may take before the worker's supervisor ends it; ignored by a worker without one"""
     heartbeat_s: float = HEARTBEAT_S
     learner_timeout_s: float = 30.0
-    """a worker whose Heartbeat was followed by no message of the learner for so long says Hello again"""
+    """a worker says Hello again if no message of the learner has followed its Heartbeat for this long"""
 
     @property
     def columns(self) -> int:
@@ -384,17 +384,17 @@ class StepSpec(msgspec.Struct, frozen=True, tag=True):
     render_mode: str | None = None
     """passed to each copy"""
     evaluation_copies: int = 0
-    """so many of the last copies play evaluations; the number of such a copy counts from the first of them"""
+    """number of copies, the last ones, that play evaluations; such a copy's number counts from the first of them"""
     seats: tuple[str, ...] = ()
     """names of the A agents of each copy; empty if the environments are gymnasium's. With seats, arrays have N · A rows in
     place of N, those of a copy side by side, and three more follow the observation's: `acts` and `complete` (bool), and
     `outside` (float64)
     """
     call_timeouts: CallTimeouts = CallTimeouts()
-    """how long a call of the user's code may take before the worker's supervisor ends it; ignored by a worker without one"""
+    """how long a call of user code may take before the worker's supervisor ends it; ignored by a worker without one"""
     heartbeat_s: float = HEARTBEAT_S
     learner_timeout_s: float = 600.0
-    """a worker whose Heartbeat was followed by no message of the learner for so long says Hello again. The caller may
+    """a worker says Hello again if no message of the learner has followed its Heartbeat for this long. The caller may
     compute for long between two steps, without reading messages; workers that end with the learner's process wait for ever
     (infinity)
     """

@@ -1,6 +1,6 @@
 """What is wrong with an algorithm: each rule of `Algorithm` is one function here, which yields mistakes.
 
-A mistake is one line. Every rule gets objects of its own, made with the same seed, and copies of the same batches. So one
+A mistake is one line. Every rule gets its own objects, made with the same seed, and copies of the same batches. So one
 broken rule does not hide another. The rules run in this process, on toy batches, with one PyTorch thread.
 """
 
@@ -457,7 +457,7 @@ def _not_plain(state: object, where: str = "") -> str:
 
 
 def _raised(what: str, error: Exception) -> str:
-    """One line about an exception of the user's code, with the place where it was raised."""
+    """One line about an exception of user code, with the place where it was raised."""
     if isinstance(error, UsageError):
         return str(error)
     frame = traceback.extract_tb(error.__traceback__)[-1]

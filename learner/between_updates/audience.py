@@ -49,7 +49,7 @@ class Audience:
         files.on_saved = self.checkpoint_written
 
     def start(self) -> None:
-        """The run begins, or goes on, and workers have joined."""
+        """Tell callbacks that the run begins, or is resumed, and workers have joined."""
         self._workers_alive = self._hub.workers_alive()
         self._callbacks.on_start(self.progress())
 
@@ -128,7 +128,7 @@ class Audience:
             self.leave(reason, cut_short=cut_short)
 
     def leave(self, reason: str, *, cut_short: bool = True) -> None:
-        """The run has ended in this process. Without a summary, because another process may go on with it."""
+        """The run has ended in this process. Without a summary, because another process may continue it."""
         self._finished = True
         self._requests.closed = "the run has ended"
         self._callbacks.on_end(msgspec.structs.replace(self.progress(), stop_reason=reason, cut_short=cut_short))

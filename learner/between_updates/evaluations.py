@@ -1,8 +1,8 @@
 """Evaluations of one run: each version at most once, the best policy kept, and that one evaluated again at the end.
 
-A number that decided something is no measurement of it: the highest of several evaluations is biased upwards, and so is one
-that ended the run, because it reached the target or because a callback saw it. So the summary reports the best policy, and
-the final policy of such a run, by a second evaluation, on other episodes.
+A number that decided something isn't a measurement of it: the highest of several evaluations is biased upwards, and so is
+one that ended the run, because it reached the target or because a callback saw it. So the summary reports the best policy,
+and the final policy of such a run, by a second evaluation, on other episodes.
 
 Rule: without `eval_workers`, training waits for each evaluation. With them, an evaluation is beside training: its result
 counts when the next one is due, or at the end, and is awaited there. So it does not depend on anybody's speed what a run
@@ -183,7 +183,7 @@ class Evaluations:
         return evaluation_of(played, self._run.spec.facts)
 
     def _keep_if_best(self, evaluation: Evaluation, env_steps: int, policy: Callable[[], tuple[Floats, Floats]]) -> None:
-        """Keep the policy, of which this is the evaluation, after so many env steps, if none was better.
+        """Keep the policy that this evaluation played, after this many env steps, if none was better.
 
         A tie keeps the newer one: it has learned more, and where all returns are equal, as in a zero-sum game that the
         policy plays with itself, they say nothing else.

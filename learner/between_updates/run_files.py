@@ -1,7 +1,7 @@
 """Writes the files of a run: rows of metrics, checkpoints, policies, the summary. It makes them again if they were deleted.
 
 Rule: a checkpoint is written between two updates, never during one, and holds everything that the next update depends on.
-If the disk is full, the run logs a warning and goes on; at its end, it fails if the disk does not take its last state.
+If the disk is full, the run logs a warning and continues; at its end, it fails if the disk does not take its last state.
 """
 
 from __future__ import annotations
@@ -139,7 +139,7 @@ class RunFiles:
     def saved(self, *, elsewhere: bool) -> str:
         """One line that says what can be resumed, and how; empty if nothing was learned yet.
 
-        `elsewhere`: as of `resume_command`. A run whose environment was given as a function goes on in Python only.
+        `elsewhere`: see `resume_command`. A run whose environment was passed as a function can continue only in Python.
         """
         if not self._state.version:
             return ""
@@ -151,7 +151,7 @@ class RunFiles:
             newest += f", and the policy of {self._policy_env_steps:,}"
         env = self._spec.env
         if env.factory is not None and not found_by_others(env.id):
-            return f"{newest}; go on in Python with: millrace.train(ENV, resume={str(folder)!r})"
+            return f"{newest}; continue in Python with: millrace.train(ENV, resume={str(folder)!r})"
         return f"{newest}; continue with: {resume_command(folder, elsewhere=elsewhere)}"
 
     def close(self) -> None:
@@ -201,7 +201,7 @@ class RunFiles:
             self._folder.lock.confirm()
 
     def _position(self) -> tuple[object, ...]:
-        """What of the state changes when the run goes on: version, evaluations, best policy, set attributes."""
+        """The part of the state that changes while the run continues: version, evaluations, best policy, set attributes."""
         state = self._state
         return state.version, state.next_evaluation, state.evaluated, state.best, self._attributes.changes
 

@@ -97,7 +97,7 @@ class Tally:
     # ---------------------------------------------------------------- seconds
 
     def updated(self, seconds: float) -> None:
-        """An update is published, so many seconds after its rollouts came.
+        """Count an update that is published, this many seconds after its rollouts arrived.
 
         Those that callbacks and the dataset took for the rollouts are among them, and do not count as the update's own.
         """

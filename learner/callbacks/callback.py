@@ -14,7 +14,7 @@ class Callback:
 
     Each method gets a `Progress`. If it returns False, the run ends as if all steps were done: with a checkpoint, the final
     evaluation and a summary. If it raises, the run ends too: the state after the last whole update is saved, then the
-    exception is raised. A method that returns anything else lets the run go on.
+    exception is raised. If a method returns anything else, the run continues.
 
     >>> import millrace
     >>> class StopWhenGood(millrace.Callback):
@@ -26,7 +26,7 @@ class Callback:
     """
 
     def on_start(self, progress: Progress) -> object:
-        """The run begins, or goes on (then `progress.updates` is not 0): workers have joined, no rollout was collected."""
+        """The run begins, or is resumed (then `progress.updates` isn't 0): workers have joined, no rollout was collected."""
         return None
 
     def on_rollouts(self, progress: Progress) -> object:

@@ -53,7 +53,7 @@ class Callbacks:
         return any(_method(callback, moment) for callback in self._callbacks)
 
     def on_start(self, progress: Progress) -> None:
-        """The run begins, or goes on."""
+        """The run begins, or is resumed."""
         for callback in self._callbacks:
             self._started.append(callback)
             self._call_one(callback, "on_start", progress)
@@ -76,7 +76,7 @@ class Callbacks:
         self._call("on_evaluation", progress)
 
     def meanwhile(self, progress: Progress) -> None:
-        """An evaluation or a long wait goes on; `progress.waiting` says how far it is, or for what."""
+        """An evaluation or a long wait continues; `progress.waiting` says how far it is, or what is awaited."""
         self._show(progress)
 
     def on_checkpoint(self, progress: Progress) -> None:

@@ -62,8 +62,8 @@ class Config(RolloutConfig, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     eval_every: Free[Natural] = 0
     """Env steps between evaluations during training. 0: evaluate only at the end."""
     eval_workers: Free[Natural] = 0
-    """Number of workers that only evaluate, so that training goes on meanwhile: train starts them in addition to workers; a
-    learner doesn't wait for any, and uses those that `millrace worker --evaluate` starts. The result counts at the next
+    """Number of workers that only evaluate, so that training continues meanwhile: train starts them in addition to workers;
+    a learner doesn't wait for any, and uses those that `millrace worker --evaluate` starts. The result counts at the next
     evaluation, or at the end, when the learner waits for it. If no such worker is left by then, the others play. 0: all
     workers evaluate, and training waits.
     """

@@ -401,7 +401,7 @@ class Hub:
         return sum(heartbeat.steps for heartbeat in heartbeats if heartbeat is not None)
 
     def _turn(self, timeout_s: float) -> None:
-        """One turn of waiting: listen, then check whether the run can go on."""
+        """One turn of waiting: listen, then check whether the run can continue."""
         self._listen(timeout_s)
         self._check_interrupt()
         for failed in self._processes.take_failures():

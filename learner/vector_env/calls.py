@@ -26,7 +26,7 @@ class CopyCalls:
     """Calls, reads and assigns attributes of the env copies of one vector environment, and describes them."""
 
     def __init__(self, send_recv: SendRecv, parts: VectorEnvParts, known: Mapping[str, Any]) -> None:
-        """`known`: attributes of every copy that are no plain data, and so cannot travel."""
+        """`known`: attributes of every copy that aren't plain data, and so can't be sent."""
         self.known = known
         self._send_recv = send_recv
         self._parts = parts
@@ -100,7 +100,7 @@ def assign_orders(layout: BatchLayout, copies: Sequence[int], name: str, values:
 
 
 def _check_name(name: object) -> None:
-    """Raise `UsageError` for what is no name of an attribute: a worker could not read the message."""
+    """Raise `UsageError` for anything but the name of an attribute: a worker could not read the message."""
     if not isinstance(name, str) or not name or one_line(name) != name:
         got = one_line(safe_repr(name), 60)
         raise UsageError(f"call: expected the name of an attribute, text of 1 to {MAX_LINE:,} characters, got {got}")

@@ -52,7 +52,7 @@ class InfoReader:
             for key in repr_paths(infos[n]):
                 if key not in self._warned:
                     self._warned.add(key)
-                    log.warning("info %s of row %d is no plain data: it arrives as its repr, a string", key, n)
+                    log.warning("info %s of row %d is not plain data: it arrives as its repr, a string", key, n)
         return dict(sorted(infos.items()))
 
 
@@ -67,7 +67,7 @@ def merged(by_row: Mapping[int, Infos], env: VectorEnv[Any, Any, Array], rows: S
 
 
 def unpack_infos(packed: bytes, rows: Sequence[int]) -> dict[int, Infos]:
-    """Infos by row, of a lane that has these rows. Raises `BadMessage` for bytes that are no infos."""
+    """Infos by row, of a lane that has these rows. Raises `BadMessage` for bytes that aren't infos."""
     try:
         pairs = [(n, info) for n, info in unpack(packed)]
     except (TypeError, ValueError) as error:

@@ -2,8 +2,8 @@
 
 Rule: an order goes to one lane, and a lane has one order at a time; lanes do not wait for each other. The order is answered,
 or its lane is lost with its worker. A lost lane starts again on new env copies, in its next incarnation. An order that a
-Heartbeat shows to be lost on the way is sent again. Steps through shared memory are no orders here; only their infos come as
-messages, where they are too long for the shared memory.
+Heartbeat shows to be lost on the way is sent again. Steps through shared memory don't count as orders here; only their infos
+come as messages, where they are too long for the shared memory.
 """
 
 from __future__ import annotations

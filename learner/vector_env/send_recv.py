@@ -84,7 +84,7 @@ class SendRecv:
     def reset(self, copies: Sequence[int], seeds: Sequence[int | None], options: Options) -> None:
         """Begin episodes in these copies. `seeds`: of all copies; a list of `options` has those of all copies.
 
-        Raises `TypeError` for options that are no plain data, and `UsageError` for a part of a lane whose copies were lost,
+        Raises `TypeError` for options that aren't plain data, and `UsageError` for a part of a lane whose copies were lost,
         with SameStep: no step resets them before their first episode.
         """
         parts = self._parts
@@ -153,7 +153,7 @@ class SendRecv:
             hub.send_steps(shared, together=together)
 
     def call(self, orders: Mapping[int, MakeOrder]) -> None:
-        """Send an order of its own to each of these lanes. The copies go on with their episodes."""
+        """Send each of these lanes its own order. The copies continue their episodes."""
         self._check_back(orders)
         now = self._watched.look(self._parts.hub.now())
         self._sent.send(orders, Sent(Asked.CALL, now))
@@ -308,7 +308,7 @@ class SendRecv:
                 case AfterLoss.RAISE:
                     self._to_raise[lane] = parts.lost_lanes.unreported[lane]
                     if asked is not Asked.CALL or parts.on_worker_loss == "raise":
-                        parts.lost_lanes.report([lane])  # else the next step reports it too: the caller may go on
+                        parts.lost_lanes.report([lane])  # otherwise the next step reports it too: the caller may continue
                     sent.drop(lane)
                 case AfterLoss.RESET_AGAIN:
                     assert isinstance(asked, AskedReset)

@@ -119,7 +119,7 @@ class SentLanes:
         return self._copies(sorted(self._results))
 
     def among(self, lanes: Iterable[int]) -> list[int]:
-        """Those of these lanes that have not come back."""
+        """The lanes among these that have not come back."""
         return [lane for lane in lanes if lane in self.sent] if self.sent else []
 
     def send(self, lanes: Iterable[int], sent: Sent) -> None:

@@ -52,7 +52,7 @@ class VectorEnvSettings:
     wrappers: Sequence[WrapperLike] = ()
     """Wrappers of every env copy, the innermost first."""
     single_lanes: int = 0
-    """Number of further copies for evaluations, after the others: each is a lane of its own, which `ZmqVectorEnv.step_async`
+    """Number of further copies for evaluations, after the others: each is a separate lane, which `ZmqVectorEnv.step_async`
     steps.
     """
     evaluates: bool = False

@@ -55,7 +55,7 @@ class RequestedCopies:
     call_timeouts: CallTimeouts
     learner_timeout_s: float
     evaluation_copies: int
-    """so many of the last copies play evaluations"""
+    """number of copies, the last ones, that play evaluations"""
 
     @property
     def to_describe(self) -> Unknown:

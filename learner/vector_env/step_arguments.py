@@ -43,7 +43,7 @@ Options = dict[str, Any] | list[dict[str, Any] | None] | None
 def take_reset_mask(options: Options, num_envs: int) -> tuple[Bools, Options]:
     """The env copies to reset, and the options without the mask. Without a mask all copies are reset.
 
-    Raises `TypeError` for a mask that is no bool array, `ValueError` for a wrong shape, a mask without True, and a list of
+    Raises `TypeError` for a mask that isn't a bool array, `ValueError` for a wrong shape, a mask without True, and a list of
     another length.
     """
     if isinstance(options, list) and len(options) != num_envs:

@@ -1,8 +1,8 @@
 """The hub of a vector environment: a shell round its coordinator and shared memory.
 
 Rule: a lane is asked by a message, or to step through shared memory; what comes of it is taken lane by lane. A worker that
-does not answer in time is given up, and killed if it is a child process of ours. Workers that have been silent for too long
-are removed only while the hub listens: the caller may take as long as it likes between two waits.
+does not answer in time is given up, and killed if it is a child process of this one. Workers that have been silent for too
+long are removed only while the hub listens: the caller may take as long as it likes between two waits.
 """
 
 from __future__ import annotations

@@ -111,7 +111,7 @@ def _as_array(value: Any) -> Array | None:
         if isinstance(value, tuple | list) and value and np.ndim(value[0]):
             return np.concatenate([np.asarray(part).reshape(-1) for part in value])
         return np.asarray(value)
-    except Exception:  # rows of different lengths, or an object of the user's
+    except Exception:  # rows of different lengths, or a user-defined object
         return None
 
 

@@ -180,7 +180,7 @@ def one_number(name: str, n: int, value: Any) -> Any:
     """
     try:
         array = np.asarray(value)
-    except Exception:  # rows of different lengths, or an object of the user's
+    except Exception:  # rows of different lengths, or a user-defined object
         array = np.asarray(None)
     if array.size == 1 and array.dtype.kind in "biuf":
         return array.item()

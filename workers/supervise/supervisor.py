@@ -102,7 +102,7 @@ class LearnerNotice(Protocol):
         ...
 
     def listen(self, for_s: float) -> bool:
-        """Take at once what the learner sends, for so long. Whether it has said that the run is over."""
+        """Handle the learner's messages for this many seconds. Returns whether it has said that the run is over."""
         ...
 
 

@@ -59,7 +59,7 @@ class SteppedLane:
         which = _first_copy(spec, lane)
         check = partial(_checked, spec)
         self._loop = EnvLoop(makes, pulse, spec.autoreset, ended=incarnation > 0, first=which, dress=check)
-        with activity().during(MAKING):  # to read an attribute of the environment may run code of its own
+        with activity().during(MAKING):  # reading an attribute may run code of the environment
             observation = self._loop.envs[0].observation_space
             action = self._loop.envs[0].action_space
         self._nested_actions = _is_nested(action)

@@ -556,7 +556,7 @@ def _past_of(rollouts: Sequence[Rollout]) -> LanePast:
 
 
 def continues_a_lane(learner: Learner) -> Script[None]:
-    """A lane that was with another worker, as it were, goes on in the next incarnation as it would have."""
+    """A lane that seems to come from another worker continues in the next incarnation as it would have there."""
     rounds = 3
     undisturbed = yield from collecting(learner, steps=7)
     if learner.hello is None or not learner.hello.continues:

@@ -167,7 +167,7 @@ class _Port:
 
 
 class _Process:
-    """The client's process, in a session of its own, so that all that it starts can be ended with it."""
+    """The client's process, in its own session, so that everything that it starts can be ended with it."""
 
     def __init__(self, command: Sequence[str], address: str, token: Path | None) -> None:
         words = {ADDRESS_WORD: address, TOKEN_WORD: "" if token is None else str(token)}

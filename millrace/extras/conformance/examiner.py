@@ -43,7 +43,7 @@ class Examiner:
     """The state of the whole test."""
 
     def __init__(self, checks: Sequence[Check], settings: Settings, now: float, limit_s: float) -> None:
-        """`limit_s`: the whole test ends after so long; what was not checked by then has failed."""
+        """`limit_s`: the whole test ends after this many seconds; checks that have not ended by then have failed."""
         self.learner = Learner(settings)
         self.results: list[CheckResult] = []
         self._checks = list(checks)
@@ -100,7 +100,7 @@ class Examiner:
         self._resume(None)
 
     def _resume(self, event: ClientEvent | None) -> None:
-        """Let the check go on until it waits again or ends."""
+        """Let the check continue until it waits again or ends."""
         assert self._script is not None
         try:
             self._wait = self._script.send(event)

@@ -89,7 +89,7 @@ def is_gymnasium_pole(env: DescribedEnv) -> bool:
 
 
 def heartbeats(learner: Learner, number: int, rule: Rule = Rule.HEARTBEAT) -> Script[Heartbeat]:
-    """The last of so many Heartbeats that follow."""
+    """The last one of this many Heartbeats that follow."""
     for _ in range(number):
         beat = yield from learner.expect(Heartbeat, rule, "a Heartbeat")
     return beat

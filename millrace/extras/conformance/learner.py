@@ -257,7 +257,7 @@ class Learner:
         return message
 
     def quiet(self, kind: type, rule: Rule, expected: str, *, for_s: float = QUIET_S) -> Script[None]:
-        """Nothing of this kind arrives for so long. Or `Broken`."""
+        """Raise `Broken` if anything of this kind arrives for this many seconds."""
         heard = yield Wait(for_s, lambda event: isinstance(event, Heard) and isinstance(event.message, kind))
         if isinstance(heard, Heard):
             raise Broken(rule, expected, brief(heard.message))

@@ -176,4 +176,4 @@ MENDS: Mapping[Rule, str] = {
     Rule.DRAINING_LEAVES: "end the process when one of them arrives after Drain, and say Hello no more",
 }
 TOO_SLOW = "look for the step at which the client waits; run this check alone with --only"
-"""If a check has not ended within its deadline, which is no rule of the document."""
+"""If a check has not ended within its deadline, which isn't a rule of the document."""

@@ -16,7 +16,7 @@ from millrace.protocol.rows.played import reason_to_reject
 from millrace.protocol.rules import Rule
 from millrace.protocol.specs import RunSpec
 
-BY_CHANCE = -14.0  # log of a probability: that so many drawn actions are all the most probable ones
+BY_CHANCE = -14.0  # log of the probability that all sampled actions are the most probable ones by chance
 
 
 class PlayedRows:

@@ -546,7 +546,7 @@ def answers_after_a_reset_connection(learner: Learner) -> Script[None]:
 
 
 def ignores_what_it_cannot_read(learner: Learner) -> Script[None]:
-    """An unknown type, an extra field, a missing frame, bytes that are no msgpack."""
+    """An unknown type, an extra field, a missing frame, bytes that aren't msgpack."""
     steps = yield from stepping(learner, 0)
     order = steps.step()
     head = msgpack.unpackb(bytes(encode(order)[0]))

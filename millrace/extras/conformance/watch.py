@@ -50,7 +50,7 @@ from millrace.protocol.rules import Rule
 from millrace.protocol.specs import RunSpec, StepSpec, WaitSpec
 
 HEARTBEATS_LATE = 2.0  # of these may be missing,
-LATE_S = 1.5  # and a busy machine may add so many seconds
+LATE_S = 1.5  # a busy machine may add this many seconds
 OTHER_SESSION = Rule.OTHER_SESSION, "its session was another"
 UNREADABLE = Rule.IGNORE_UNREADABLE, "no message that names it can be read"
 

@@ -54,7 +54,7 @@ class RowFilter:
 
 
 class RowCallback(Callback):
-    """Sends rows to a tool. A class of its own for each tool says how: `_begin`, `_send`, `_end`.
+    """Sends rows to a tool. A subclass for each tool says how: `_begin`, `_send`, `_end`.
 
     What the tool refuses ends the run, in one line that names the tool.
     """
@@ -65,7 +65,7 @@ class RowCallback(Callback):
         self._rows = RowFilter(every_s)
 
     def on_start(self, progress: Progress) -> None:
-        """Begin a run of this folder's name, or go on with the one that is there. Log the numbers of cloning, if any."""
+        """Begin a run with this folder's name, or continue the existing one. Log the numbers of cloning, if any."""
         with refusals_of(self._tool):
             self._begin(progress)
         self._log(self._rows.last(progress), progress)

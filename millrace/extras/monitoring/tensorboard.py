@@ -1,6 +1,6 @@
 """Writes the metrics of a run as TensorBoard events, into the folder tensorboard of the run folder.
 
-Rule: what the disk refuses waits and is written later, as with all files of a run. A resumed run writes a file of its own,
+Rule: events that the disk refuses are written later, as with all files of a run. A resumed run writes its own file,
 which tells TensorBoard to forget what came after the checkpoint.
 """
 

@@ -1,4 +1,4 @@
-"""Logs a run to Weights & Biases: settings, metrics, evaluations. A resumed run goes on under the same id."""
+"""Logs a run to Weights & Biases: settings, metrics, evaluations. A resumed run continues under the same id."""
 
 from __future__ import annotations
 

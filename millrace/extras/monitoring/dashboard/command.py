@@ -49,7 +49,7 @@ def where_to_listen(bind: str, *, insecure: bool) -> tuple[str, int]:
         raise UsageError(f"dashboard: bind {bind}: expected HOST:PORT, as in 127.0.0.1:8080")
     if not (insecure or is_local(f"tcp://{bind}")):
         raise UsageError(
-            f"dashboard: bind {bind}: others can reach this address, and anyone who learns the page's URL sees settings, logs and "
+            f"dashboard: bind {bind}: others can reach this address, and anyone who learns the URL sees settings, logs and "
             "videos of these runs, unencrypted; use an ssh tunnel (ssh -L), or add --insecure"
         )
     return host, int(port)

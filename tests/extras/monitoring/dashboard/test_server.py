@@ -169,7 +169,7 @@ def test_an_address_that_others_reach_must_be_asked_for() -> None:
     assert where_to_listen("127.0.0.1:0", insecure=False) == ("127.0.0.1", 0)
     assert where_to_listen("[::1]:80", insecure=False) == ("[::1]", 80)
     assert where_to_listen("0.0.0.0:80", insecure=True) == ("0.0.0.0", 80)
-    with pytest.raises(UsageError, match="who learns the page's address sees settings, logs and films of these runs"):
+    with pytest.raises(UsageError, match="anyone who learns the URL sees settings, logs and videos of these runs"):
         where_to_listen("0.0.0.0:80", insecure=False)
     for bind in ("80", ":80", "127.0.0.1:", "127.0.0.1:70000", "127.0.0.1:x"):
         with pytest.raises(UsageError, match="expected HOST:PORT"):

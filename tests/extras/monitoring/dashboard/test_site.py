@@ -243,7 +243,7 @@ def test_a_number_of_the_user_s_own_has_its_name_as_label_and_the_meaning_of_its
 
 def test_what_happened_is_told_with_its_time_the_newest_first(tmp_path: Path) -> None:
     run, pages = a_run(tmp_path), Pages(tmp_path)
-    assert "There was nothing to warn of." in pages.said(f"run/{key_of(run)}")
+    assert "There were no warnings." in pages.said(f"run/{key_of(run)}")
     with kept_log(run):
         log.warning("w0 was lost")
         log.warning("an environment raised: ValueError: no\nTraceback\n  line 3")
