@@ -22,7 +22,7 @@ class EnvSpaces(NamedTuple):
     max_episode_steps: int | None
     """Time limit of an episode in env steps; None if there is none, or it is not known."""
     masked: bool = False
-    """Whether the run uses action masks. A mask in an observation is not one of `observation`."""
+    """Whether the run uses action masks. A mask in an observation isn't part of `observation`."""
     seats: tuple[str, ...] = ()
     """The names of its agents, whose spaces these are; empty if it is gymnasium's."""
     takes_turns: bool = False
@@ -34,9 +34,9 @@ class EnvSpaces(NamedTuple):
     def of_description(
         env: DescribedEnv, action_masks: Literal["auto", "info", "none"] = "auto", critic_keys: Sequence[str] = ()
     ) -> EnvSpaces:
-        """Those that a worker described. Raises `UsageError` if a policy cannot use them.
+        """The spaces that a worker described.
 
-        `critic_keys`: of a Dict observation, which only the critic sees.
+        Raises `UsageError` if a policy can't use them. `critic_keys`: keys of a Dict observation that only the critic sees.
         """
         observation = env.observation_space
         action = action_spec(env.action_space)
@@ -70,5 +70,5 @@ class EnvSpaces(NamedTuple):
 
     @staticmethod
     def of_policy(policy: PolicySpec, seats: tuple[str, ...] = ()) -> EnvSpaces:
-        """Those that a policy was made for."""
+        """The spaces that a policy was made for."""
         return EnvSpaces(policy.observation, policy.action, None, seats=seats, critic=policy.critic)

@@ -1,8 +1,8 @@
-"""What a setting or a public function starts of an extra. The core imports an extra only when somebody asks for it.
+"""What settings and public functions start in extras. The core imports an extra only when it is used.
 
-Rule: each entry is `module:name`, and the caller says which type of the core the object has. The core has such tables for
-what else extras give: commands (`millrace/cli/commands.py`), kinds of env copies (`protocol/envs/kinds_of_copies.py`) and
-environments (`protocol/env_spec.py`). It names extras nowhere else.
+Rule: each entry is `module:name`, and the caller says which type of the core the object has. The core has similar tables for
+the other contributions of extras: commands (`millrace/cli/commands.py`), kinds of env copies
+(`protocol/envs/kinds_of_copies.py`) and environments (`protocol/env_spec.py`). It names extras nowhere else.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ STARTED_BY = {
 
 
 class Packages(NamedTuple):
-    """What a setting needs that `pip install .` does not install."""
+    """Packages of a setting that `pip install .` doesn't install."""
 
     modules: tuple[str, ...]
     """as Python imports them"""

@@ -1,4 +1,4 @@
-"""Imports PyTorch and what else a run needs in a second thread, while workers start and describe the environment."""
+"""Imports PyTorch and other modules of a run in a second thread, while workers start and describe the environment."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class ImportsAhead:
         self._thread.start()
 
     def wait(self, check_interrupt: Callable[[], None]) -> None:
-        """Wait until all is imported. Raises what an import raised, or what `check_interrupt` raises meanwhile."""
+        """Wait until everything is imported. Raises what an import raised, or what `check_interrupt` raises meanwhile."""
         while self._thread.is_alive():
             self._thread.join(POLL_S)
             check_interrupt()
@@ -44,7 +44,7 @@ class ImportsAhead:
 
 
 def exit_if_importing(exit_code: int) -> None:
-    """End this process at once if an import is still under way: the interpreter would wait for it, for seconds.
+    """End this process at once if an import is still running: the interpreter would wait for it, for seconds.
 
     Call it last: nothing is cleaned up after it.
     """

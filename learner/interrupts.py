@@ -20,25 +20,26 @@ from typing import Any, Self
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 FOR_SAVING = 0.5  # the part of the grace time that an update must leave
-SAVE_TAKES = 1.5  # times as long as the longest so far, at most
+SAVE_TAKES = 1.5  # factor: saving takes at most this times the longest so far
 
-_stopped = False  # whether `Stopped` was raised: code of others may have swallowed it, as in an import or a finalizer
+_stopped = False  # whether `Stopped` was raised: other code, such as an import or a finalizer, may have swallowed it
 Handler = Callable[[int, FrameType | None], None] | signal.Handlers
 
 
 class Stopped(KeyboardInterrupt):
     """A signal has stopped the program.
 
-    A separate class: after a plain KeyboardInterrupt has passed through `exec`, as of a dataclass that is being made,
-    Python ends as if the signal had killed it, whatever the program does with the exception.
+    It is a separate class, because after a plain KeyboardInterrupt has passed through `exec`, for example in the definition
+    of a dataclass, Python ends as if the signal had killed it, whatever the program does with the exception.
     """
 
 
 @contextmanager
 def stopped_by_signals() -> Iterator[None]:
-    """Within it, the first signal raises `Stopped`. More would only cut the clean-up short, and do nothing.
+    """While it is entered, the first signal raises `Stopped`.
 
-    Signals that were blocked come now. Afterwards they are ignored: when Python ends, it would take away any other handler.
+    Later ones are ignored, because they would only cut the clean-up short. Blocked signals are delivered on entry. After the
+    exit, signals are ignored: at its end, Python would remove any other handler.
     """
     global _stopped
 
@@ -99,4 +100,4 @@ class Interrupts:
             self._end_s = monotonic() + self._grace_s
             for each, handler in self._handlers_before.items():
                 if each == signal.SIGINT or math.isinf(self._grace_s):
-                    signal.signal(each, handler)  # the second one does what it would have done without us
+                    signal.signal(each, handler)  # a second one has its effect without this class

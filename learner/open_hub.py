@@ -1,6 +1,7 @@
-"""Makes the hub of a run from its settings, for our training and for a user's own loop. Imports no torch.
+"""Makes the hub of a run from its settings, for millrace's training and for your own loop.
 
-Who starts worker processes is not known here: the launchers in `millrace` pass in `WorkerProcesses`, with the lobby.
+Imports no torch. This file doesn't know who starts worker processes: the launchers in `millrace` pass in `WorkerProcesses`,
+with the lobby.
 """
 
 from __future__ import annotations

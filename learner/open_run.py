@@ -1,6 +1,7 @@
-"""Makes a run of its parts: algorithm, hub, and what it does between two updates. Imports PyTorch.
+"""Assembles a run: algorithm, hub, and everything that happens between two updates.
 
-`learner/run_setup.py` says what must exist before. Nothing of a resumed run is written before everything fits.
+Imports PyTorch. `learner/run_setup.py` describes the parts that must exist before. In a resumed run, nothing is written
+before all checks have passed.
 """
 
 from __future__ import annotations
@@ -52,10 +53,10 @@ log = logging.getLogger("millrace.learner")
 
 
 def open_run(setup: RunSetup, lobby: Lobby, watch: Watch, observer: HubObserver) -> OpenRun:
-    """The run of this setup, whose folder is ready, for the workers in the lobby. Raises `MillraceError`.
+    """Open the run of this setup, with the workers in the lobby. Its folder is ready. Raises `MillraceError`.
 
     `watch`: the callbacks of the run, or a function to call after each update. `observer` is called each time the hub has
-    listened. Nothing of a resumed run is written before everything fits.
+    listened. In a resumed run, nothing is written before all checks have passed.
     """
     callbacks = Callbacks.of(watch).with_named(setup.config.callbacks)
     if setup.config.tensorboard:
@@ -73,7 +74,7 @@ def open_run(setup: RunSetup, lobby: Lobby, watch: Watch, observer: HubObserver)
     folder = setup.folder
     algorithm, prior = _new_algorithm(setup, spec)
     state = restore(folder, algorithm) if setup.resumed else RunState()
-    # The last save gets half of what is left of the grace time, and the workers need time to leave.
+    # The last save gets half of the remaining grace time, because the workers need time to leave.
     folder.writes.at_most = lambda seconds: setup.interrupts.at_most(2 * seconds) / 2
     pool = _opponent_pool(config, spec, state.opponents)
     progress_file = ProgressFile(folder.path)
@@ -153,7 +154,10 @@ def _use_threads(setup: RunSetup, policy: PolicySpec, processes: WorkerProcesses
 
 
 def _new_algorithm(setup: RunSetup, spec: RunSpec) -> tuple[Algorithm, PriorData | None]:
-    """An algorithm that starts from another run, if it is to, and has its prior data. A resumed one has its own start."""
+    """An algorithm that starts from another run, if the settings say so, and has its prior data.
+
+    A resumed run has its own start.
+    """
     config = setup.config
     folder = setup.folder
     policy = spec.policy
@@ -174,7 +178,7 @@ def _new_algorithm(setup: RunSetup, spec: RunSpec) -> tuple[Algorithm, PriorData
 
 @dataclass(frozen=True)
 class _InterruptiblePrior:
-    """Prior data whose reading `check` may end: it is called after each episode, and what it raises passes."""
+    """Prior data whose reading `check` may end: it is called after each episode, and its exceptions pass through."""
 
     data: PriorData
     check: Callable[[], None]

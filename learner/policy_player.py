@@ -1,7 +1,7 @@
-"""A learner that trains nothing: it has workers play episodes of the policy of a run folder.
+"""A learner that doesn't train: it has workers play episodes with the policy of a run folder.
 
-Rule: the policy is published as version 1, once; one that plays against it, as version 0. The learner's process runs no
-environment code. Timeouts and the number of failures that are allowed are those of a training run.
+Rule: the policy is published once, as version 1; a policy that plays against it, as version 0. The learner's process runs no
+    environment code. Timeouts and the number of allowed failures are those of a training run.
 """
 
 from __future__ import annotations
@@ -130,7 +130,7 @@ class PolicyPlayer:
     ) -> list[PlayedEpisode]:
         """Play these episodes. Returns them in the order of the seeds. Raises `RunError` if that is not possible.
 
-        Against another policy, both draw their actions, because two greedy ones would repeat the same few games.
+        Against another policy, both sample their actions, because two greedy ones would repeat the same few games.
 
         `bound` and `before` are those of `EvaluationPlan.how_far`, which makes the text that `watch` gets.
         """
@@ -149,7 +149,7 @@ class PolicyPlayer:
 
     def _published(self) -> Hub:
         policy = self.policy
-        # One for each worker of this program: only then do its failures count.
+        # One for each worker of this program, because only then its failures count.
         lanes = max(1, self._lobby.processes.expected)
         settings = msgspec.structs.replace(self._settings, lanes=lanes)
         run = RunSpec(
@@ -162,7 +162,7 @@ class PolicyPlayer:
             facts=policy.facts,
             masked=policy.masked,
             seats=policy.seats,
-            takes_turns=bool(policy.seats),  # perhaps
+            takes_turns=bool(policy.seats),  # may be False
             call_timeouts=settings.call_timeouts(),
             heartbeat_s=settings.heartbeat_s(),
         )

@@ -1,8 +1,9 @@
-"""What the pickle in a checkpoint would call, found before torch's loader calls it. Pure: bytes in.
+"""Finds the calls of the pickle in a checkpoint before torch's loader makes them.
 
-Rule: a pickle may hold only what torch.save writes for tensors and plain data. torch's loader for files of strangers
-(`weights_only`) runs no code of theirs; yet it calls `bytearray` with any length, and copies a container or a text as often
-as it is told to, so a few bytes could fill the memory. Here the pickle is followed, and nothing of it is made.
+Pure: bytes in. Rule: a pickle may contain only what torch.save writes for tensors and plain data. torch's loader for
+untrusted files (`weights_only`) doesn't run their code, but calls `bytearray` with any length, and copies a container or a
+text as often as the file says, so a few bytes could fill the memory. Here the pickle is interpreted without making its
+objects.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ ADD = {"APPEND": 1, "SETITEM": 2}
 """Opcodes, as pickletools explains them, and how many items of the stack they take. torch.save writes protocol 2."""
 
 REBUILD = {f"torch._utils {name}" for name in ("_rebuild_tensor_v2", "_rebuild_tensor_v3", "_rebuild_parameter")}
-"""They make a view of a storage. How large that is, is checked when it is there."""
+"""They make a view of a storage, whose size is checked once it exists."""
 HOOKS = "collections OrderedDict"  # of a tensor: it has none
 BYTES = "_codecs encode"  # a bytes object is written as text
 CALLED = REBUILD | {HOOKS, BYTES}
@@ -25,7 +26,7 @@ TYPES = ("torch ", "torch.storage ")  # how the names of storages and dtypes beg
 
 
 class Unfit(Exception):
-    """The pickle holds something else. The text says what."""
+    """The pickle contains something else. The text says what."""
 
 
 class _Function(NamedTuple):
@@ -77,12 +78,12 @@ def rehearse(content: bytes) -> None:
 
 
 def _gather(stack: list[object], first: int) -> None:
-    """Make a tuple of what stands on the stack from there on."""
+    """Make a tuple of the items on the stack from this index on."""
     stack[first:] = [tuple(stack[first:])]
 
 
 def _cost(called: object, arguments: object) -> int:
-    """How many bytes a call makes beside tensors. Raises `Unfit` for a call that torch.save does not write."""
+    """How many bytes a call allocates besides tensors. Raises `Unfit` for a call that torch.save does not write."""
     match called, arguments:
         case _Function(name), tuple() if name in REBUILD:
             return 0

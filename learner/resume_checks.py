@@ -1,6 +1,6 @@
-"""What is checked before a run is resumed: that the settings and the environment are still those of its weights and state.
+"""Checks before a run is resumed: that the settings and the environment still fit its weights and state.
 
-Rule: all of this is checked before anything is written into the run folder, so a refused resume changes nothing. A launcher
+Rule: all checks are made before anything is written into the run folder, so a refused resume changes nothing. A launcher
 gets a `Resumption`, which only `unless_finished` makes, so no launcher can skip the check.
 """
 
@@ -41,7 +41,7 @@ def unless_finished(config: Config, resume: Path | None, train: Callable[[Resump
     """
     if resume is None:
         if config.start_from:
-            policy_to_start_from(config)  # a folder that is wrong is found before anything starts
+            policy_to_start_from(config)  # so that a wrong folder is found before anything starts
         return train(None)
     lines = check_settings(config, resume)
     return resume if _is_finished(config, RunFolder.open(resume)) else train(Resumption(resume, tuple(lines)))
@@ -60,10 +60,10 @@ def check_settings(config: Config, run: Path) -> list[str]:
     RunFolder.open(run)
     before = _with_present_names(config_of_run(run, config.algo), config)
     changed = [*changes(before, config)]
-    if before.algo == config.algo:  # else the settings of the two algorithms cannot be compared
+    if before.algo == config.algo:  # otherwise the settings of the two algorithms can't be compared
         changed += changes(before.algorithm, config.algorithm)
     if why := refusal(changed):
-        raise UsageError(f"run {run}: {why}; a run keeps this setting: resume it without, or start a new run")
+        raise UsageError(f"run {run}: {why}; a run keeps this setting: resume it without the setting, or start a new run")
     match before.algorithm, config.algorithm:
         case OffPolicyConfig(core=str()) as had, OffPolicyConfig() as has if had.rollout_steps != has.rollout_steps:
             raise UsageError(
@@ -88,7 +88,7 @@ def check_spaces(run: Path, made_for: EnvSpaces, now: EnvSpaces) -> None:
 
 
 def first_difference(expected: Iterable[object], got: Iterable[object]) -> tuple[str, str] | None:
-    """The first two that differ, as text in one line; or their numbers; None if all are equal."""
+    """The first two that differ, or else the two counts, as text in one line; None if all are equal."""
     expected = [*expected]
     got = [*got]
     for one, other in zip(expected, got, strict=False):
@@ -108,7 +108,7 @@ def _with_present_names(before: Config, now: Config) -> Config:
 
 
 def _is_finished(config: Config, folder: RunFolder) -> bool:
-    """Whether the run has nothing left to do: it ended for a reason that holds with this configuration too."""
+    """Whether the run has nothing left to do: it ended for a reason that is also true with this configuration."""
     summary = folder.summary()
     if summary is None or summary.evaluation is None:
         return False

@@ -1,4 +1,4 @@
-"""The specification that `Welcome` brings to the workers of a run, for our training and for a user's own loop.
+"""The specification that `Welcome` brings to the workers of a run, for millrace's training and for your own loop.
 
 Imports no torch.
 """

@@ -15,7 +15,7 @@ from millrace.learner.run_setup import RunSetup
 
 @dataclass(frozen=True)
 class OpenRun:
-    """A run: what it consists of, and what it does between two updates."""
+    """A run: its parts, and everything that happens between two updates."""
 
     setup: RunSetup
     parts: RunParts
@@ -29,6 +29,6 @@ class OpenRun:
     """The data that the run learns from besides its own, if there are any."""
 
     def check_time(self) -> None:
-        """Raises `Interrupted` if the time is up that an interrupted run has."""
+        """Raises `Interrupted` if the grace time of an interrupted run is up."""
         if self.setup.interrupts.time_is_up(self.files.longest_save_s):
             raise Interrupted(self.setup.folder.shown)

@@ -1,7 +1,7 @@
 """The line that sums up a run: its state, its progress, its return. Reads little of a run folder.
 
-Rule: a folder that cannot be read is a line too, which says why. Nobody writes down that a run died, so it is what is left:
-no process trains it, and it has no results.
+Rule: a folder that can't be read also has a line, which says why. Nothing records that a run died, so this is inferred: no
+    process trains it, and it has no results.
 """
 
 from __future__ import annotations
@@ -64,17 +64,17 @@ class RunLine(NamedTuple):
 
     @property
     def begins(self) -> bool:
-        """Whether it trains, and nobody knows how far it is: its folder has no numbers before the first update."""
+        """Whether it trains, but its progress isn't known: its folder has no numbers before the first update."""
         return self.state == "training" and not (self.progress.updates or self.progress.env_steps_made)
 
     @property
     def has_numbers(self) -> bool:
-        """Whether anything says how far it is. A power failure may cost the file that does."""
+        """Whether its progress is known. A power failure may destroy the file that has it."""
         return not self.begins and (self.summary is not None or self.progress.at_s > 0.0)
 
     @property
     def done(self) -> str:
-        """How much of it is done, or why it ended before."""
+        """How much of it is done, or why it ended early."""
         if self.begins:
             return "before its first update"
         if not self.has_numbers:

@@ -1,4 +1,4 @@
-"""What exists of a run before PyTorch is imported: its folder, what a worker says of the environment, and its interrupts.
+"""The parts of a run that exist before PyTorch is imported: its folder, the described environment, and its interrupts.
 
 The order is: bind the link; make or open the run folder; start the workers (a launcher does that); let one of them describe
 the environment, while another thread imports PyTorch (`known_environment`); open the `Run` (`learner/open_run.py`), which
@@ -52,7 +52,7 @@ class KnownEnvironment:
     env: EnvSpec
     spaces: EnvSpaces
     described: DescribedEnv
-    """As a worker described it."""
+    """The environment that a worker described."""
     evaluation_limit: int | None
     """Env steps after which an episode of an evaluation is truncated, if it is."""
 
@@ -71,7 +71,7 @@ class RunSetup:
     """Whether its workers are started elsewhere, and not by this program."""
 
     def announce(self, bound: Bound) -> None:
-        """Say in the lock of the run folder that `millrace status` may ask at this address; or why it cannot."""
+        """Write into the lock of the run folder that `millrace status` may ask at this address, or why it can't."""
         address = bound.link.address
         keyring = bound.keyring
         lock = self.folder.lock
@@ -152,7 +152,7 @@ def named_environment(config: Config) -> EnvSpec:
 def known_environment(config: Config, env: EnvSpec, resume: Resumption | None, lobby: Lobby) -> KnownEnvironment:
     """The environment, as a worker in the lobby describes it. Meanwhile another thread imports PyTorch.
 
-    Of a run to `resume`, only an environment with the spaces of the run's policy is accepted. Raises `UsageError` if there
+    For a run to `resume`, only an environment with the spaces of the run's policy is accepted. Raises `UsageError` if there
     is no such environment, or no policy for it; `RunError` if no worker describes it in time; and `KeyboardInterrupt` if
     the user stops the program.
     """

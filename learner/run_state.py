@@ -1,7 +1,7 @@
-"""The state of a run: what a checkpoint holds besides the algorithm's own state, and how it is read back.
+"""The state of a run: the content of a checkpoint besides the algorithm's own state, and how it is restored.
 
-A run that is resumed takes all of it (`restore`). A new run may take a part of another run's (`start_from`): numbers alone,
-for a policy that its own settings describe. Nothing that the other folder names is imported.
+A run that is resumed takes all of it (`restore`). A new run may take a part of another run's (`start_from`): only numbers,
+for a policy that its own settings describe. Modules that the other folder names are not imported.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from millrace.protocol.specs import PolicySpec
 log = logging.getLogger("millrace.learner")
 
 MISFITS = (LookupError, ValueError, TypeError, AttributeError, ArithmeticError, RuntimeError, MemoryError, BadMessage)
-"""What loading a state of another form raises."""
+"""Exceptions from loading a state of another form."""
 POLICIES = ("best_policy", "pending_policy", "opponent_policies")  # of a `RunState`; a checkpoint has them as tensors
 RECORDS: dict[str, type[msgspec.Struct]] = {"lanes": LanePast, "acting": Weights}
 """Of a `RunState`; a checkpoint has them as bytes."""
@@ -96,11 +96,14 @@ class RunState(msgspec.Struct, kw_only=True):
 
 
 def restore(folder: RunFolder, algorithm: Algorithm) -> RunState:
-    """Load the newest whole checkpoint into the algorithm. Raises `CheckpointError` if there is none or it does not fit."""
+    """Load the newest undamaged checkpoint into the algorithm.
+
+    Raises `CheckpointError` if there is none or it does not fit.
+    """
     newest = _newest(folder.path)
     try:
         state = msgspec.convert(newest.state["past"], RunState)
-        EnvAttributes(state.env_attributes), EpisodeWindow(state.episodes, state.facts)  # they raise for what no run has
+        EnvAttributes(state.env_attributes), EpisodeWindow(state.episodes, state.facts)  # they raise for an invalid state
         for name in POLICIES:
             if (policy := newest.state.get(name)) is not None:
                 setattr(state, name, tuple(array.numpy() for array in policy))
@@ -118,7 +121,7 @@ def restore(folder: RunFolder, algorithm: Algorithm) -> RunState:
 
 
 def _check_policies(state: RunState, own: tuple[Floats, Floats]) -> None:
-    """Raise `ValueError` unless each policy that the state speaks of is there, as large as the run's `own`."""
+    """Raise `ValueError` unless each policy that the state mentions exists and is as large as the run's `own`."""
     snapshots = len(state.opponents.snapshots)
     for name, is_there, rows in (
         ("best_policy", state.best is not None, ()),
@@ -156,7 +159,7 @@ def start_from(config: Config, policy: PolicySpec, algorithm: Algorithm) -> str:
         state = _of_policy_alone(config, policy, parameters, buffers)
         taken = f"{'best ' * (parts == 'best')}policy"
     else:
-        raise UsageError(f"{where}: from_parts {parts}: expected a run with a checkpoint, got a policy alone")
+        raise UsageError(f"{where}: from_parts {parts}: expected a run with a checkpoint, got only a policy")
     try:
         algorithm.start_from(Start(state, len(parameters), critic=parts in ("critic", "all"), optimizer=parts == "all"))
     except MISFITS as error:
@@ -168,7 +171,7 @@ def start_from(config: Config, policy: PolicySpec, algorithm: Algorithm) -> str:
 
 
 def _of_policy_alone(config: Config, policy: PolicySpec, parameters: Floats, buffers: Floats) -> dict[str, Any]:
-    """What `Start.state` has of a policy. Its statistics count as much as all observations of the new run will."""
+    """`Start.state` for only a policy. Its statistics weigh as much as all observations of the new run will."""
     import torch
 
     state: dict[str, Any] = {"parameters": torch.from_numpy(parameters)}
@@ -180,7 +183,7 @@ def _of_policy_alone(config: Config, policy: PolicySpec, parameters: Floats, buf
 
 
 def _newest(run: Path) -> checkpoint.Checkpoint:
-    """The newest whole checkpoint. Raises `CheckpointError`."""
+    """The newest undamaged checkpoint. Raises `CheckpointError`."""
     newest, warnings = checkpoint.newest(run)
     for line in warnings:
         log.warning("%s", line)

@@ -1,9 +1,9 @@
-"""Standard output and error of a program: what cannot be written never ends it.
+"""Standard output and error of a program: failed writes never end it.
 
-Rule: a program opens what was closed at its start (`prepare_streams`), before it opens any file: else a file would get
-number 1 or 2, and what a library prints would go into it. Then `never_fails` takes the place of a stream. What a full disk,
-a closed pipe or a terminal that is gone does not take is dropped, and counted; a character that the encoding lacks is
-escaped. Each write is tried again, so a disk that has room again gets the next line.
+Rule: a program opens what was closed at its start (`prepare_streams`), before it opens any file: otherwise a file would get
+    number 1 or 2, and the output of libraries would go into it. Then `never_fails` replaces a stream. Output that a full
+    disk, a closed pipe or a closed terminal refuses is dropped, and counted; a character that the encoding lacks is escaped.
+    Each write is attempted, so a disk that has space again gets the next line.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Literal, TextIO
 
 
 def prepare_streams() -> None:
-    """Open what is closed of standard input, output and error, on a device that takes everything and gives nothing.
+    """Open closed ones of standard input, output and error on a device that accepts everything and returns nothing.
 
     From now on characters that the encoding of output or error lacks are escaped.
     """
@@ -25,12 +25,12 @@ def prepare_streams() -> None:
         try:
             os.fstat(number)
         except OSError:
-            os.open(os.devnull, os.O_RDWR)  # the lowest number that is free: this one
+            os.open(os.devnull, os.O_RDWR)  # gets the lowest free number: this one
     for number, name in ((1, "stdout"), (2, "stderr")):
         stream = getattr(sys, name)
         if stream is None:
             setattr(sys, name, _writer(number, "utf-8"))
-        elif isinstance(stream, io.TextIOWrapper):  # no stream of a notebook
+        elif isinstance(stream, io.TextIOWrapper):  # not a stream of a notebook
             stream.reconfigure(errors="backslashreplace")
 
 
@@ -63,7 +63,7 @@ def _writer(number: int, encoding: str) -> TextIO:
 
 
 class DroppingFile(io.RawIOBase):
-    """Writes to a file descriptor, which it does not close. Drops what it does not take."""
+    """Writes to a file descriptor, which it does not close. Drops output that the descriptor refuses."""
 
     def __init__(self, number: int) -> None:
         self.dropped_bytes = 0

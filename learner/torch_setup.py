@@ -1,10 +1,9 @@
 """The device of PyTorch, its defaults, and how many threads PyTorch and numpy have while this process learns or acts.
 
-Rules: a run has the defaults of a program that has just started: float32, the CPU, gradients. What the calling program has
-chosen for itself changes no bit of it. The numbers of threads do not depend on who imported the two first: a script, a
-notebook or the command line. numpy's matrices are so small that more threads of its BLAS gain nothing, and beside other busy
-processes they wait for one another: an update takes up to thirty times as long. Afterwards the program that called has the
-threads and defaults that it had.
+Rules: a run has PyTorch's initial defaults: float32, the CPU, gradients. The calling program's own choices don't change its
+bits. The numbers of threads do not depend on who imported the two first: a script, a notebook or the command line. numpy's
+matrices are so small that more threads of its BLAS gain nothing, and beside other busy processes they wait for one another:
+an update takes up to thirty times as long. Afterwards the calling program has its threads and defaults back.
 """
 
 from __future__ import annotations
@@ -71,7 +70,7 @@ def one_thread(*, uses_torch: bool = True) -> Iterator[None]:
 
 
 def torch_device(config: Config) -> str:
-    """Device that the settings ask for: cpu or cuda. Raises `UsageError` if there is no such device."""
+    """The device in the settings: cpu or cuda. Raises `UsageError` if there is no such device."""
     import torch
 
     if config.device == "cuda" and not torch.cuda.is_available():

@@ -305,8 +305,8 @@ class TrainKeywords(RolloutKeywords, total=False):
     """ppo, a2c, dqn, rainbow, impala, sac, td3, tqc, crossq, xqc: Number of units of the recurrent layer."""
     batch_size: int
     """ppo: Largest number of rows (steps of one env copy) in a minibatch. With core, whole sequences may exceed it.
-    dqn, rainbow, sac, td3, tqc, crossq, xqc: Number of transitions in a gradient step. With core, it takes as many
-    sequences as have this many, but at least 16.
+    dqn, rainbow, sac, td3, tqc, crossq, xqc: Number of transitions in a gradient step. With core, as many sequences as
+    make up this number, but at least 16.
     """
     n_epochs: int
     """ppo: Number of epochs: how often an update uses each row.

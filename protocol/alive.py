@@ -69,5 +69,6 @@ class Alive(Message, frozen=True):
     ended: Annotated[tuple[WorkerExit, ...], Meta(max_length=MAX_WORKERS)]
     """workers that ended a short while ago; repeated, because a message may be lost"""
     replies: Natural | None = None
-    """number of the last HeartbeatReply that came to the supervisor, if its workers share the weights that it gets; null if
-    they do not"""
+    """number of the last HeartbeatReply that the supervisor received, if its workers share the weights that it gets; null if
+    they don't
+    """

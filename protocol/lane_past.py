@@ -46,7 +46,7 @@ class LastEpisode(msgspec.Struct, frozen=True, array_like=True):
     start: Natural
     """number of the copy's start"""
     random: RandomState | None
-    """None: the episode cannot be repeated, so the copy is to start anew, under the next number, unless it is `saved`"""
+    """None: the episode cannot be repeated, so the copy starts anew, with the next number, unless it is `saved`"""
     first: Natural
     """its first row in `LanePast.action`"""
     over: bool

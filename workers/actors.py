@@ -31,7 +31,7 @@ class Actors:
         self._loaded: Weights | None = None
 
     def do(self, task: RolloutTask | EvaluationTask, send: SendRows, pulse: Pulse) -> Sequence[WorkAnswer]:
-        """Collect rollouts, or play episodes, whose rows `send` gets. `pulse` is called at every step and may raise.
+        """Collect rollouts, or play episodes and pass their rows to `send`. `pulse` is called at every step and may raise.
 
         Raises `EnvironmentFailed`, `PolicyFailed`, and what `pulse` raises.
         """

@@ -1,7 +1,7 @@
-"""Tells how far a run is: its callbacks (the terminal is one of them), `millrace status`, Prometheus.
+"""Reports how far a run is to its callbacks (the terminal is one of them), `millrace status` and Prometheus.
 
-Rule: what is told was counted before, and stands in a row of the metrics. What callbacks log is added to the row of the
-newest update, also if one of them raises. `on_checkpoint` follows a checkpoint, so what it asks for may not be in it.
+Rule: numbers are counted, and in a row of the metrics, before they are reported. Numbers that callbacks log are added to the
+row of the newest update, even if one of them raises. `on_checkpoint` follows a checkpoint, so its requests may not be in it.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ SHOW_EVERY_S = 0.2  # progress between two updates
 
 
 class Audience:
-    """All that watch one run."""
+    """Everything that watches one run."""
 
     def __init__(self, run: RunParts, callbacks: Callbacks, files: RunFiles, requests: Requests) -> None:
-        """`requests`: what callbacks ask for."""
+        """`requests`: the requests of callbacks."""
         self._config = run.config
         self._hub = run.hub
         self._tally = run.tally
@@ -44,7 +44,7 @@ class Audience:
         self._update: dict[str, Any] = {}  # facts of the last update: fields of `Progress`
         self._workers_alive = 0
         self._shown_s = 0.0
-        self._said_missing = False  # whether facts were looked for in the first episodes
+        self._said_missing = False  # whether missing facts were looked for in the first episodes
         self._finished = False
         files.on_saved = self.checkpoint_written
 
@@ -54,7 +54,7 @@ class Audience:
         self._callbacks.on_start(self.progress())
 
     def cloned(self, metrics: Mapping[str, float]) -> None:
-        """The policy was cloned, with these metrics."""
+        """Report that the policy was cloned, with these metrics."""
         found = ", ".join(f"{name.rpartition('/')[2].replace('_', ' ')} {number:.3g}" for name, number in metrics.items())
         epochs: int = getattr(self._config.algorithm, "clone_epochs", 0)
         log_notice(log, f"cloned {self._config.prior} in {epochs} epochs: {found}")
@@ -62,7 +62,7 @@ class Audience:
         self._files.write_row(self.progress(), metrics)
 
     def show_now(self) -> None:
-        """Show how far an evaluation is, or what a long wait is for, now and then."""
+        """Show now and then how far an evaluation is, or what a long wait is for."""
         now = time.monotonic()
         if now - self._shown_s >= SHOW_EVERY_S:
             self._shown_s = now
@@ -73,7 +73,7 @@ class Audience:
             self._callbacks.meanwhile(progress)
 
     def gathered(self, rollouts: Sequence[AcceptedRollout]) -> bool:
-        """These rollouts have come. True if an update is to be made of them: no callback ends the run."""
+        """Report that these rollouts have arrived. True if an update should use them: no callback ends the run."""
         began_s = time.monotonic()
         if self._callbacks.wants("on_rollouts"):
             progress = msgspec.structs.replace(
@@ -87,7 +87,7 @@ class Audience:
         return True
 
     def updated(self, metrics: Mapping[str, float]) -> None:
-        """The update that was counted last was published."""
+        """Report the last counted update, which was published."""
         self._say_missing_facts()
         self._workers_alive = self._hub.workers_alive()
         snapshot = self._hub.snapshot()
@@ -100,7 +100,7 @@ class Audience:
             self._write_logged()
 
     def evaluated(self, metrics: Row | None = None) -> None:
-        """A policy was evaluated. Without `metrics`, its update's row gets only what callbacks log."""
+        """Report an evaluation. Without `metrics`, its update's row gets only numbers that callbacks log."""
         progress = self.progress()
         if metrics is not None:
             self._write_row(progress, metrics)
@@ -110,7 +110,7 @@ class Audience:
             self._write_logged()
 
     def checkpoint_written(self) -> None:
-        """A checkpoint was written."""
+        """Report that a checkpoint was written."""
         if self._callbacks.wants("on_checkpoint"):
             self._requests.closed = "expected it earlier than in on_checkpoint: the checkpoint would lack it"
             try:
@@ -119,7 +119,7 @@ class Audience:
                 self._requests.closed = ""
 
     def finish(self, reason: str, *, cut_short: bool = False) -> None:
-        """The run has ended, and its summary is written. Does nothing if that was done.
+        """Report the end of the run, and write its summary. Does nothing the second time.
 
         `cut_short`: an error or an interrupt ended the run. Otherwise raises `RunError` if the summary cannot be written.
         """
@@ -128,7 +128,7 @@ class Audience:
             self.leave(reason, cut_short=cut_short)
 
     def leave(self, reason: str, *, cut_short: bool = True) -> None:
-        """The run has ended in this process. Without a summary, because another process may continue it."""
+        """Report the end of the run in this process, without a summary, because another process may continue it."""
         self._finished = True
         self._requests.closed = "the run has ended"
         self._callbacks.on_end(msgspec.structs.replace(self.progress(), stop_reason=reason, cut_short=cut_short))
@@ -144,7 +144,7 @@ class Audience:
     # ---------------------------------------------------------------- inside
 
     def _progress(self, snapshot: HubSnapshot, collected: int = 0) -> Progress:
-        """`collected`: env steps that wait for the next update, if that is awaited."""
+        """`collected`: env steps that wait for the next update, if the learner waits for it."""
         state = self._state
         tally = self._tally
         wall_s = self._tally.wall_s(snapshot)
@@ -184,15 +184,15 @@ class Audience:
         self._hub.report_progress(progress)
 
     def _write_logged(self) -> None:
-        """Add what callbacks logged to the row of this update, if there was one."""
+        """Add the numbers that callbacks logged to the row of this update, if there was one."""
         if (logged := self._requests.take_logged()) and self._state.version:
             self._files.write_row(self.progress(), logged)
 
     def _say_missing_facts(self) -> None:
-        """Say once which facts no episode had: perhaps they are called otherwise."""
+        """Warn once about facts that no episode had: perhaps they have another name."""
         window = self._tally.window
         if window.full and not self._said_missing:
             self._said_missing = True
             if names := [name for name, fact in window.facts.items() if fact.mean is None]:
                 last = "none of the last 100 episodes had it in the info of its last step"
-                log.warning("info_keys %s: %s; is it called so?", ", ".join(names), last)
+                log.warning("info_keys %s: %s; is the name right?", ", ".join(names), last)

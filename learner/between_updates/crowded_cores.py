@@ -14,14 +14,14 @@ from contextlib import contextmanager
 log = logging.getLogger("millrace.learner")
 
 LONG_S = 10.0
-SHARE = 0.5  # of an update in which at least one thread should compute
+SHARE = 0.5  # of an update's time in which at least one thread should compute
 
 
 class CrowdedCores:
     """Watches the updates of one run."""
 
     def __init__(self, threads: int) -> None:
-        """`threads`: of PyTorch, if they compute the updates; 0 if a GPU does."""
+        """`threads`: number of PyTorch's threads, if they compute the updates; 0 if a GPU does."""
         self._threads = threads
         self._said = False
 
@@ -35,9 +35,9 @@ class CrowdedCores:
             log.warning("%s", line)
 
     def updated(self, took_s: float, computed_s: float) -> str:
-        """An update took this long, in which all threads of this process together computed for `computed_s`.
+        """Take the duration of an update, in which all threads of this process together computed for `computed_s`.
 
-        Returns what to say; empty if there is nothing to say.
+        Returns a line for the log; empty if there is nothing to say.
         """
         if self._said or self._threads < 2 or took_s < LONG_S or computed_s > SHARE * took_s:
             return ""

@@ -1,12 +1,12 @@
 """Evaluations of one run: each version at most once, the best policy kept, and that one evaluated again at the end.
 
 A number that decided something isn't a measurement of it: the highest of several evaluations is biased upwards, and so is
-one that ended the run, because it reached the target or because a callback saw it. So the summary reports the best policy,
-and the final policy of such a run, by a second evaluation, on other episodes.
+one that ended the run, because it reached the target or because a callback saw it. So for the best policy, and for the final
+policy of such a run, the summary reports a second evaluation, on other episodes.
 
 Rule: without `eval_workers`, training waits for each evaluation. With them, an evaluation is beside training: its result
-counts when the next one is due, or at the end, and is awaited there. So it does not depend on anybody's speed what a run
-does. The policy that was evaluated is kept until then.
+counts when the next one is due, or at the end, and is awaited there. So the course of a run doesn't depend on speed. The
+evaluated policy is kept until then.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ class Evaluations:
     def __init__(self, run: RunParts, time_limit: int | None) -> None:
         """`time_limit`: env steps after which an episode of an evaluation is truncated, if any."""
         self.confirmed: Best | None = None
-        """The best policy and its second evaluation, once the run was concluded."""
+        """The best policy and its second evaluation, after `conclude`."""
         self.final: Evaluation | None = None
-        """The evaluation of the final policy to report, once the run was concluded."""
+        """The evaluation of the final policy to report, after `conclude`."""
         self.ended_by: Evaluation | None = None
         """The one that ended the run, if it was of the final policy. Then `final` is a second one, on other episodes."""
         self._run = run
@@ -43,10 +43,10 @@ class Evaluations:
         self._time_limit = time_limit
         self._tally = run.tally
         self._state = run.tally.state
-        self.write_best()  # the folder may have that of a later version, which was lost
+        self.write_best()  # the folder may have a later one, which was lost
 
     def begin_again(self, env_attributes: Array | None, watch: Callable[[], None]) -> Row | None:
-        """Begin the evaluation again that was beside training when the run was interrupted: its weights are published.
+        """Begin again the evaluation that was beside training when the run was interrupted, and publish its weights.
 
         Without `eval_workers`, as the run may be resumed, it is also ended here. Returns its metrics then. `env_attributes`:
         those of the newest weights, which may be the same, and are sent once.
@@ -59,10 +59,10 @@ class Evaluations:
         return None if self._config.eval_workers else self.end_pending(watch)
 
     def evaluate_when_due(self, watch: Callable[[], None]) -> Row | None:
-        """Make the evaluation that is due, of the newest policy. Returns its metrics.
+        """Make the evaluation that is due, of the newest policy.
 
-        With `eval_workers`, begin it, and return those of the one before: None for the first. `watch` is called several
-        times a second during an evaluation.
+        Returns its metrics. With `eval_workers`, begin it, and return those of the previous one: None for the first. `watch`
+        is called several times a second during an evaluation.
         """
         if not self._config.eval_workers:
             evaluation = self._evaluate_newest(evaluation_size(self._config), watch)
@@ -78,7 +78,7 @@ class Evaluations:
         return metrics
 
     def end_pending(self, watch: Callable[[], None]) -> Row | None:
-        """Wait for the evaluation beside training, if there is one. Returns its metrics, and which policy they are of."""
+        """Wait for the evaluation beside training, if there is one. Returns its metrics, and which policy it played."""
         state = self._state
         pending = state.pending
         policy = state.pending_policy
@@ -124,7 +124,7 @@ class Evaluations:
         folder.writes.write("best policy", lambda: folder.write_policy(spec, policy[0], policy[1], "best"))
 
     def to_report(self) -> Evaluation | None:
-        """The evaluation of the newest policy, also of a run that was cut short; none that may have ended the run."""
+        """The evaluation of the newest policy, also of a run that was cut short; None if it may have ended the run."""
         if self.final is not None:
             return self.final
         return self.of_newest() if self._tally.stop_reason() in (None, ALL_STEPS_DONE) else None
@@ -155,7 +155,7 @@ class Evaluations:
         return evaluation
 
     def _record(self, evaluation: Evaluation, of: EvaluatedPolicy) -> None:
-        """The newest evaluation is this, of this policy."""
+        """Record this evaluation, of this policy, as the newest."""
         self._state.newest_evaluation = evaluation
         self._state.evaluated = of
         self._say(evaluation, of.env_steps)
@@ -164,12 +164,12 @@ class Evaluations:
         self._tally.note = f"{env_steps:,} env steps: greedy {evaluation}"
 
     def _evaluate(self, purpose: Purpose, size: EvaluationSize, watch: Callable[[], None]) -> Evaluation:
-        """Evaluate the weights that were published last, while training waits."""
+        """Evaluate the weights that were last published, while training waits."""
         self._run.hub.begin_evaluation(self._plan(purpose, size))
         return self._end(watch)
 
     def _begin_beside(self) -> None:
-        """Begin to evaluate the weights that were published last, beside training."""
+        """Begin to evaluate the weights that were last published, beside training."""
         self._run.hub.begin_evaluation(self._plan(Purpose.EVALUATION, evaluation_size(self._config)), beside=True)
 
     def _plan(self, purpose: Purpose, size: EvaluationSize) -> EvaluationPlan:
@@ -185,8 +185,8 @@ class Evaluations:
     def _keep_if_best(self, evaluation: Evaluation, env_steps: int, policy: Callable[[], tuple[Floats, Floats]]) -> None:
         """Keep the policy that this evaluation played, after this many env steps, if none was better.
 
-        A tie keeps the newer one: it has learned more, and where all returns are equal, as in a zero-sum game that the
-        policy plays with itself, they say nothing else.
+        A tie keeps the newer one, because it has learned more. If all returns are equal, as in a zero-sum game that the
+        policy plays against itself, there is no other criterion.
         """
         state = self._state
         if state.best is None or evaluation.return_mean >= state.best[0]:

@@ -1,7 +1,7 @@
-"""Writes the files of a run: rows of metrics, checkpoints, policies, the summary. It makes them again if they were deleted.
+"""Writes the files of a run: rows of metrics, checkpoints, policies, the summary. It makes them again if they are deleted.
 
 Rule: a checkpoint is written between two updates, never during one, and holds everything that the next update depends on.
-If the disk is full, the run logs a warning and continues; at its end, it fails if the disk does not take its last state.
+If the disk is full, the run logs a warning and continues; at its end, it fails if its last state can't be written.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class RunFiles:
     """The files of one run."""
 
     def __init__(self, run: RunParts, evaluations: Evaluations, attributes: EnvAttributes) -> None:
-        """Removes the rows of updates that the checkpoint of a resumed run knows nothing of. Raises `RunError`."""
+        """Removes the rows of updates after the checkpoint of a resumed run. Raises `RunError`."""
         self._config, self._spec, self._folder, self._algorithm, self._hub, self._tally = run
         self._state = run.tally.state
         self._evaluations = evaluations
@@ -51,11 +51,11 @@ class RunFiles:
         """Called after a checkpoint was written."""
         self._metrics = MetricsLog(run.folder.path, self._state.env_steps, self._state.version)
         self._schedule = checkpoint.CheckpointSchedule(run.config.checkpoint_every_s, time.monotonic())
-        self._saved: tuple[object, ...] | None = None  # what `_position` was in the newest checkpoint
+        self._saved: tuple[object, ...] | None = None  # `_position` at the newest checkpoint
         self._saved_env_steps = self._policy_env_steps = self._state.env_steps if self._state.version else None
 
     def write_row(self, progress: Progress, metrics: Row) -> None:
-        """Write a row of metrics, or add these metrics to the newest row if that is of the same update."""
+        """Write a row of metrics, or add these metrics to the newest row if it belongs to the same update."""
         writes = self._folder.writes
         if self._metrics.gone:
             writes.write("folder", self._make_folder_again)
@@ -63,7 +63,7 @@ class RunFiles:
         writes.write("metrics", self._metrics.flush)
 
     def write_images(self, batch: Batch) -> None:
-        """Write what the policy sees in the batch of the first update."""
+        """Write the observations in the batch of the first update as pictures."""
         if self._state.version == 1:
             images = image_samples(batch.obs, self._spec.policy.seen)
             self._folder.writes.write("images", lambda: self._folder.write_images(images))
@@ -76,7 +76,7 @@ class RunFiles:
         self._schedule.saved(began_s)
         took_s = time.monotonic() - began_s
         grace_s = self._config.grace_s
-        if grace_s and self.longest_save_s <= grace_s < took_s:  # said once
+        if grace_s and self.longest_save_s <= grace_s < took_s:  # warn once
             log.warning("a checkpoint takes %.0f s, but --grace-s %g: a SIGTERM may lose work; allow more", took_s, grace_s)
         self.longest_save_s = max(self.longest_save_s, took_s)
         if self._saved == self._position():
@@ -93,9 +93,9 @@ class RunFiles:
             self.save()
 
     def save_after_error(self, error: BaseException) -> None:
-        """As `save_unless_saved` and `confirm_saved`. What a callback raises is logged: `error` ended the run, and counts.
+        """Like `save_unless_saved` and `confirm_saved`, but logs errors of callbacks, because `error` ended the run.
 
-        Raises `RunError` if the disk refuses the state and `error` says no failure, as Ctrl-C.
+        Raises `RunError` if the disk refuses the state and `error` isn't a failure, such as Ctrl-C.
         """
         try:
             self.save_unless_saved()
@@ -111,7 +111,7 @@ class RunFiles:
             log.warning("%s", refused)
 
     def confirm_saved(self) -> None:
-        """The last save: what the disk has refused is tried again for a while. Raises `RunError` if it stays refused.
+        """The last save: retry refused writes for a while. Raises `RunError` if they stay refused.
 
         Raises `RunTakenOver`, as `save` does.
         """
@@ -137,7 +137,7 @@ class RunFiles:
         return line
 
     def saved(self, *, elsewhere: bool) -> str:
-        """One line that says what can be resumed, and how; empty if nothing was learned yet.
+        """One line that says what can be resumed, and how; empty if nothing has been learned yet.
 
         `elsewhere`: see `resume_command`. A run whose environment was passed as a function can continue only in Python.
         """

@@ -1,4 +1,4 @@
-"""What every object between two updates works on. `open_run` makes it."""
+"""The parts that every object between two updates works on. `open_run` makes them."""
 
 from __future__ import annotations
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from millrace.learner.config.config import Config
 from millrace.learner.run_folder.results import ALL_STEPS_DONE
 
-BY_THE_POLICY_OF = " by the policy of "  # follows the reason if training went on while the policy was evaluated
+BY_THE_POLICY_OF = " by the policy of "  # follows the reason if training continued during the evaluation
 
 
 def reason_to_stop(
@@ -19,8 +19,8 @@ def reason_to_stop(
     """Why the run should end now, or None.
 
     `evaluation_return`: mean return of the newest greedy evaluation, if there was one. `training_return`: mean return of
-    the last episodes of training, if there were enough of them. `evaluated_before`: env steps of the policy of this
-    evaluation, if training went on meanwhile.
+    the last episodes of training, if there were enough of them. `evaluated_before`: env steps of the evaluated policy, if
+    training continued meanwhile.
     """
     target = config.target_return
     if target is not None and evaluation_return is not None and evaluation_return >= target:

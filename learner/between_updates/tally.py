@@ -21,7 +21,7 @@ from millrace.protocol.specs import RunSpec
 
 
 class Tally:
-    """What one run has made so far."""
+    """The counts of one run."""
 
     def __init__(
         self,
@@ -34,10 +34,10 @@ class Tally:
         """`state`: where the run stands. `ended_by`: why a callback has ended the run, or None. `pool`: of self-play."""
         self.pool = pool
         self.state = state
-        """Also the evaluations change it. A checkpoint adds what others hold."""
+        """The evaluations change it, too. A checkpoint adds the state of other objects."""
         self.window = EpisodeWindow.from_state(state.episodes, state.facts, spec.facts)
         self.new_episodes: tuple[Episode, ...] = ()
-        """Those that ended in the rollouts of the last update."""
+        """The episodes that ended in the rollouts of the last update."""
         due_at = state.env_steps + config.eval_every
         state.next_evaluation = min(state.next_evaluation or due_at, due_at)
         self.note = ""
@@ -53,7 +53,7 @@ class Tally:
         self._started_s = time.monotonic()
 
     def count(self, batch: Batch) -> None:
-        """An update was made of this batch."""
+        """Count an update with this batch."""
         self.state.version += 1
         self.state.env_steps += batch.env_steps
         self.window.extend(batch.episodes)
@@ -62,7 +62,7 @@ class Tally:
         self.new_episodes = batch.episodes
 
     def ratings(self) -> dict[str, float]:
-        """What a row of the metrics has of self-play."""
+        """The metrics of self-play."""
         return {} if self.pool is None else self.pool.metrics()
 
     def stop_reason(self) -> str | None:
@@ -84,12 +84,12 @@ class Tally:
     # ---------------------------------------------------------------- evaluations
 
     def evaluation_is_due(self) -> bool:
-        """Whether an evaluation is due. None is, once a callback has ended the run."""
+        """Whether an evaluation is due. No more are due once a callback has ended the run."""
         due = self._config.eval_every and self.state.env_steps >= self.state.next_evaluation
         return bool(due) and self._ended_by() is None
 
     def evaluated(self) -> None:
-        """The evaluation that was due is made. The next one is due at the next multiple that is not reached yet."""
+        """Count the evaluation that was due. The next one is due at the next multiple that hasn't been reached."""
         every = self._config.eval_every
         state = self.state
         state.next_evaluation += every * (1 + (state.env_steps - state.next_evaluation) // every)
@@ -99,7 +99,7 @@ class Tally:
     def updated(self, seconds: float) -> None:
         """Count an update that is published, this many seconds after its rollouts arrived.
 
-        Those that callbacks and the dataset took for the rollouts are among them, and do not count as the update's own.
+        They include the seconds that callbacks and the dataset took for the rollouts, which don't count as the update's own.
         """
         self._update_s += seconds - self.gathered_s
 

@@ -1,1 +1,1 @@
-"""Callbacks: a user's own code that a run calls between its steps."""
+"""Callbacks: user code that a run calls between its steps."""

@@ -10,10 +10,10 @@ from millrace.learner.run_folder.progress import Progress
 
 
 class Callback:
-    """Code of your own that a run calls. Write the methods that you want; the others cost nothing.
+    """Your own code that a run calls. Write the methods that you need; the others cost nothing.
 
     Each method gets a `Progress`. If it returns False, the run ends as if all steps were done: with a checkpoint, the final
-    evaluation and a summary. If it raises, the run ends too: the state after the last whole update is saved, then the
+    evaluation and a summary. If it raises, the run ends too: the state after the last complete update is saved, then the
     exception is raised. If a method returns anything else, the run continues.
 
     >>> import millrace
@@ -30,7 +30,7 @@ class Callback:
         return None
 
     def on_rollouts(self, progress: Progress) -> object:
-        """`progress.rollouts` have come, and an update will be made of them next. Their arrays are read-only.
+        """`progress.rollouts` have arrived, and the next update will use them. Their arrays are read-only.
 
         Not called if an earlier callback has ended the run.
         """
@@ -49,5 +49,5 @@ class Callback:
         return None
 
     def on_end(self, progress: Progress) -> object:
-        """The run has ended: `progress.stop_reason`. It is called once if `on_start` was, also after an error."""
+        """The run has ended: `progress.stop_reason`. It is called once if `on_start` was called, also after an error."""
         return None

@@ -1,7 +1,7 @@
 """All callbacks of a run as one: it calls them in order, and remembers whether one of them ended the run.
 
-Rule: what a callback raises passes through, with a note that names the callback. `on_end` is called for every callback that
-was started, also if an earlier one raised. A function among the callbacks is called to show how far the run is: after each
+Rule: exceptions of callbacks pass through, with a note that names the callback. `on_end` is called for every callback that
+was started, even if an earlier one raised. A function among the callbacks is called to show how far the run is: after each
 update and evaluation, several times a second during an evaluation or a long wait, and at the end.
 """
 
@@ -36,7 +36,7 @@ class Callbacks:
 
     @staticmethod
     def of(watch: Watch) -> Callbacks:
-        """The callbacks of a run that was given its callbacks, or one function."""
+        """The callbacks of a run, from its callbacks or one function."""
         return watch if isinstance(watch, Callbacks) else Callbacks([watch])
 
     def with_named(self, names: Sequence[str]) -> Self:
@@ -59,7 +59,7 @@ class Callbacks:
             self._call_one(callback, "on_start", progress)
 
     def on_rollouts(self, progress: Progress) -> bool:
-        """Rollouts have come. Returns whether an update is to be made of them; if not, the other callbacks are not told."""
+        """Rollouts have arrived. Returns whether an update should use them; if not, later callbacks are not called."""
         for callback in self._callbacks:
             if self.stop_reason is None:
                 self._call_one(callback, "on_rollouts", progress)
@@ -80,12 +80,12 @@ class Callbacks:
         self._show(progress)
 
     def on_checkpoint(self, progress: Progress) -> None:
-        """A checkpoint was written. That before `on_start` is not told."""
+        """A checkpoint was written. Nothing is called for one before `on_start`."""
         if self._started:
             self._call("on_checkpoint", progress)
 
     def on_end(self, progress: Progress) -> None:
-        """The run has ended. Raises what the first callback raised; what others raise is logged."""
+        """The run has ended. Raises the first callback's exception; those of others are logged."""
         raised: BaseException | None = None
         calls = [self._show]
         calls += [lambda progress, each=each: _call(each, "on_end", progress) for each in self._started]  # type: ignore[misc]
@@ -127,13 +127,13 @@ def _call(callback: object, moment: str, progress: Progress) -> object:
         return method(progress)
     except BaseException as error:
         note = one_line(f"raised in {_name(callback, moment)}", 300)
-        if note not in getattr(error, "__notes__", ()):  # a function may raise it again when the run ends
+        if note not in getattr(error, "__notes__", ()):  # a function may raise the same error again when the run ends
             error.add_note(note)
         raise
 
 
 def _method(callback: object, moment: str) -> Callable[[Progress], object] | None:
-    """The method of this callback, unless it is that of `Callback`, which does nothing; of a function, `__call__`."""
+    """The method of this callback, unless it is the empty one of `Callback`; for a function, `__call__`."""
     if moment == "__call__":
         return None if not callable(callback) or any(hasattr(callback, each) for each in MOMENTS) else callback
     found: Any = getattr(callback, moment, None)

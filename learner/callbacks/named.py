@@ -1,6 +1,6 @@
 """A callback by its name, `module:factory`: the module is imported, and the factory (or class) is called without arguments.
 
-Rule: whatever is wrong with the name is one line that quotes it. What the user's code raised has its traceback as detail.
+Rule: an error in the name is one line that quotes it. If user code raised, its traceback is the detail.
 """
 
 from __future__ import annotations

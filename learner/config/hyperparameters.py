@@ -190,7 +190,7 @@ class OffPolicyConfig(AlgorithmConfig, frozen=True):
     learning_rate_schedule: Free[Schedule] = "constant"
     """linear: the learning rate falls to zero over the run."""
     batch_size: Free[Count] = 64
-    """Number of transitions in a gradient step. With core, it takes as many sequences as have this many, but at least 16."""
+    """Number of transitions in a gradient step. With core, as many sequences as make up this number, but at least 16."""
     learning_starts: Free[Natural] = 1000
     """Number of env steps before the first gradient step."""
     replay_size: Fixed[Count] = 100_000
@@ -314,7 +314,7 @@ class ContinuousConfig(OffPolicyConfig, frozen=True):
     net: Fixed[tuple[Count, ...]] = (256, 256)
     """Sizes of the hidden layers: of the actor and of each critic."""
     batch_size: Free[Count] = 256
-    """Number of transitions in a gradient step. With core, it takes as many sequences as have this many, but at least 16."""
+    """Number of transitions in a gradient step. With core, as many sequences as make up this number, but at least 16."""
     learning_starts: Free[Natural] = 100
     """Number of env steps before the first gradient step. Until then, actions are drawn uniformly."""
     replay_size: Fixed[Count] = 1_000_000

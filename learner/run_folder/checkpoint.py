@@ -62,8 +62,8 @@ class _Unreadable(Exception):
 def save(folder: Path, state: dict[str, Any], env_steps: int, keep: int) -> Path:
     """Write a checkpoint into the run folder.
 
-    Of it and earlier ones, keep the newest `keep`. A later one stays: a resumed run skipped it because it is damaged. Raises
-    `CheckpointError` if it cannot be written; older checkpoints then stay untouched. Raises `UsageError` if the state
+    The newest `keep` checkpoints up to this one are kept. A later one stays: a resumed run skipped it because it is damaged.
+    Raises `CheckpointError` if it cannot be written; older checkpoints then stay untouched. Raises `UsageError` if the state
     contains something that could not be read back.
     """
     import torch

@@ -223,7 +223,7 @@ def test_an_info_that_is_no_plain_data_arrives_as_its_repr_with_one_warning(capl
             infos = env.step(action)[4]
         assert infos["odd"].tolist() == ["<odd>", "<odd>"]
     assert [record.message for record in caplog.records].count(
-        "info odd of row 0 is no plain data: it arrives as its repr, a string"
+        "info odd of row 0 is not plain data: it arrives as its repr, a string"
     ) == 1
 
 

@@ -87,7 +87,7 @@ def test_a_run_whose_environment_only_the_script_has_goes_on_in_python(tmp_path:
     with pytest.raises(UsersError) as caught:
         millrace.train(lambda: Identity(), callbacks=[raises_at(2, UsersError())], **settings)
     folder = str(folder_of(tmp_path / "runs"))
-    assert caught.value.__notes__[-1].endswith(f"; go on in Python with: millrace.train(ENV, resume={folder!r})")
+    assert caught.value.__notes__[-1].endswith(f"; continue in Python with: millrace.train(ENV, resume={folder!r})")
 
 
 def test_the_command_that_goes_on_is_of_the_same_kind_and_may_be_pasted_into_a_shell() -> None:
