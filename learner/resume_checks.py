@@ -124,7 +124,7 @@ def _is_finished(config: Config, folder: RunFolder) -> bool:
 def _differences(before: Config, config: Config, changed: Sequence[Change]) -> list[str]:
     same_copies = before.envs // before.lanes == config.envs // config.lanes
     goes_on = same_copies and config.lost_lanes == "continue"
-    episodes = "lanes that the run had continue" if goes_on else "every lane begins new episodes"
+    episodes = "its earlier lanes continue" if goes_on else "every lane begins new episodes"
     lines = [
         f"{name}: {given} now, {had} before; {episodes}"
         for name, on_resume, had, given in changed

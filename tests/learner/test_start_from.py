@@ -279,7 +279,7 @@ def test_a_policy_alone_brings_the_statistics_that_it_acts_with(tmp_path: Path) 
     algorithm.update(rows(algorithm, 3), no_pulse)
     for name, now in statistics(algorithm).items():
         np.testing.assert_allclose(now, found[name], atol=0.01)
-    assert "from_parts critic: expected a run with a checkpoint, got a policy alone" in refusal(
+    assert "from_parts critic: expected a run with a checkpoint, got only a policy" in refusal(
         "ppo", tmp_path, alone, from_parts="critic"
     )
 

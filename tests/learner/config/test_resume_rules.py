@@ -133,7 +133,7 @@ def test_a_launcher_gets_the_run_and_what_is_different(tmp_path: Path) -> None:
 )
 def test_the_refusal_names_setting_values_and_what_to_do(tmp_path: Path, changed: dict[str, Any], says: str) -> None:
     run = a_run(tmp_path)
-    with pytest.raises(UsageError, match=rf"^run {run}: {says}.*resume it without, or start a new run$"):
+    with pytest.raises(UsageError, match=rf"^run {run}: {says}.*resume it without the setting, or start a new run$"):
         check_settings(resolve(resume=run, **changed), run)
 
 
@@ -152,8 +152,8 @@ def test_the_rest_is_taken(tmp_path: Path) -> None:
     assert lines == [f"run {run}: lanes: 2 now, 4 before; every lane begins new episodes"]
     lines = check_settings(resolve(resume=run, lanes=2, envs=4), run)
     assert lines == [
-        f"run {run}: envs: 4 now, 8 before; lanes that the run had go on",
-        f"run {run}: lanes: 2 now, 4 before; lanes that the run had go on",
+        f"run {run}: envs: 4 now, 8 before; its earlier lanes continue",
+        f"run {run}: lanes: 2 now, 4 before; its earlier lanes continue",
     ]
 
 

@@ -217,7 +217,7 @@ def test_a_resume_with_other_fixed_settings_is_one_line_and_changes_nothing(tmp_
     ):
         for command in ("train", "learner"):
             line = refusal(capsys, command, "--resume", str(run), *flags)
-            assert f"run {run}: {says}; a run keeps this setting: resume it without, or start a new run" in line
+            assert f"run {run}: {says}; a run keeps this setting: resume it without the setting, or start a new run" in line
     assert {file.name: file.read_bytes() for file in run.iterdir()} == before
 
 

@@ -151,7 +151,9 @@ def test_a_row_has_all_choices_then_all_bits_then_all_numbers() -> None:
     "space", [spaces.Tuple([]), spaces.Dict({}), spaces.Tuple([spaces.Discrete(2), spaces.Dict({"a": spaces.Tuple([])})])]
 )
 def test_a_dict_or_tuple_of_no_actions_is_refused(space: Any) -> None:
-    with pytest.raises(UsageError, match=r"^action space .*: expected at least one space in each Dict and Tuple, got one"):
+    with pytest.raises(
+        UsageError, match=r"^action space .*: expected at least one space in each Dict and Tuple, got an empty one"
+    ):
         action_spec(space)
 
 

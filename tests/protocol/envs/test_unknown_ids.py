@@ -286,7 +286,7 @@ def test_the_line_about_observations_names_a_wrapper_that_helps(env: gymnasium.E
     line = str(why.value)
     assert line.endswith(advice)
     assert "\n" not in line
-    wrapper = line.partition("--wrappers ")[2].partition(" leaves")[0].partition(" makes")[0].strip('"')
+    wrapper = line.partition("--wrappers ")[2].partition(" keeps")[0].partition(" makes")[0].strip('"')
     if wrapper.startswith("gymnasium."):
         from millrace.protocol.envs.wrappers import wrap
 

@@ -359,14 +359,14 @@ def test_the_hand_made_weights_are_good_ones() -> None:
         ([], "expected 1 to 256 frames, got 0"),
         ([b""] * (MAX_FRAMES + 1), "expected 1 to 256 frames, got 257"),
         ([b"\xc0" * (MAX_HEAD_BYTES + 1)], "head expected at most 1048576 bytes"),
-        ([b"\x91" * 100_000], "head is not a message of ours"),  # nested a hundred thousand deep
-        ([b"\x81\xa1a" * 100_000], "head is not a message of ours"),
+        ([b"\x91" * 100_000], "head is not a message of millrace"),  # nested a hundred thousand deep
+        ([b"\x81\xa1a" * 100_000], "head is not a message of millrace"),
         ([b"\xdd\xff\xff\xff\xff"], "exceeds max_array_len"),  # says it has four thousand million items
         ([b"\xdf\xff\xff\xff\xff"], "exceeds max_map_len"),
-        ([b"\xdb\xff\xff\xff\xff"], "head is not a message of ours"),
-        ([b"\xc7\x01\x05x"], "head is not a message of ours"),  # an extension type
-        ([b"\xd6\xff\x00\x00\x00\x00"], "head is not a message of ours"),  # a timestamp
-        (head([1] * 70_000), "head is not a message of ours"),
+        ([b"\xdb\xff\xff\xff\xff"], "head is not a message of millrace"),
+        ([b"\xc7\x01\x05x"], "head is not a message of millrace"),  # an extension type
+        ([b"\xd6\xff\x00\x00\x00\x00"], "head is not a message of millrace"),  # a timestamp
+        (head([1] * 70_000), "head is not a message of millrace"),
         (head(["Nothing"]), "Invalid value 'Nothing' - at `$[0]`"),
         (head(["Nothing - at `$[1]`"]), "Invalid value 'Nothing - at `$[1]`' - at `$[0]`"),
         (head(["x" * 1_000_000]), "Invalid value 'xxx"),
@@ -377,9 +377,9 @@ def test_the_hand_made_weights_are_good_ones() -> None:
         (head({"type": "x" * 1_000_000}), "Invalid value 'xxx"),
         (head({"type": "Hello\nworker w1 said: all is well"}), r"Invalid value 'Hello\nworker w1 said"),
         (head({"type": ["x" * 100]}), "Expected `str`, got"),
-        (head({1: 2}), "head is not a message of ours"),
-        (head({}), "head is not a message of ours"),
-        (head(None), "head is not a message of ours"),
+        (head({1: 2}), "head is not a message of millrace"),
+        (head({}), "head is not a message of millrace"),
+        (head(None), "head is not a message of millrace"),
         ([*sent(WEIGHTS), b"more"], "Weights: expected 2 arrays, got 3 frames"),
         (sent(WEIGHTS)[:-1], "array frame expected 1 to 1, got 2"),
         (weights(["|O", [1], 2], bytes(8)), "array dtype expected a supported one"),

@@ -84,7 +84,7 @@ def test_a_resumed_run_may_ask_for_others(run: Path, tmp_path: Path, caplog: pyt
     assert later[1] < 50, "the distances of the episodes before are kept"
     said = [record.getMessage() for record in caplog.records if "info_keys" in record.getMessage()]
     assert said == [
-        "info_keys is_sucess: none of the last 100 episodes had it in the info of its last step; is it called so?"
+        "info_keys is_sucess: none of the last 100 episodes had it in the info of its last step; is the name right?"
     ]
 
 
