@@ -96,7 +96,7 @@ class WorkerOptions:
     shared_weights: SharedWeightsReader | None = None
     """The weights that the supervisor receives for all its workers."""
     exit_code: Callable[[int, str], int] = _same_exit_code
-    """Exit code of the process, from that of the conversation and the reason for leaving."""
+    """The exit code of the process, from the conversation's exit code and the reason for leaving."""
     make_actors: MakeActors = make_local_actors
     """Makes the actors of a run."""
 

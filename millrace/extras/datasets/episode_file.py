@@ -93,7 +93,7 @@ class _RememberingFile(io.RawIOBase):
         return offset
 
     def readinto(self, buffer: Any) -> int:
-        """Read what was written, or seems to be; zeros beyond the end."""
+        """Read written data, including data that only seems to be written; zeros beyond the end."""
         wanted = memoryview(buffer).cast("B")
         found = os.pread(self._descriptor, len(wanted), self._at)
         wanted[:] = found.ljust(len(wanted), b"\0")

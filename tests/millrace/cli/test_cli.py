@@ -417,7 +417,7 @@ def test_keys_are_made_shown_allowed_and_revoked(tmp_path: Path, capsys: Capture
     assert advice[:2] == ["keys", "allow"]
     assert says(*advice[1:], *here) == ["home may connect"]
 
-    assert "is shut out" in says("revoke", "lab", *here)[0]
+    assert "is revoked" in says("revoke", "lab", *here)[0]
     shown = says("show", *here)
     assert re.search(r"^lab .* revoked \d{4}", shown[2])
     assert re.search(r"^home .* may connect$", shown[3])
