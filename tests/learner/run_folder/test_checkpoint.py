@@ -220,7 +220,7 @@ def test_the_pickle_that_torch_reads_is_the_one_that_is_rehearsed(tmp_path: Path
     path = checkpoint.save(tmp_path, {"x": 1}, 100, keep=1)
     whole = path.read_bytes()
     path.write_bytes(pickle.dumps({"format": 1, "env_steps": 100, "state": {"x": 2}}, protocol=2) + whole)
-    with pytest.raises(CheckpointError, match=r"it isn.t an archive that torch"):
+    with pytest.raises(CheckpointError, match="it isn't an archive that torch"):
         checkpoint.load(path)
     torch.save({"format": 1, "env_steps": 3, "state": {"x": Calls(bytearray, 1000)}}, path)
     path.write_bytes(path.read_bytes().replace(b"/data.pkl", b"/DATA.pkl"))
