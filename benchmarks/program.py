@@ -53,6 +53,11 @@ BENCHMARKS = {
     "slow": Benchmark(
         "slow", "PPO on an environment whose steps sleep 5 ms, compared with Stable-Baselines3", brief=("--rounds", "1")
     ),
+    "plan": Benchmark(
+        "plan",
+        "what millrace plan recommends and expects, compared with runs",
+        brief=("--envs", "waits for 5 ms", "--seconds", "2"),
+    ),
     "python": Benchmark(
         "from_python",
         "training from a script and a notebook, compared with the command line, alone and beside busy processes",

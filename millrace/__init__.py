@@ -41,6 +41,8 @@ if TYPE_CHECKING:
     from millrace.learner.run_folder.results import Evaluation, RecordedDataset, Summary
     from millrace.loaded_policy import LoadedPolicy, load
     from millrace.own_policy import OwnPolicy
+    from millrace.planning.plan import plan
+    from millrace.planning.run_plan import RunPlan
     from millrace.playing import evaluate, record
     from millrace.policies import CNN, MLP, Piece, PolicyParameters, Recurrent
     from millrace.protocol.envs.tuple_of_agents import TupleOfAgents
@@ -77,6 +79,7 @@ __all__ = [
     "RolloutService",
     "Run",
     "RunError",
+    "RunPlan",
     "Stalled",
     "Summary",
     "TupleOfAgents",
@@ -89,6 +92,7 @@ __all__ = [
     "evaluate",
     "load",
     "make_vec",
+    "plan",
     "record",
     "testing",
     "train",
@@ -113,12 +117,14 @@ _IMPORTED_WHEN_USED = {
     "RolloutBatch": "millrace.rollout_service",
     "RolloutService": "millrace.rollout_service",
     "Run": "millrace.runs",
+    "RunPlan": "millrace.planning.run_plan",
     "Summary": "millrace.learner.run_folder.results",
     "TupleOfAgents": "millrace.protocol.envs.tuple_of_agents",
     "env_copy": "millrace.workers.copy_slots",
     "evaluate": "millrace.playing",
     "load": "millrace.loaded_policy",
     "make_vec": "millrace.launch.vector",
+    "plan": "millrace.planning.plan",
     "record": "millrace.playing",
     "train": "millrace.runs",
 }

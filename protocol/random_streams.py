@@ -56,6 +56,8 @@ class Purpose(IntEnum):
     """which opponent plays in a rollout; lane, round"""
     PLAYED_OPPONENTS = 19
     """actions of opponents in an episode, from its reset seed"""
+    ROUNDS = 20
+    """times of the rounds that `millrace plan` imagines"""
 
 
 def generator(seed: int, purpose: Purpose, *indices: int) -> np.random.Generator:

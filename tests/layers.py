@@ -66,6 +66,7 @@ NO_PROCESS = (
     "tests/learner/run_folder/test_run_format.py",
     "tests/learner/run_folder/test_run_lock.py",
     "tests/learner/vector_env/test_order_coordinator.py",
+    "tests/millrace/planning/",
     "tests/protocol/",
     "tests/test_layers.py",
     "tests/workers/collect/",

@@ -65,9 +65,10 @@ WORKERS = {  # the same for each folder and file of the workers; the files that 
     "vector_env": {"activity", "copies", "copy_slots"},
 }
 MILLRACE = {  # the same for each folder of the public package
-    "cli": {"flags", "launch", "play_flags", "playing", "terminal"},
+    "cli": {"flags", "launch", "planning", "play_flags", "playing", "terminal"},
     "flags": set[str](),
     "launch": {"arguments", "flags", "own_policy", "policies", "terminal"},
+    "planning": {"arguments", "launch", "policies", "rollout_service"},
 }
 ROOMS = {"learner": LEARNER, "workers": WORKERS, "millrace": MILLRACE}
 MAY_PRINT = ("millrace/cli/", "millrace/terminal.py")

@@ -68,6 +68,7 @@ COMMANDS = {  # where no test of a fault or a feature runs the command
     "worker --stay": "test_stay.py::test_a_worker_serves_two_runs_of_other_environments_and_ends_with_sigterm",
     "worker without PyTorch": "test_thin_worker.py::test_workers_join_and_status_shows_the_run",
     "status": "test_local_run.py::test_status_asks_the_learner_that_train_started_by_its_run_folder",
+    "plan": ("test_plan.py::test_the_command_measures_an_environment_that_waits_and_names_a_command_that_trains"),
     "launch": "test_launch_kubernetes.py::test_the_commands_of_the_manifest_train",
     "dashboard": "test_page_beside.py::test_its_address_is_said_and_it_shows_the_end_of_the_run[workers]",
     "evaluate": "test_evaluation.py::test_a_run_reports_the_same_evaluation_whatever_the_number_of_workers",

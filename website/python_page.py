@@ -35,7 +35,8 @@ GROUPS = {
     "training": Group(
         "Train and look at runs",
         "[Settings](../settings.md) has the meaning and the range of every keyword of `train`.",
-        "train Run Metrics Summary Evaluation evaluate record RecordedDataset extras.monitoring.dashboard.Dashboard",
+        "plan RunPlan train Run Metrics Summary Evaluation evaluate record RecordedDataset "
+        "extras.monitoring.dashboard.Dashboard",
     ),
     "policies": Group("Use a policy", "A saved policy acts without its environment or algorithm.", "load LoadedPolicy"),
     "callbacks": Group(

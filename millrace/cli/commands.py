@@ -32,6 +32,7 @@ class Command(NamedTuple):
 GROUPS = {  # one line a command
     "Train": {
         "train": Command("millrace.cli.train:train", "ENV [flags]", "train on this machine: a learner and its worker processes"),
+        "plan": Command("millrace.cli.plan:run", "ENV [flags]", "step an environment here, and say what to choose and what to expect"),
         "presets": Command("millrace.cli.presets:run", "", "list settings that are known to work"),
     },
     "Train with workers on other machines": {

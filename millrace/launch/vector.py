@@ -137,13 +137,21 @@ def make_vec(
         observation_mode=observation_mode,
         on_worker_loss=on_worker_loss,
         timeout_s=timeout,
-        call_timeouts=_call_timeouts(timeout),
+        call_timeouts=call_timeouts_of(timeout),
         max_env_failures=max_env_failures,
         copy=copy,
         render_mode=render_mode,
         kwargs=kwargs,
         wrappers=wrappers,
     )
+    return start_vector_env(settings, Crew())
+
+
+def start_vector_env(settings: VectorEnvSettings, crew: Crew) -> ZmqVectorEnv:
+    """Start a vector environment and wait for its workers, which have the logs and cores of this crew.
+
+    Raises `UsageError`, `NoWorkers` and `EnvironmentFailed`.
+    """
     deaths = FailureCount(settings.max_env_failures, len(settings.envs), time.monotonic())
 
     def died(event: Failed) -> None:
@@ -164,7 +172,7 @@ def make_vec(
     resources = ExitStack()
     try:
         pool = open_vector_env_pool(settings, resources)
-        lobby = resources.enter_context(pool.start(Crew(), before))
+        lobby = resources.enter_context(pool.start(crew, before))
         made = pool.vector_env(lobby.describe(pool.requested.to_describe))
         made.hub.on_death = died
         made.hub.while_waiting = deaths.check
@@ -267,7 +275,7 @@ def open_vector_env_pool(settings: VectorEnvSettings, resources: ExitStack) -> V
     return VectorEnvPool(settings, requested, pool, resources)
 
 
-def _call_timeouts(timeout_s: float) -> CallTimeouts:
+def call_timeouts_of(timeout_s: float) -> CallTimeouts:
     """How long a call of the environment may take before its worker is ended.
 
     This is longer than `timeout_s`, after which the learner gives the worker up, and kills it if it is local. So it matters

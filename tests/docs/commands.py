@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 from benchmarks.program import BENCHMARKS
 from millrace import play_flags
-from millrace.cli import keys, presets, status
+from millrace.cli import keys, plan, presets, status
 from millrace.cli.commands import COMMANDS
 from millrace.cli.list import ListFlags
 from millrace.extras.conformance.command import ConformFlags
@@ -45,6 +45,7 @@ RECORDS: dict[str, type[Any]] = {
     "report": ReportFlags,
     "status": status.StatusFlags,
     "conform": ConformFlags,
+    "plan": plan.PlanFlags,
     "presets": presets.PresetsFlags,
     "worker": WorkerFlags,
 }

@@ -1,0 +1,85 @@
+"""How long an update takes on this machine: of an algorithm with its settings, and batches that somebody collects.
+
+Rule: the algorithm is made and used as in a run, with as many threads, on the same device. An algorithm with a replay buffer
+makes its gradient steps from the first update on, and has a buffer that is just large enough.
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable
+from typing import NamedTuple
+
+import msgspec
+
+from millrace.learner.algorithms import algorithm_class
+from millrace.learner.algorithms.algorithm import acting_weights
+from millrace.learner.config.config import Config
+from millrace.learner.config.costs import minibatch_rows
+from millrace.learner.config.hyperparameters import AlgorithmConfig, OffPolicyConfig
+from millrace.learner.torch_setup import one_thread, threads, torch_device
+from millrace.protocol.arrays import Floats
+from millrace.protocol.machine.core_delay import CoreDelay
+from millrace.protocol.rollout import Batch
+from millrace.protocol.specs import PolicySpec
+
+SMALL_REPLAY = 20_000  # transitions
+LEAST_UPDATES = 2
+AT_MOST = 4.0  # times the seconds; then no further update is begun
+
+
+class UpdateTime(NamedTuple):
+    """What updates take."""
+
+    per_step_s: float
+    """median time of an update if a core is free, divided by the env steps of its batch"""
+    cores: float
+    """CPU time of an update, divided by its time"""
+
+
+def update_time(
+    config: Config, policy: PolicySpec, collect: Callable[[Floats, Floats], Batch], seconds: float, workers: int
+) -> UpdateTime:
+    """Learn from batches for about so many seconds. `collect`: takes weights and buffers. `workers`: of this machine.
+
+    The first update, which begins to use memory and an empty replay buffer, is not counted if there are others. Raises
+    `MillraceError`.
+    """
+    algorithm_config = _from_the_first_step_on(config.algorithm)
+    with one_thread():
+        import torch
+
+        torch.set_num_threads(
+            config.torch_threads or threads(policy, minibatch_rows(config), config.max_lag, workers).number
+        )
+        algorithm = algorithm_class(config.algo)(
+            algorithm_config, policy, total_steps=config.steps, seed=config.seed, device=torch_device(config)
+        )
+        delay = CoreDelay()
+        per_step_s: list[float] = []
+        cores: list[float] = []
+        began_s = time.monotonic()
+        while len(per_step_s) <= LEAST_UPDATES or time.monotonic() < began_s + seconds:
+            batch = collect(*acting_weights(algorithm, policy))
+            delayed_s = delay.seconds()
+            cpu_s = time.process_time()
+            update_began_s = time.monotonic()
+            algorithm.remember()
+            algorithm.update(batch, lambda: None)
+            acting_weights(algorithm, policy)
+            took_s = time.monotonic() - update_began_s - (delay.seconds() - delayed_s)
+            per_step_s.append(took_s / batch.env_steps)
+            cores.append((time.process_time() - cpu_s) / took_s)
+            if time.monotonic() > began_s + AT_MOST * seconds:
+                break
+        delay.close()
+    counted = slice(min(1, len(per_step_s) - 1), None)
+    return UpdateTime(statistics.median(per_step_s[counted]), statistics.median(cores[counted]))
+
+
+def _from_the_first_step_on(config: AlgorithmConfig) -> AlgorithmConfig:
+    match config:
+        case OffPolicyConfig():
+            return msgspec.structs.replace(config, learning_starts=0, replay_size=min(config.replay_size, SMALL_REPLAY))
+    return config

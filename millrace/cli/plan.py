@@ -1,0 +1,47 @@
+"""`millrace plan`: measure an environment here, and show what to choose for a run and what to expect of it."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import msgspec
+from msgspec import Meta
+from rich.console import Console
+
+from millrace.flags.fields import Flag
+from millrace.flags.parse import parse_flags
+from millrace.planning.plan import LEAST_S, SECONDS, plan_of
+from millrace.planning.probe import ProbedEnv
+from millrace.planning.run_plan import screen
+from millrace.protocol.bounds import Natural
+from millrace.protocol.env_spec import Scalar
+
+
+class PlanFlags(msgspec.Struct, frozen=True, kw_only=True):
+    """Step an environment on this machine for half a minute, and say what to choose and what to expect, with the reasons."""
+
+    env: Annotated[str, Flag(positional=True)]
+    """Environment id for gymnasium.make, or a name, as for train"""
+    env_kwargs: dict[str, Scalar] = {}
+    """keyword arguments of the environment, as for train"""
+    wrappers: Annotated[tuple[str, ...], Flag("MODULE:CLASS ...")] = ()
+    """wrappers of every env copy, as for train"""
+    max_env_copies: Natural = 0
+    """most env copies that may run at the same time, as for floating licences. 0: any number"""
+    seconds: Annotated[float, Meta(ge=LEAST_S)] = SECONDS
+    """about how long it may take; more if a step or a start of the environment takes seconds"""
+    json: bool = False
+    """print one line of JSON with all that was measured"""
+
+
+def run(argv: list[str]) -> int:
+    """Print the plan. Returns the exit code."""
+    flags = parse_flags(PlanFlags, argv, "plan")
+    env = ProbedEnv(flags.env, flags.env_kwargs, flags.wrappers)
+    with Console(stderr=True).status("") as shown:
+        plan = plan_of(env, max_env_copies=flags.max_env_copies, seconds=flags.seconds, say=shown.update)
+    if flags.json:
+        print(msgspec.json.encode({"type": type(plan).__name__, **msgspec.structs.asdict(plan)}).decode())
+    else:
+        Console().print(screen(plan), highlight=False)
+    return 0

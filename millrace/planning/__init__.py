@@ -1,0 +1,1 @@
+"""What to choose for an environment, and what to expect: `millrace.plan`."""

@@ -1,0 +1,184 @@
+"""Measures what millrace itself takes on this machine: collecting and updates, with an environment that does nothing.
+
+Rule: nothing is assumed of the machine. Rounds of different sizes are timed, and what a row, a lane, a copy and a rollout
+take follows from them. CPU time is what counts, so that other programs on this machine change little.
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import gymnasium
+import msgspec
+
+from millrace.learner.algorithms import algorithm_class
+from millrace.learner.config.config import Config
+from millrace.learner.config.costs import minibatch_rows
+from millrace.learner.config.hyperparameters import OffPolicyConfig, QLearningConfig
+from millrace.learner.update_time import UpdateTime, update_time
+from millrace.planning.measurements import Overheads
+from millrace.planning.stand_in import StandIn, StandInOfAgents
+from millrace.policies import PolicyChoice
+from millrace.protocol.arrays import Floats
+from millrace.protocol.rollout import Batch
+from millrace.protocol.specs import ActionSpec, ExtraArray, Leaf, PolicySpec
+from millrace.rollout_service import RolloutBatch, RolloutService
+
+EACH_S = 0.4  # of collecting, for each size
+LEAST_ROUNDS = 3
+OF_UPDATES_S = 1.5
+MINIBATCHES = 4  # of an update that is measured
+COPIES = 8
+LONG, SHORT = 48, 8  # steps of a rollout
+MOST_WAITING_S = 0.001
+TORCH_BYTES = 200 << 20  # of a worker that acts on images, because it imports torch
+
+
+class StoodFor(NamedTuple):
+    """The environment in whose place a stand-in is stepped."""
+
+    observation: gymnasium.Space[Any]
+    action: gymnasium.Space[Any]
+    seats: tuple[str, ...] = ()
+    wait_s: float = 0.0
+    """for how long its step waits"""
+
+    def stand_in(self) -> Callable[[], Any]:
+        """Makes an environment with these spaces."""
+        wait_s = min(self.wait_s, MOST_WAITING_S)
+        if self.seats:
+            return partial(StandInOfAgents, self.observation, self.action, wait_s, agents=self.seats)
+        return partial(StandIn, self.observation, self.action, wait_s)
+
+
+class _PolicyOf(NamedTuple):
+    """The policy that an algorithm trains, as a rollout service takes it."""
+
+    config: Config
+
+    @property
+    def extra_arrays(self) -> tuple[ExtraArray, ...]:
+        return ()
+
+    def spec(self, observation: tuple[Leaf, ...], action: ActionSpec) -> PolicySpec:
+        return algorithm_class(self.config.algo).policy_spec(self.config.algorithm, observation, action)
+
+
+class _Size(NamedTuple):
+    lanes: int
+    copies: int
+    steps: int
+
+
+class _Round(NamedTuple):
+    """What a round takes one worker and the learner."""
+
+    worker_s: float
+    """CPU time"""
+    learner_s: float
+    """CPU time"""
+    wall_s: float
+    """the least"""
+
+
+def overheads(config: Config, env: StoodFor) -> Overheads:
+    """Measure them for runs with these settings. It takes some seconds. Raises `UserFacingError`."""
+    one_long = _round(config, env, _Size(1, 1, LONG))
+    one_short = _round(config, env, _Size(1, 1, SHORT))
+    many_long = _round(config, env, _Size(COPIES, COPIES, LONG))
+    many_short = _round(config, env, _Size(COPIES, COPIES, SHORT))
+    one_lane = _round(config, env, _Size(1, COPIES, LONG))
+    awake = _round(config, env._replace(wait_s=0.0), _Size(1, 1, SHORT))
+    # A worker takes base + l · per_lane + T · (row_s + l · lane_row_s + n · copy_row_s).
+    row_of_one_s = _slope(one_long.worker_s - one_short.worker_s, LONG - SHORT)
+    row_of_many_s = _slope(many_long.worker_s - many_short.worker_s, LONG - SHORT)
+    base_s = max(0.0, one_long.worker_s - LONG * row_of_one_s)
+    row_of_one_lane_s = _slope(one_lane.worker_s - base_s, LONG)
+    copy_row_s = _slope(row_of_one_lane_s - row_of_one_s, COPIES - 1)
+    lane_row_s = _slope(row_of_many_s - row_of_one_lane_s, COPIES - 1)
+    sending_s = _slope(many_long.worker_s - LONG * row_of_many_s - base_s, COPIES - 1)
+    # The learner takes base + l · per_lane + n · T · received_s.
+    received_s = _slope(many_long.learner_s - many_short.learner_s, COPIES * (LONG - SHORT))
+    taken_in_s = _slope(many_short.learner_s - one_short.learner_s - (COPIES - 1) * SHORT * received_s, COPIES - 1)
+    on_the_way_s = max(0.0, awake.wall_s - awake.worker_s - awake.learner_s)
+    update, convolves = _update(config, env)
+    return Overheads(
+        row_s=max(0.0, row_of_one_s - lane_row_s - copy_row_s),
+        lane_row_s=lane_row_s,
+        copy_row_s=copy_row_s,
+        sent_s=sending_s,
+        round_s=max(0.0, one_short.learner_s - SHORT * received_s - taken_in_s) + base_s + on_the_way_s,
+        rollout_s=taken_in_s,
+        received_s=received_s,
+        update_s=update.per_step_s,
+        update_cores=update.cores,
+        acting_bytes=TORCH_BYTES if convolves else 0,
+    )
+
+
+def _slope(difference: float, by: float) -> float:
+    """Times that were measured may differ by less than they vary; none is negative."""
+    return max(0.0, difference) / by
+
+
+def _service(config: Config, env: StoodFor, size: _Size) -> RolloutService:
+    policy: PolicyChoice = _PolicyOf(config)
+    return RolloutService(env.stand_in(), policy, rollout_steps=size.steps, workers=1, envs=size.copies, lanes=size.lanes)
+
+
+def _round(config: Config, env: StoodFor, size: _Size) -> _Round:
+    """What a round of this size takes."""
+    found: list[_Round] = []
+    with _service(config, env, size) as service:
+        parameters = service.policy.initial()
+        service.publish(parameters)
+        service.gather()
+        end_at_s = time.monotonic() + EACH_S
+        while len(found) < LEAST_ROUNDS or time.monotonic() < end_at_s:
+            cpu_s = time.process_time()
+            began_s = time.monotonic()
+            service.publish(parameters)
+            batch = service.gather()
+            wall_s = time.monotonic() - began_s
+            found.append(_Round(float(batch.reward.sum(dtype=float)), time.process_time() - cpu_s, wall_s))
+    return _Round(
+        worker_s=statistics.median(each.worker_s for each in found),
+        learner_s=statistics.median(each.learner_s for each in found),
+        wall_s=min(each.wall_s for each in found),
+    )
+
+
+def _update(config: Config, env: StoodFor) -> tuple[UpdateTime, bool]:
+    """What updates take, and whether the policy has convolutions."""
+    size = _Size(1, config.envs, _steps_of_update(config))
+    with _service(config, env, size) as service:
+
+        def collect(parameters: Floats, buffers: Floats) -> Batch:
+            service.publish(parameters, buffers)
+            return _as_algorithms_take_it(service.gather())
+
+        policy = service.run.policy
+        taken = msgspec.structs.replace(config, torch_threads=None)
+        return update_time(taken, policy, collect, OF_UPDATES_S, config.workers), policy.convolves
+
+
+def _steps_of_update(config: Config) -> int:
+    """Steps of a rollout, fewer than in a run if an update of fewer takes in proportion less."""
+    steps = config.algorithm.rollout_steps
+    match config.algorithm:
+        case QLearningConfig():  # whose number of gradient steps in an update is a setting
+            return steps
+        case OffPolicyConfig():
+            return max(1, steps // 4)
+    of_minibatches = -(-MINIBATCHES * minibatch_rows(config) // config.envs)
+    return min(steps, max(SHORT, of_minibatches))
+
+
+def _as_algorithms_take_it(batch: RolloutBatch) -> Batch:
+    """The same batch, with the leaves of its observations in a tuple."""
+    leaves = tuple(batch.obs.values()) if isinstance(batch.obs, dict) else (batch.obs,)
+    return Batch(**{name: getattr(batch, name) for name in Batch.__struct_fields__} | {"obs": leaves})

@@ -1,0 +1,220 @@
+"""`millrace.plan`: measures an environment and this machine, and says what to choose and what to expect."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache
+
+import msgspec
+
+from millrace.arguments import checked
+from millrace.learner.algorithms.replay.available_memory import available_bytes
+from millrace.learner.config.config import Config
+from millrace.learner.config.hyperparameters import OffPolicyConfig
+from millrace.learner.config.layers import resolve
+from millrace.planning.expected_rate import Situation, Sizes, steps_per_s
+from millrace.planning.in_words import counted, number_in_words, time_in_words
+from millrace.planning.measurements import Machine
+from millrace.planning.overheads import StoodFor, overheads
+from millrace.planning.probe import ProbedEnv, probe
+from millrace.planning.recommendation import (
+    NEEDED_STEPS,
+    ChosenSetting,
+    Learning,
+    best,
+    candidates,
+    choose_algorithm,
+    choose_replay_size,
+    on_machines,
+    reasons,
+)
+from millrace.planning.run_plan import ExpectedSpeed, RunPlan, train_command
+from millrace.protocol.env_spec import EnvLike
+from millrace.protocol.envs.wrappers import WrapperLike, wrapper_names
+from millrace.protocol.errors import UsageError
+from millrace.protocol.machine.cpu_cores import usable_cores
+from millrace.protocol.random_streams import Purpose, generator
+from millrace.workers.machine_slots import copies_per_machine
+
+SECONDS = 30.0
+OF_PROBE = 0.7  # of the seconds; then millrace's own part is measured
+LEAST_S = 5.0
+EVALUATION_COPIES = Config().eval_copies
+MACHINES = (1, 2, 10)
+BUSY = 0.5  # load average, divided by the cores
+RESETS_COUNT = 1.1  # resets in the background are worth a line if they make a run faster by this factor
+SLOW_START_S = 10.0
+
+
+@checked
+def plan(
+    env: EnvLike,
+    *,
+    env_kwargs: Mapping[str, bool | int | float | str] | None = None,
+    wrappers: Sequence[WrapperLike] = (),
+    max_env_copies: int = 0,
+    seconds: float = SECONDS,
+) -> RunPlan:
+    """Step an environment in workers of this machine, and say what to choose for a run and what to expect of it.
+
+    Its actions are random. One copy is stepped, then several side by side; then millrace's own part is measured, with an
+    environment that does nothing. Your environment runs in workers only, so that a crash or a hang is a line of `advice`.
+
+    Args:
+        env: an id that `gymnasium.make` takes, a `gymnasium.envs.registration.EnvSpec`, or a callable that returns an
+            environment. It may be of PettingZoo's, with several agents.
+        env_kwargs: keyword arguments of the environment.
+        wrappers: as of `millrace.train`.
+        max_env_copies: most env copies that may run at the same time, as for floating licences. 0: any number.
+        seconds: about how long it may take. Give it more if a step or a start takes seconds.
+
+    Raises `UsageError` if an argument is wrong or the environment cannot be found, and `RunError`, such as
+    `EnvironmentFailed`, if it could make no step.
+
+    >>> import millrace
+    >>> plan = millrace.plan("Pendulum-v1", seconds=6)
+    >>> plan.command.split()[:3], plan.steps_per_s > 0
+    (['millrace', 'train', 'Pendulum-v1'], True)
+    """
+    probed = ProbedEnv(env, dict(env_kwargs or {}), tuple(wrappers))
+    return plan_of(probed, max_env_copies=max_env_copies, seconds=seconds, say=lambda line: None)
+
+
+def plan_of(env: ProbedEnv, *, max_env_copies: int, seconds: float, say: Callable[[str], None]) -> RunPlan:
+    """As `plan`. `say` is told what is measured next."""
+    if seconds < LEAST_S:
+        raise UsageError(f"plan: seconds: expected at least {LEAST_S:g}, got {seconds:g}")
+    if max_env_copies < 0:
+        raise UsageError(f"plan: max_env_copies: expected at least 0, got {max_env_copies}")
+    allowed = min([number for number in (max_env_copies, copies_per_machine()) if number], default=0)
+    if allowed == 1:
+        raise UsageError("plan: expected at least 2 env copies that may run, of which one plays evaluations, got 1")
+    machine = Machine(
+        cores=usable_cores(),
+        free_bytes=available_bytes(),
+        most_copies=allowed - _evaluation_copies(allowed) if allowed else 0,
+        load=os.getloadavg()[0],
+    )
+    say(f"stepping {env.name}, with random actions")
+    probed = probe(env, machine, OF_PROBE * seconds)
+    measured = probed.measured
+    algorithm = choose_algorithm(measured, machine)
+    config = resolve(env.name, algo=algorithm.value)
+    others = _limits(max_env_copies, allowed)
+    if isinstance(config.algorithm, OffPolicyConfig):
+        replay_size = choose_replay_size(config.algorithm.replay_size, measured, machine)
+        others += [] if replay_size is None else [replay_size]
+    say(f"updating with {config.algo}, and an environment that does nothing")
+    stood_for = StoodFor(probed.observation_space, probed.action_space, probed.seats, measured.alone.wait_s)
+    situation = Situation(measured=measured, overheads=overheads(config, stood_for), machine=machine)
+    return _decided(env, config, situation, [algorithm], others)
+
+
+def _limits(max_env_copies: int, allowed: int) -> list[ChosenSetting]:
+    """The settings that keep a run within the number of copies that are allowed."""
+    found = []
+    if max_env_copies:
+        found.append(ChosenSetting("max_env_copies", max_env_copies, "with those of evaluations"))
+    if allowed and (evaluating := _evaluation_copies(allowed)) < EVALUATION_COPIES:
+        why = f"so that {allowed - evaluating} of {counted(allowed, 'copy', 'copies')} train"
+        found.append(ChosenSetting("eval_copies", evaluating, why))
+    return found
+
+
+def _evaluation_copies(allowed: int) -> int:
+    """How many of the copies that are allowed play evaluations: the default number, unless that would be a third of them."""
+    return EVALUATION_COPIES if not allowed or allowed >= 3 * EVALUATION_COPIES else 1
+
+
+def _decided(
+    env: ProbedEnv,
+    config: Config,
+    situation: Situation,
+    first: Sequence[ChosenSetting],
+    others: Sequence[ChosenSetting],
+) -> RunPlan:
+    """The plan that follows from all that was measured. `first`, `others`: what is chosen before and after the sizes."""
+    has_replay = isinstance(config.algorithm, OffPolicyConfig)
+    default_steps = config.algorithm.rollout_steps
+    rows = config.envs * default_steps if has_replay else None
+    learning = Learning(config.envs, default_steps, rows, situation.overheads.acting_bytes)
+
+    @cache
+    def rate(sizes: Sizes) -> float:
+        return steps_per_s(sizes, situation, generator(1, Purpose.ROUNDS))
+
+    sizes = best({each: rate(each) for each in candidates(learning, situation.measured, situation.machine)})
+    chosen = [*first, *reasons(sizes, learning, situation, rate)]
+    if sizes.rollout_steps != default_steps:
+        why = f"the policy is updated after {counted(sizes.steps_per_round, 'env step')}"
+        chosen.append(ChosenSetting("rollout_steps", sizes.rollout_steps, why))
+    chosen += others
+    needed = NEEDED_STEPS[config.algo]
+    return RunPlan(
+        env=env.name,
+        chosen=tuple(chosen),
+        expected=tuple(_expected(sizes, learning, situation, needed)),
+        needed_steps=needed,
+        advice=tuple(_advice(sizes, situation, rate(sizes))),
+        command=train_command(env.name, env.kwargs, wrapper_names(env.wrappers), tuple(chosen)),
+        measured=situation.measured,
+        overheads=situation.overheads,
+        machine=situation.machine,
+    )
+
+
+def _expected(sizes: Sizes, learning: Learning, situation: Situation, needed: int) -> list[ExpectedSpeed]:
+    found = []
+    fastest = 0.0
+    for machines in MACHINES:
+        here = on_machines(sizes, machines, learning)
+        there = msgspec.structs.replace(situation, machines=machines)
+        fastest = max(fastest, steps_per_s(here, there, generator(1, Purpose.ROUNDS)))
+        gathering_s = situation.overheads.gathering_s(here.lanes, here.steps_per_round)
+        busy_s = situation.overheads.update_s + gathering_s / here.steps_per_round
+        found.append(
+            ExpectedSpeed(
+                machines=machines,
+                workers=here.workers,
+                envs=here.envs,
+                steps_per_s=fastest,
+                learner_share=min(1.0, fastest * busy_s),
+                needed_s=needed / fastest,
+            )
+        )
+    return found
+
+
+def _advice(sizes: Sizes, situation: Situation, rate: float) -> list[str]:
+    """What else to know."""
+    measured = situation.measured
+    machine = situation.machine
+    lines = list(measured.findings)
+    if machine.load > BUSY * machine.cores:
+        lines.append(
+            f"other programs use the {counted(machine.cores, 'core')} (load average {number_in_words(machine.load)}): "
+            "beside them, runs are slower than expected here"
+        )
+    if measured.repeats is False:
+        lines.append(
+            "it does not repeat itself for the same seed and actions: if a worker is lost, its episodes begin anew, and two "
+            "runs with the same seed differ"
+        )
+    ahead = msgspec.structs.replace(situation, resets_ahead=True)
+    faster = steps_per_s(sizes, ahead, generator(1, Purpose.ROUNDS))
+    if faster > RESETS_COUNT * rate:
+        lines.append(
+            f"resets take {time_in_words(measured.reset_s)}: with --wrappers millrace:ResetAhead, which makes them in the "
+            f"background, {number_in_words(faster)} env steps/s are expected; the environment must work in a second thread, "
+            "and two of them for each copy fit into the memory"
+        )
+    if measured.goals:
+        lines.append(
+            "its observations have goals: an algorithm with a replay buffer can learn in hindsight (--hindsight 0.8)"
+        )
+    if measured.start_s > SLOW_START_S:
+        lines.append(
+            f"a worker with a copy takes {time_in_words(measured.start_s)} to start: after this time a lost one is replaced"
+        )
+    return lines

@@ -1,0 +1,337 @@
+"""Steps an environment in workers, with random actions, and measures what it takes.
+
+Rule: its code runs in workers, never in this process. Everything has a deadline. What goes wrong once a step was made is a
+finding, in one line; before that, it is the error.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, NamedTuple
+
+import gymnasium
+import msgspec
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector.utils import concatenate, create_empty_array
+
+from millrace.launch.crew import Crew
+from millrace.launch.vector import call_timeouts_of, start_vector_env
+from millrace.learner.vector_env.env import ZmqVectorEnv
+from millrace.learner.vector_env.settings import VectorEnvSettings
+from millrace.planning.measurements import WORKER_BYTES, ActionKind, Machine, Measurements, StepCosts
+from millrace.planning.stopwatch import CopyTimes, read_notes
+from millrace.protocol.arrays import Array
+from millrace.protocol.bounds import one_line
+from millrace.protocol.env_spec import EnvLike, EnvSpec, Scalar
+from millrace.protocol.envs.spaces import observation_leaves
+from millrace.protocol.envs.wrappers import WrapperLike
+from millrace.protocol.errors import MillraceError, RunError, UsageError, first_line
+from millrace.protocol.policy.masks import MASK
+
+LEAST_STEPS = 8  # of a copy alone, even if they take longer than planned
+SCRIPT = 1009  # random actions, which copies take in the same order again and again
+SEED = 1
+WARM_UP = 2  # steps of a copy that are not counted
+OF_ALONE = 0.15  # of the seconds
+OF_SIDE_BY_SIDE = 0.9  # of the seconds, until the last copies are started
+EACH_S = 2.0  # of stepping copies side by side
+MOST_PER_CORE = 8  # copies that are tried
+MOST_AT_LEAST = 16
+SHORT_S = 1e-3  # steps that take less are measured in workers with several copies, as a run steps them
+COPIES_OF_SHORT = 8
+OF_ITS_OWN = "if a copy needs a port, a folder or a licence of its own, see docs/how-to/simulators.md"
+GROWTH = 4  # from one number of workers to the next
+WORTH_WHILE = 1.1  # if more copies do not make more env steps by this factor, no more are tried
+OF_MEMORY = 0.7  # of what is free is used
+
+
+class ProbedEnv(NamedTuple):
+    """The environment that is measured."""
+
+    env: EnvLike
+    kwargs: Mapping[str, Scalar]
+    wrappers: Sequence[WrapperLike]
+
+    @property
+    def name(self) -> str:
+        """As a run is told it."""
+        return EnvSpec.of(self.env).id
+
+    def in_wrapper(self, wrapper: str) -> EnvSpec:
+        """The environment in a further wrapper."""
+        return EnvSpec.of(self.env, dict(self.kwargs), (*self.wrappers, wrapper))
+
+
+class Probed(NamedTuple):
+    """What was measured, and the spaces of the environment."""
+
+    measured: Measurements
+    observation_space: gymnasium.Space[Any]
+    action_space: gymnasium.Space[Any]
+    seats: tuple[str, ...]
+
+
+def probe(env: ProbedEnv, machine: Machine, seconds: float) -> Probed:
+    """Step one copy, then several side by side, for about so many seconds.
+
+    Raises `UserFacingError` if no step could be made.
+    """
+    began_s = time.monotonic()
+    give_up_at_s = began_s + seconds
+    first = _session(env, 1, OF_ALONE * seconds, give_up_at_s)
+    if not first.times or not len(first.times[0].steps):
+        why = first.wrong or "a step takes longer"
+        raise RunError(f"plan: {env.name}: no step could be made within {seconds:g} s: {why}")
+    sessions = [first]
+    measured = _measured_alone(env, first)
+    each = 1
+    if measured.alone.own_s < SHORT_S and not first.wrong:
+        several = _session(env, 1, OF_ALONE * seconds, give_up_at_s, each=COPIES_OF_SHORT)
+        sessions.append(several)
+        if several.is_whole:
+            each = COPIES_OF_SHORT
+            measured = msgspec.structs.replace(measured, side_by_side=(_costs(1, several.times),))
+    for workers in _ladder(measured, machine):
+        if time.monotonic() - began_s + 1.5 * sessions[-1].start_s > OF_SIDE_BY_SIDE * seconds:
+            break
+        session = _session(env, workers, EACH_S, give_up_at_s, each=each)
+        sessions.append(session)
+        if not session.is_whole:
+            break
+        costs = _costs(workers, session.times)
+        if costs.steps_per_s < WORTH_WHILE * measured.side_by_side[-1].steps_per_s:
+            break
+        measured = msgspec.structs.replace(measured, side_by_side=(*measured.side_by_side, costs))
+    if len(sessions) == 1 and not first.wrong:  # a second copy must show whether the environment repeats itself
+        sessions.append(_session(env, 1, OF_ALONE * seconds, give_up_at_s))
+    return Probed(_with_all(measured, sessions), first.observation_space, first.action_space, first.seats)
+
+
+def _ladder(measured: Measurements, machine: Machine) -> Iterator[int]:
+    """The numbers of workers to try, ascending."""
+    alone = measured.alone
+    limit = max(MOST_AT_LEAST, MOST_PER_CORE * machine.cores)
+    if machine.free_bytes is not None:
+        limit = min(limit, int(OF_MEMORY * machine.free_bytes / max(measured.worker_bytes, WORKER_BYTES)))
+    if machine.most_copies:
+        limit = min(limit, machine.most_copies)
+    # More copies than cores are tried only if they wait.
+    limit = min(limit, machine.cores if alone.computes else math.ceil(machine.cores / max(alone.cpu_share, 1e-3)))
+    workers = max(2, machine.cores)
+    while workers < limit:
+        yield workers
+        workers *= GROWTH
+    if limit > 1:
+        yield limit
+
+
+# ------------------------------------------------------------------------------------------------------------ one session
+
+
+class _SteppedCopies(NamedTuple):
+    """What some copies did side by side."""
+
+    times: list[CopyTimes]
+    traces: list[list[int]]
+    """for each copy, a number for all that each step showed and gave"""
+    start_s: float
+    wrong: str
+    """what went wrong, in a line; empty if nothing did"""
+    observation_space: gymnasium.Space[Any]
+    action_space: gymnasium.Space[Any]
+    seats: tuple[str, ...]
+    time_limit: int | None
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether all copies have made steps, and nothing went wrong."""
+        stepped = sum(len(each.steps) > WARM_UP for each in self.times)
+        return stepped == len(self.traces) and not self.wrong
+
+    @property
+    def finding(self) -> str:
+        """What went wrong, and in which circumstances, in a line; empty if nothing did."""
+        copies = len(self.traces)
+        if not self.wrong:
+            return ""
+        if copies == 1:
+            return f"one copy, after {max(map(len, self.traces))} calls: {self.wrong}"
+        return f"{copies} copies side by side: {self.wrong}; {OF_ITS_OWN}"
+
+
+def _session(env: ProbedEnv, workers: int, seconds: float, give_up_at_s: float, each: int = 1) -> _SteppedCopies:
+    """Step copies for some seconds, `each` of them in each worker.
+
+    Raises `UserFacingError` if they cannot be made and there is one alone.
+    """
+    copies = workers * each
+    with TemporaryDirectory(prefix="millrace-plan-") as folder:
+        notes = Path(folder, "notes")
+        notes.mkdir()
+        began_s = time.monotonic()
+        traces: list[list[int]] = [[] for _ in range(copies)]
+        wrong = ""
+        known: tuple[Any, ...] = (None, None, (), None)
+        start_s = 0.0
+        try:
+            timeout_s = max(1.0, give_up_at_s - began_s)
+            settings = VectorEnvSettings(
+                env.in_wrapper(f"millrace.planning.stopwatch:stopwatch(folder={str(notes)!r})"),
+                copies,
+                workers=workers,
+                lanes=workers,
+                on_worker_loss="raise",
+                max_env_failures=0,
+                timeout_s=timeout_s,
+                call_timeouts=call_timeouts_of(timeout_s),
+            )
+            with start_vector_env(settings, Crew(logs=Path(folder, "logs"))) as envs:
+                start_s = time.monotonic() - began_s
+                limit = None if envs.spec is None else envs.spec.max_episode_steps
+                known = (envs.single_observation_space, envs.single_action_space, envs.seats, limit)
+                _step(envs, traces, time.monotonic() + seconds, give_up_at_s)
+        except UsageError:
+            raise
+        except MillraceError as error:
+            if copies == 1 and not any(notes.iterdir()):
+                raise
+            wrong = one_line(first_line(error, type(error).__name__))
+        times = [each for each in read_notes(notes) if len(each.resets)]
+        return _SteppedCopies(times, traces, start_s, wrong, *known)
+
+
+def _step(envs: ZmqVectorEnv, traces: list[list[int]], end_at_s: float, give_up_at_s: float) -> None:
+    """Step all copies until then, each as soon as it has come back."""
+    agents = max(1, len(envs.seats))
+    envs.single_action_space.seed(SEED)
+    script = [envs.single_action_space.sample() for _ in range(SCRIPT)]
+    envs.reset_async(seed=[SEED] * len(traces))
+    while envs.outstanding:
+        observation, reward, terminated, truncated, infos = envs.recv(timeout=max(1.0, give_up_at_s - time.monotonic()))
+        ready = infos["env_id"].tolist()
+        actions = []
+        for i, copy in enumerate(ready):
+            rows = slice(i * agents, (i + 1) * agents)
+            shown = [array[rows] for array in _arrays(observation)]
+            traces[copy].append(_digest([*shown, reward[rows], terminated[rows], truncated[rows]]))
+            masks = observation[MASK][rows] if isinstance(observation, dict) and MASK in observation else [None] * agents
+            for seat, mask in enumerate(masks):
+                number = len(traces[copy]) * agents + seat
+                actions.append(_allowed(script, number, mask, envs.single_action_space))
+        now_s = time.monotonic()
+        if now_s < give_up_at_s and (now_s < end_at_s or min(map(len, traces)) <= LEAST_STEPS):
+            space = envs.single_action_space
+            into: Any = create_empty_array(space, len(actions))
+            batch = concatenate(space, actions, into)
+            envs.send(batch, ready)
+
+
+def _allowed(script: Sequence[Any], number: int, mask: Array | None, space: gymnasium.Space[Any]) -> Any:
+    """The action of this number, or another one if the mask does not allow it."""
+    action = script[number % SCRIPT]
+    if mask is None or not isinstance(space, spaces.Discrete) or not np.any(mask):
+        return action
+    allowed = np.flatnonzero(mask)
+    return space.start + allowed[(int(action) - space.start) % len(allowed)]
+
+
+def _arrays(observation: Any) -> Iterator[Array]:
+    match observation:
+        case dict():
+            for value in observation.values():
+                yield from _arrays(value)
+        case tuple():
+            for value in observation:
+                yield from _arrays(value)
+        case _:
+            yield np.asarray(observation)
+
+
+def _digest(arrays: Sequence[Array]) -> int:
+    number = 0
+    for array in arrays:
+        number = zlib.crc32(np.ascontiguousarray(array).tobytes(), number)
+    return number
+
+
+def _repeats(traces: Sequence[Sequence[int]]) -> bool | None:
+    """Whether all copies showed and gave the same, as far as two of them came."""
+    traces = [trace for trace in traces if trace]
+    if len(traces) < 2:
+        return None
+    longest = max(traces, key=len)
+    return all(list(trace) == list(longest[: len(trace)]) for trace in traces)
+
+
+# ------------------------------------------------------------------------------------------------------------ the numbers
+
+
+def _measured_alone(env: ProbedEnv, session: _SteppedCopies) -> Measurements:
+    """What one copy shows."""
+    leaves = observation_leaves(session.observation_space)
+    keys = session.observation_space.spaces if isinstance(session.observation_space, spaces.Dict) else {}
+    return Measurements(
+        env=env.name,
+        agents=max(1, len(session.seats)),
+        action=_kind(session.action_space),
+        images=any(leaf.is_image for leaf in leaves),
+        goals={"achieved_goal", "desired_goal"} <= {*keys},
+        observation_bytes=sum(math.prod(leaf.shape) * np.dtype(leaf.dtype).itemsize for leaf in leaves),
+        side_by_side=(_costs(1, session.times),),
+        start_s=session.start_s,
+        worker_bytes=session.times[0].bytes,
+    )
+
+
+def _with_all(measured: Measurements, sessions: Sequence[_SteppedCopies]) -> Measurements:
+    """With what all sessions together show. The first reset of a copy may take longer than the others do."""
+    times = [each for session in sessions for each in session.times]
+    later = [each.resets[1:] for each in times if len(each.resets) > 1]
+    resets = np.concatenate(later or [each.resets for each in times])
+    steps = sum(int(np.count_nonzero(each.steps[:, 0] < each.resets[-1, 0])) for each in times)  # of whole episodes
+    share = max(each.others_cpu_share for each in times)
+    return msgspec.structs.replace(
+        measured,
+        reset_s=float((resets[:, 1] - resets[:, 3]).mean()),
+        reset_cpu_s=float((resets[:, 2] + share * resets[:, 1]).mean()),
+        resets=len(resets),
+        episode_steps=steps / sum(map(len, later)) if later else sessions[0].time_limit,
+        repeats=_repeats([trace for session in sessions for trace in session.traces]),
+        findings=tuple(session.finding for session in sessions if session.wrong),
+    )
+
+
+def _kind(space: gymnasium.Space[Any]) -> ActionKind:
+    match space:
+        case spaces.Box() if space.is_bounded("both"):
+            return "box"
+        case spaces.Discrete():
+            return "discrete"
+    return "other"
+
+
+def _costs(workers: int, times: Sequence[CopyTimes]) -> StepCosts:
+    """The costs of a step of these copies."""
+    counted = [each.steps[WARM_UP:] if len(each.steps) > WARM_UP else each.steps for each in times]
+    wall_s = np.concatenate([each[:, 1] for each in counted])
+    cpu_s = np.concatenate(
+        [each[:, 2] + copy.others_cpu_share * each[:, 1] for each, copy in zip(counted, times, strict=True)]
+    )
+    of_copies = [float(each[:, 1].mean()) for each in counted]
+    return StepCosts(
+        workers=workers,
+        steps=len(wall_s),
+        mean_s=float(wall_s.mean()),
+        median_s=float(np.median(wall_s)),
+        p95_s=float(np.quantile(wall_s, 0.95)),
+        std_s=float(wall_s.std()),
+        cpu_s=float(cpu_s.mean()),
+        delay_s=float(np.concatenate([each[:, 3] for each in counted]).mean()),
+        slowest_copy=max(of_copies) / max(float(np.median(of_copies)), 1e-12),
+    )

@@ -1,0 +1,237 @@
+"""What to choose for an environment that was measured: algorithm, env copies, workers, lanes and lag, and why. Pure.
+
+Rule: of all sizes whose expected env steps/s are within `AS_GOOD` of the best, those with the least lag are chosen, then the
+fewest env copies, then the fewest workers. The rules of docs/how-to/algorithms.md and docs/how-to/slow_environments.md are
+those that decide here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from typing import NamedTuple
+
+import msgspec
+
+from millrace.planning.expected_rate import Situation, Sizes
+from millrace.planning.in_words import counted, number_in_words, time_in_words
+from millrace.planning.measurements import WORKER_BYTES, Machine, Measurements
+
+AS_GOOD = 0.95
+SLOW_S = 0.005  # a step, divided by the copies that run at once: above it, an algorithm with a replay buffer is done sooner
+SLOW_WITH_IMAGES_S = 0.05
+MOST_ENVS = 64  # of steps that compute: more of them gain little
+UNEVEN = 3.0  # a step of 95 of 100, divided by the median one
+LEARNER_BYTES = 500 << 20
+TRANSITION_BYTES = 24  # besides its observation
+REPLAY_SIZES = (1_000_000, 500_000, 200_000, 100_000, 50_000, 20_000, 10_000)
+OF_MEMORY = 0.8  # of what is free is used
+OF_MEMORY_FOR_REPLAY = 0.4
+LAGS = (0, 1, 2)
+NEEDED_STEPS = {"xqc": 100_000, "rainbow": 100_000, "sac": 300_000, "ppo": 1_000_000}
+"""Env steps that tasks such as MuJoCo's took, about. They say how long a run may be, and not how long yours will."""
+
+
+class ChosenSetting(msgspec.Struct, frozen=True):
+    """A setting of `millrace train`, its value, and why."""
+
+    name: str
+    value: int | str
+    why: str
+
+
+class Limit(NamedTuple):
+    """A largest number, and what sets it."""
+
+    number: int
+    why: str
+
+
+class Learning(NamedTuple):
+    """How the algorithm that was chosen is run."""
+
+    envs: int
+    """the usual number of env copies"""
+    rollout_steps: int
+    """the usual number with so many copies"""
+    rows_of_update: int | None
+    """env steps between two updates, if there must not be more: it learns from a replay buffer; else None"""
+    acting_bytes: int = 0
+    """memory that a worker needs in addition to act"""
+
+    def steps(self, envs: int) -> int:
+        """The steps of a rollout with so many env copies."""
+        return self.rollout_steps if self.rows_of_update is None else max(1, self.rows_of_update // envs)
+
+
+def copies_at_once(measured: Measurements, machine: Machine, acting_bytes: int = 0) -> Limit:
+    """How many env copies can make steps at the same time here."""
+    tried = measured.side_by_side[-1]
+    faster = tried.steps_per_s / measured.alone.steps_per_s
+    made = f"so many were tried side by side, and made {faster:.1f} times the env steps of one"
+    limits = [
+        Limit(
+            machine.cores,
+            f"a step computes, and there {'are' if machine.cores > 1 else 'is'} {counted(machine.cores, 'core')}",
+        )
+        if measured.alone.computes
+        else Limit(tried.workers, made if tried.workers > 1 else "no more could be tried side by side")
+    ]
+    if machine.most_copies:
+        limits.append(Limit(machine.most_copies, f"at most {counted(machine.most_copies, 'copy', 'copies')} may run here"))
+    if machine.free_bytes is not None:
+        size = max(measured.worker_bytes, WORKER_BYTES) + acting_bytes
+        fit = max(1, int((OF_MEMORY * machine.free_bytes - LEARNER_BYTES) / size))
+        limits.append(
+            Limit(fit, f"a worker with a copy takes {size / 2**20:,.0f} MB, and no more of them fit into the memory")
+        )
+    return min(limits, key=lambda limit: limit.number)
+
+
+# ------------------------------------------------------------------------------------------------------------ the algorithm
+
+
+def choose_algorithm(measured: Measurements, machine: Machine) -> ChosenSetting:
+    """The algorithm, by the three questions of docs/how-to/algorithms.md."""
+    at_once = copies_at_once(measured, machine).number
+    slow_s = SLOW_WITH_IMAGES_S if measured.images and measured.action == "box" else SLOW_S
+    each_s = measured.step_with_reset_s / at_once
+    takes = (
+        f"a step takes {time_in_words(measured.step_with_reset_s)} with its share of a reset, and "
+        f"{counted(at_once, 'copy', 'copies')} can run at once: {time_in_words(each_s)} for each env step"
+    )
+    if each_s <= slow_s:
+        return ChosenSetting(
+            "algo", "ppo", f"{takes}; below {time_in_words(slow_s)}, PPO is done sooner, although it takes more of them"
+        )
+    if measured.agents > 1:
+        return ChosenSetting(
+            "algo", "ppo", f"its {measured.agents} agents share a policy, which those with a replay buffer do not learn"
+        )
+    match measured.action:
+        case "box":
+            algo = "sac" if measured.images else "xqc"
+            actions = "continuous"
+        case "discrete":
+            algo = "rainbow"
+            actions = "discrete"
+        case "other":
+            return ChosenSetting("algo", "ppo", "only algorithms without a replay buffer take such actions")
+    why = f"{takes}; above {time_in_words(slow_s)}, the algorithm is done first that takes the fewest; actions are {actions}"
+    return ChosenSetting("algo", algo, why)
+
+
+def choose_replay_size(default: int, measured: Measurements, machine: Machine) -> ChosenSetting | None:
+    """A smaller replay buffer than `default`, if that would take too much of the memory."""
+    if machine.free_bytes is None:
+        return None
+    of_one = measured.observation_bytes + TRANSITION_BYTES
+    room = OF_MEMORY_FOR_REPLAY * machine.free_bytes
+    if default * of_one <= room:
+        return None
+    size = next((size for size in REPLAY_SIZES if size < default and size * of_one <= room), REPLAY_SIZES[-1])
+    why = f"a transition takes {of_one:,} bytes, so {default:,} of them would take {default * of_one / 2**30:,.1f} GB"
+    return ChosenSetting("replay_size", size, why)
+
+
+# ---------------------------------------------------------------------------------------------------------------- the sizes
+
+
+def candidates(learning: Learning, measured: Measurements, machine: Machine) -> Iterator[Sizes]:
+    """All sizes of a run among which one is chosen."""
+    at_once = copies_at_once(measured, machine, learning.acting_bytes).number
+    for envs in _numbers_of_envs(measured, machine, learning, at_once):
+        for workers in sorted({1, min(machine.cores, envs), min(at_once, envs)}):
+            for lanes in sorted({_lanes_for(workers, envs), envs}):
+                for lag in LAGS:
+                    yield Sizes(workers=workers, envs=envs, lanes=lanes, max_lag=lag, rollout_steps=learning.steps(envs))
+
+
+def _lanes_for(workers: int, envs: int) -> int:
+    """The least number of lanes that gives each worker as many, if there is one."""
+    return next((lanes for lanes in range(workers, envs + 1, workers) if envs % lanes == 0), envs)
+
+
+def _numbers_of_envs(measured: Measurements, machine: Machine, learning: Learning, at_once: int) -> list[int]:
+    """Numbers of env copies, ascending."""
+    if not measured.alone.computes:
+        return sorted({min(learning.envs * 2**n, at_once) for n in range(at_once.bit_length() + 1)})
+    most = machine.most_copies or max(MOST_ENVS, learning.envs)
+    if machine.free_bytes is not None:
+        of_copy = max(1, measured.worker_bytes - WORKER_BYTES)
+        of_workers = LEARNER_BYTES + at_once * (WORKER_BYTES + learning.acting_bytes)
+        most = max(1, min(most, int((OF_MEMORY * machine.free_bytes - of_workers) / of_copy)))
+    least = -(-learning.envs // machine.cores) * machine.cores  # a multiple of the cores
+    return sorted({min(least * 2**n, most) for n in range(most.bit_length() + 1)})
+
+
+def best(rates: Mapping[Sizes, float]) -> Sizes:
+    """The sizes to choose, of these with the env steps/s that are expected of each."""
+    enough = AS_GOOD * max(rates.values())
+    good = [sizes for sizes, rate in rates.items() if rate >= enough]
+    return min(good, key=lambda sizes: (sizes.max_lag, sizes.envs, sizes.workers, -sizes.lanes))
+
+
+def on_machines(sizes: Sizes, machines: int, learning: Learning) -> Sizes:
+    """The same on each of so many machines."""
+    envs = sizes.envs * machines
+    return Sizes(
+        workers=sizes.workers * machines,
+        envs=envs,
+        lanes=sizes.lanes * machines,
+        max_lag=sizes.max_lag,
+        rollout_steps=learning.steps(envs),
+    )
+
+
+# -------------------------------------------------------------------------------------------------------------- the reasons
+
+
+def reasons(
+    sizes: Sizes, learning: Learning, situation: Situation, rate: Callable[[Sizes], float]
+) -> tuple[ChosenSetting, ...]:
+    """The sizes, and why each is as it is. `rate`: the env steps/s that are expected of sizes."""
+    measured = situation.measured
+    return (
+        ChosenSetting("workers", sizes.workers, _why_workers(sizes, measured, situation.machine)),
+        ChosenSetting("envs", sizes.envs, _why_envs(sizes, learning, situation)),
+        ChosenSetting("lanes", sizes.lanes, _why_lanes(sizes, measured)),
+        ChosenSetting("max_lag", sizes.max_lag, _why_lag(sizes, rate)),
+    )
+
+
+def _why_workers(sizes: Sizes, measured: Measurements, machine: Machine) -> str:
+    share = measured.alone.cpu_share
+    if measured.alone.computes and sizes.workers == machine.cores:
+        return f"a step computes for {min(share, 1.0):.0%} of its time, so there is one for each core"
+    if sizes.workers == sizes.envs > 1:
+        return f"a step waits for {1 - share:.0%} of its time, so each copy waits in a worker of its own"
+    if sizes.workers == 1:
+        return "more would hardly be faster"
+    return "more would hardly be faster, because updates take most of the time"
+
+
+def _why_envs(sizes: Sizes, learning: Learning, situation: Situation) -> str:
+    at_once = copies_at_once(situation.measured, situation.machine, situation.overheads.acting_bytes)
+    if not situation.measured.alone.computes:
+        return at_once.why if sizes.envs == at_once.number else "more would hardly be faster, because of the updates"
+    if sizes.envs > max(learning.envs, situation.machine.cores):
+        return "steps are so short that a worker should step several copies at a time"
+    return "the usual number"
+
+
+def _why_lanes(sizes: Sizes, measured: Measurements) -> str:
+    if sizes.lanes < sizes.envs:
+        return "the copies of a lane are stepped together, which saves time if steps are short"
+    alone = measured.alone
+    uneven = alone.p95_s > UNEVEN * alone.median_s or measured.reset_s > UNEVEN * alone.mean_s
+    return "no copy waits for another one within a rollout" + (", and their times are uneven" if uneven else "")
+
+
+def _why_lag(sizes: Sizes, rate: Callable[[Sizes], float]) -> str:
+    lag = sizes.max_lag
+    here = number_in_words(rate(sizes))
+    if lag == 0:
+        other = number_in_words(rate(msgspec.structs.replace(sizes, max_lag=1)))
+        return f"all rollouts are of the newest policy; with 1, {other} env steps/s in place of {here} are expected"
+    other = number_in_words(rate(msgspec.structs.replace(sizes, max_lag=lag - 1)))
+    return f"workers collect while the learner updates; with {lag - 1}, {other} env steps/s in place of {here} are expected"

@@ -1,0 +1,179 @@
+"""What `millrace plan` chooses, by measurements that nobody made."""
+
+from __future__ import annotations
+
+import itertools
+import shlex
+
+import msgspec
+import pytest
+
+from millrace.learner.config.command_line import read_config
+from millrace.planning.measurements import ActionKind, Machine, Overheads
+from millrace.planning.recommendation import (
+    ChosenSetting,
+    Learning,
+    choose_algorithm,
+    choose_replay_size,
+    copies_at_once,
+    on_machines,
+    reasons,
+)
+from millrace.planning.run_plan import train_command
+from tests.millrace.planning.made_up import MACHINE, OVERHEADS, PPO, REPLAY, TRIED, chosen, measured, rate, situation
+
+WAITS_S = (0.0, 1e-4, 1e-3, 1e-2, 1e-1, 1.0)
+
+
+@pytest.mark.parametrize("learning", [PPO, REPLAY])
+def test_more_waiting_never_means_fewer_copies_or_workers(learning: Learning) -> None:
+    found = [chosen(situation(measured(wait_s=wait_s, cpu_s=1e-4)), learning) for wait_s in WAITS_S[3:]]
+    assert [each.envs for each in found] == sorted(each.envs for each in found)
+    assert [each.workers for each in found] == sorted(each.workers for each in found)
+
+
+def test_steps_that_wait_get_a_worker_and_a_lane_for_each_copy_that_was_tried() -> None:
+    found = chosen(situation(measured(wait_s=0.01)))
+    assert (found.workers, found.envs, found.lanes) == (TRIED, TRIED, TRIED)
+
+
+@pytest.mark.parametrize("cores", [1, 2, 5, 16])
+@pytest.mark.parametrize("cpu_s", [1e-5, 1e-3, 1e-1])
+def test_steps_that_compute_never_get_more_workers_than_cores(cores: int, cpu_s: float) -> None:
+    where = situation(measured(cpu_s=cpu_s, tried=cores), machine=Machine(cores=cores))
+    assert chosen(where).workers <= cores
+    assert chosen(where, REPLAY).workers <= cores
+
+
+def test_short_steps_get_many_copies_in_few_lanes_and_long_ones_the_usual_number_in_a_lane_each() -> None:
+    quick = msgspec.structs.replace(OVERHEADS, update_s=1e-5)
+    short = chosen(situation(measured(cpu_s=1e-5, tried=2), quick))
+    assert short.envs >= 32
+    assert short.lanes < short.envs
+    long = chosen(situation(measured(cpu_s=1e-2, tried=2)))
+    assert (long.envs, long.lanes) == (8, 8)
+
+
+@pytest.mark.parametrize(("wait_s", "cpu_s"), [(0.01, 1e-4), (0.0, 0.01)])
+def test_memory_bounds_copies(wait_s: float, cpu_s: float) -> None:
+    free = 8 << 30
+    for gigabytes in (1, 2, 3, 6):
+        machine = Machine(cores=2, free_bytes=free)
+        found = chosen(situation(measured(wait_s=wait_s, cpu_s=cpu_s, worker_bytes=gigabytes << 30), machine=machine))
+        assert found.envs * (gigabytes << 30) <= free or found.envs == 1
+        assert found.envs >= int(0.7 * 8 / gigabytes)  # and no less than that
+
+
+@pytest.mark.parametrize(("wait_s", "cpu_s"), [(0.01, 1e-4), (0.0, 1e-5)])
+@pytest.mark.parametrize("licences", [1, 3, 6])
+def test_licences_bound_copies(wait_s: float, cpu_s: float, licences: int) -> None:
+    machine = msgspec.structs.replace(MACHINE, most_copies=licences)
+    found = chosen(situation(measured(wait_s=wait_s, cpu_s=cpu_s, tried=licences), machine=machine))
+    assert found.envs == licences
+    assert found.envs % found.lanes == 0
+    assert found.workers <= found.lanes
+
+
+def test_if_the_learner_is_the_limit_no_more_copies_are_chosen_than_it_can_use() -> None:
+    slow = msgspec.structs.replace(OVERHEADS, update_s=0.02)
+    found = chosen(situation(measured(wait_s=0.05), slow), REPLAY)
+    assert found.envs == 8
+    assert found.max_lag == 1
+    assert found.rollout_steps * found.envs == REPLAY.rows_of_update
+
+
+def test_lag_is_chosen_only_if_it_is_faster() -> None:
+    quick = Overheads(row_s=0, lane_row_s=0, copy_row_s=0, sent_s=0, round_s=0, rollout_s=0, received_s=0, update_s=1e-7)
+    assert chosen(situation(measured(wait_s=0.01, cpu_s=0), quick)).max_lag == 0
+    assert chosen(situation(measured(wait_s=0.01, cpu_s=0))).max_lag == 1
+
+
+def test_all_that_is_chosen_is_nearly_the_best_of_all_sizes() -> None:
+    for wait_s, uneven, learning in itertools.product(WAITS_S, (0.0, 1.0), (PPO, REPLAY)):
+        where = situation(measured(wait_s=wait_s, std_s=uneven * wait_s))
+        found = chosen(where, learning)
+        for changes in (
+            {"max_lag": 2},
+            {"workers": 1},
+            {"lanes": found.workers},
+            {"workers": found.envs, "lanes": found.envs},
+        ):
+            other = msgspec.structs.replace(found, **changes)
+            if other.workers <= other.lanes and other.envs % other.lanes == 0:
+                assert rate(found, where) > 0.94 * rate(other, where), (wait_s, uneven, changes)
+
+
+# ------------------------------------------------------------------------------------------------------------ the algorithm
+
+
+@pytest.mark.parametrize(
+    ("each_ms", "action", "others", "algo"),
+    [  # the table of docs/how-to/algorithms.md
+        (6, "box", {}, "xqc"),
+        (60, "box", {"images": True}, "sac"),
+        (40, "box", {"images": True}, "ppo"),
+        (6, "discrete", {}, "rainbow"),
+        (6, "discrete", {"images": True}, "rainbow"),
+        (6, "other", {}, "ppo"),
+        (6, "box", {"agents": 3}, "ppo"),
+        (4, "box", {}, "ppo"),
+        (4, "discrete", {}, "ppo"),
+    ],
+)
+def test_the_algorithm_is_that_of_the_manual(
+    each_ms: float, action: ActionKind, others: dict[str, object], algo: str
+) -> None:
+    found = choose_algorithm(measured(wait_s=each_ms * TRIED / 1e3, cpu_s=0, action=action, **others), MACHINE)
+    assert (found.name, found.value) == ("algo", algo)
+    assert found.why
+
+
+def test_the_share_of_a_reset_counts_as_time_of_a_step() -> None:
+    assert choose_algorithm(measured(wait_s=0.04, cpu_s=0), MACHINE).value == "ppo"
+    assert choose_algorithm(measured(wait_s=0.04, cpu_s=0, reset_s=10.0, episode_steps=100.0), MACHINE).value == "xqc"
+
+
+def test_a_replay_buffer_that_takes_too_much_memory_is_smaller() -> None:
+    images = measured(observation_bytes=84 * 84 * 4)
+    assert choose_replay_size(1_000_000, measured(observation_bytes=32), MACHINE) is None
+    assert choose_replay_size(1_000_000, images, Machine(cores=2)) is None
+    smaller = choose_replay_size(1_000_000, images, MACHINE)
+    assert smaller is not None
+    assert isinstance(smaller.value, int)
+    assert smaller.value * 84 * 84 * 4 < (MACHINE.free_bytes or 0) / 2
+    assert smaller.value == 200_000
+
+
+def test_what_sets_the_number_of_copies_is_said() -> None:
+    assert "side by side" in copies_at_once(measured(wait_s=0.01), MACHINE).why
+    assert "2 cores" in copies_at_once(measured(cpu_s=0.01), MACHINE).why
+    assert "may run" in copies_at_once(measured(wait_s=0.01), Machine(cores=2, most_copies=4)).why
+    assert "memory" in copies_at_once(measured(wait_s=0.01), Machine(cores=2, free_bytes=1 << 30)).why
+
+
+# -------------------------------------------------------------------------------------------------------------- the command
+
+
+@pytest.mark.parametrize("learning", [PPO, REPLAY])
+@pytest.mark.parametrize("wait_s", WAITS_S)
+def test_each_setting_has_a_reason_and_the_command_is_one_that_train_takes(wait_s: float, learning: Learning) -> None:
+    where = situation(measured(wait_s=wait_s))
+    found = chosen(where, learning)
+    settings = (ChosenSetting("algo", "ppo", "because"), *reasons(found, learning, where, lambda sizes: rate(sizes, where)))
+    assert all(each.why and "\n" not in each.why for each in settings)
+    command = train_command(
+        "CartPole-v1", {"render_mode": "rgb array"}, ("gymnasium.wrappers:FlattenObservation",), settings
+    )
+    program, train, *argv = shlex.split(command)
+    assert (program, train) == ("millrace", "train")
+    assert f"--max-lag {found.max_lag} " in f"{command} "
+    config, _ = read_config("train", argv)
+    assert (config.workers, config.envs, config.lanes) == (found.workers, found.envs, found.lanes)
+    assert config.env_kwargs == {"render_mode": "rgb array"}
+
+
+def test_more_machines_have_as_many_of_all_and_updates_as_often_as_they_can() -> None:
+    here = chosen(situation(measured(wait_s=0.5)), REPLAY)
+    ten = on_machines(here, 10, REPLAY)
+    assert (ten.workers, ten.envs, ten.lanes) == (10 * here.workers, 10 * here.envs, 10 * here.lanes)
+    assert ten.rollout_steps == max(1, 64 // ten.envs)

@@ -1,0 +1,103 @@
+"""`millrace plan`, from the environment to the command: real workers, and environments that wait, crash and hang."""
+
+from __future__ import annotations
+
+import os
+import shlex
+from typing import Any
+
+import gymnasium
+import msgspec
+import numpy as np
+import pytest
+
+import millrace
+from millrace.cli.main import main
+from millrace.learner.config.command_line import read_config
+from millrace.protocol.errors import RunError, UsageError
+
+TOY = "tests.support.envs.toy"
+BRIEF_S = 6.0
+
+
+class Forgets(gymnasium.Env[Any, Any]):
+    """Shows random numbers that do not follow from its seed."""
+
+    def __init__(self) -> None:
+        self.observation_space = gymnasium.spaces.Box(0, 255, (2,), np.float32)
+        self.action_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        return self._shown(), {}
+
+    def step(self, action: Any) -> Any:
+        return self._shown(), 0.0, False, False, {}
+
+    def _shown(self) -> Any:
+        return np.frombuffer(os.urandom(2), np.uint8).astype(np.float32)
+
+
+def planned(capsys: pytest.CaptureFixture[str], env: str, *flags: str) -> dict[str, Any]:
+    """The plan as JSON, and what was shown meanwhile."""
+    assert main(["plan", env, "--seconds", str(BRIEF_S), "--json", *flags]) == 0
+    (line,) = capsys.readouterr().out.splitlines()
+    found: dict[str, Any] = msgspec.json.decode(line)
+    return found
+
+
+def test_the_command_measures_an_environment_that_waits_and_names_a_command_that_trains(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    step_s = 0.02
+    found = planned(capsys, f"{TOY}:Slow", "--env-kwargs", "seconds", str(step_s), "k", "5", "--max-env-copies", "3")
+    alone = found["measured"]["side_by_side"][0]
+    assert alone["mean_s"] >= step_s
+    assert alone["cpu_s"] < 0.2 * alone["mean_s"]
+    assert found["measured"]["repeats"] is True
+    assert found["measured"]["episode_steps"] == 5
+    assert found["measured"]["worker_bytes"] > 20 << 20
+    chosen = {each["name"]: each["value"] for each in found["chosen"]}
+    assert chosen["algo"] == "rainbow"  # 10 ms for each of two copies, and discrete actions
+    assert 1 <= chosen["envs"] <= 2  # one is enough if gradient steps are slow here
+    assert (chosen["max_env_copies"], chosen["eval_copies"]) == (3, 1)
+    program, train, *argv = shlex.split(found["command"])
+    assert (program, train) == ("millrace", "train")
+    config, _ = read_config("train", argv)
+    assert (config.envs, config.workers, config.env_kwargs) == (
+        chosen["envs"],
+        chosen["workers"],
+        {"seconds": step_s, "k": 5},
+    )
+    one, two, ten = (each["steps_per_s"] for each in found["expected"])
+    assert 0 < one <= 2 / step_s
+    assert one <= two <= ten
+
+
+def test_an_environment_of_the_script_that_does_not_repeat_itself_is_found_out_from_python() -> None:
+    plan = millrace.plan(Forgets, seconds=BRIEF_S)
+    assert plan.measured.repeats is False
+    assert any("does not repeat itself" in line for line in plan.advice)
+    assert plan.measured.alone.computes
+    assert plan.settings["algo"] == "ppo"
+    text = str(plan)
+    assert plan.command.split()[-1] in text
+    assert all(each.why.split()[0] in text for each in plan.chosen)
+
+
+@pytest.mark.parametrize(("name", "after"), [("Dies", 20), ("Hangs", 20), ("Raises", 20)])
+def test_a_crash_is_a_line_and_not_the_end(name: str, after: int) -> None:
+    plan = millrace.plan(f"{TOY}:{name}", env_kwargs={"after": after}, seconds=BRIEF_S)
+    assert plan.measured.findings
+    assert all("\n" not in line for line in plan.measured.findings)
+    assert plan.measured.findings[0] in plan.advice
+    assert plan.measured.alone.steps >= after // 2
+
+
+def test_if_no_step_can_be_made_the_error_says_why() -> None:
+    with pytest.raises(UsageError, match="Missing"):
+        millrace.plan(f"{TOY}:Missing", seconds=BRIEF_S)
+    with pytest.raises(RunError, match="no step could be made within"):
+        millrace.plan(f"{TOY}:Hangs", env_kwargs={"after": 0}, seconds=BRIEF_S)
+    with pytest.raises(UsageError, match="seconds: expected at least 5, got 1"):
+        millrace.plan("CartPole-v1", seconds=1)
