@@ -12,7 +12,7 @@ PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .PHONY: train check test test-rest test-all lint type type-all pure unit unit-rest docs site dist bench bench-peers test-learning \
-	packages test-cluster test-clients test-model test-processors test-versions test-kill soak clean
+	packages test-cluster test-clients test-recipes test-model test-processors test-versions test-kill soak clean
 
 train: .venv/installed  ## train CartPole-v1 on two worker processes until a greedy evaluation averages 475
 	$(BIN)/millrace train CartPole-v1 --workers 2 --target-return 475 --eval-episodes 20 --eval-every 5000
@@ -66,6 +66,9 @@ test-cluster: .venv/installed-ray  ## Docker, Prometheus, Slurm, Ray, MPI, Xvfb 
 test-clients: .venv/installed-dev  ## the clients in C++ and other languages, built and run. Needs `make packages`
 	$(BIN)/python -m pytest -m clients -rs --numprocesses $(TEST_PROCESSES) --dist worksteal tests/clients
 
+test-recipes: .venv/installed-dev .venv-recipes/installed  ## the recipes for SUMO, FMUs, grid2op and others, with the real simulators (2 GB)
+	$(BIN)/python -m pytest -m recipes tests/recipes
+
 test-processors: .venv/installed-dev  ## the tests that compare floats, with the code that PyTorch and numpy run on other processors
 	$(BIN)/python -m tests.processors
 
@@ -117,5 +120,12 @@ bench-peers: .venv/installed-dev  ## training beside seven other systems, each i
 	$(PIP_INSTALL) --editable '.[docs]'
 	touch $@
 
+.venv-recipes/installed: pyproject.toml tests/recipes/requirements.txt tests/recipes/pinned.txt
+	$(PYTHON) -m venv .venv-recipes
+	.venv-recipes/bin/python -m pip install --quiet --requirement tests/recipes/requirements.txt --editable .
+	$(PYTHON) -m venv .venv-recipes/pinned
+	.venv-recipes/pinned/bin/python -m pip install --quiet --requirement tests/recipes/pinned.txt
+	touch $@
+
 clean:
-	rm -rf .venv site .versions .cluster benchmarks/peers/envs .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf .venv .venv-recipes site .versions .cluster benchmarks/peers/envs .mypy_cache .ruff_cache .pytest_cache .hypothesis

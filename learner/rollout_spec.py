@@ -63,6 +63,7 @@ def rollout_spec(
         scripted=scripted,
         call_timeouts=config.call_timeouts(),
         heartbeat_s=config.heartbeat_s(),
+        restart_episodes=config.restart_episodes,
     )
     _check_weights_can_be_sent(env.id, policy, config)
     check_can_be_sent(env.id, run)

@@ -281,6 +281,9 @@ class RunSpec(msgspec.Struct, frozen=True, tag=True):
     call_timeouts: CallTimeouts = CallTimeouts()
     """how long a call of user code may take before the worker's supervisor ends it; ignored by a worker without one"""
     heartbeat_s: float = HEARTBEAT_S
+    restart_episodes: int = 0
+    """after this many episodes, a worker that can do so closes an env copy and creates it again, to continue as the copy
+    would have done; 0: never"""
     learner_timeout_s: float = 30.0
     """a worker says Hello again if no message of the learner has followed its Heartbeat for this long"""
 

@@ -47,8 +47,8 @@ GROUPS = {
     ),
     "network": ("transport", "bind", "advertise", "keys", "insecure"),
     "timeouts and failures": (
-        "lost_lanes", "replay_limit", "worker_timeout_s", "no_workers_timeout_s", "start_timeout_s", "step_timeout_s",
-        "grace_s", "max_env_failures",
+        "lost_lanes", "replay_limit", "restart_episodes", "worker_timeout_s", "no_workers_timeout_s", "start_timeout_s",
+        "step_timeout_s", "grace_s", "max_env_failures",
     ),
     "files and logs": (
         "checkpoint_every_s", "keep_checkpoints", "record", "prior", "callbacks", "tensorboard", "metrics_bind", "dashboard",

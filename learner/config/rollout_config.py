@@ -144,6 +144,11 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     """Longest episode, in steps, that is replayed so that it can continue. If it is longer, a new one begins. Replaying an
     episode takes as long as its steps took, without the policy.
     """
+    restart_episodes: Free[Natural] = 0
+    """Number of episodes after which each env copy is closed and created again, also in evaluations: for simulators that
+    grow or slow down the longer they run. The new copy continues with the seed and the random numbers of the old one, so
+    results don't change if the environment is deterministic given its seed. 0: never.
+    """
     no_workers_timeout_s: Free[Positive] = 600.0
     """Write a checkpoint and end the run if there has been no worker for this many seconds. A run whose workers are all
     local ends at once when none is left.

@@ -169,6 +169,8 @@ def check_rollout_settings(config: RolloutConfig) -> None:
         raise UsageError(
             f"vector {config.vector}: wrappers are applied to single env copies; expected loop, which is the default"
         )
+    if config.restart_episodes and config.vector != "loop":
+        raise UsageError(f"vector {config.vector}: restart_episodes makes single env copies anew; expected loop")
     check_kind(config.vector)
     for wrapper in config.wrappers:
         wrapper_name(wrapper)
@@ -199,6 +201,8 @@ def _check_learner_inference(config: Config) -> None:
         wrong = f"max_lag: expected 0, got {config.max_lag}; the policy acts under the newest weights"
     elif config.vector != "loop":
         wrong = f"vector: expected loop, got {config.vector}; its workers step copies one by one"
+    elif config.restart_episodes:
+        wrong = f"restart_episodes: expected 0, got {config.restart_episodes}; its workers make no copy anew"
     elif config.eval_workers:
         wrong = f"eval_workers: expected 0, got {config.eval_workers}; its workers step copies, and cannot evaluate alone"
     else:

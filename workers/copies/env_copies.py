@@ -39,6 +39,12 @@ from millrace.workers.copies.saved_state import CannotSave, SavedCopy, load, sav
 Leaves = Sequence[Any]
 
 
+CANNOT_RESTART = (
+    "restart_episodes: the env copies of training are not made anew, because nobody could go on with the random numbers of "
+    "their environment; expected a reset that calls super().reset(seed=seed), and no ResetAhead"
+)
+
+
 class SeatColumns(NamedTuple):
     """What a step of N copies means for their N · A columns."""
 
@@ -168,18 +174,24 @@ class LoopedCopies:
         masked: bool = False,
         critic_keys: Sequence[str] = (),
         first: EnvCopy = FIRST_COPY,
+        restart_episodes: int = 0,
     ) -> None:
         """`facts`: names of the numbers in `info` that belong to an episode. `masked`: read masks of the allowed actions.
 
         `critic_keys`: keys of a Dict observation whose arrays come last. `first`: identifies the first copy. In an
         evaluation, no step resets a copy.
+        `restart_episodes`: after this many episodes, a copy is closed and created again; 0: never.
         """
         self._facts = facts
         self._activity = activity()
         evaluates = first.evaluation
         autoreset: Autoreset = "Disabled" if evaluates else "NextStep"
         stepping = EVALUATING if evaluates else STEPPING
-        self._loop = EnvLoop(makes, pulse, autoreset, first=first, stepping=stepping, dress=without_order_check)
+        self._attributes: dict[str, bytes] = {}  # that each copy has, packed
+        self._restart_episodes = restart_episodes
+        self._loop = EnvLoop(
+            makes, pulse, autoreset, first=first, stepping=stepping, dress=self._dressed, restart_episodes=restart_episodes
+        )
         self.envs = self._loop.envs
         self.count = len(self._loop.envs)
         with self._activity.during(MAKING):  # reading an attribute may run code of the environment
@@ -201,8 +213,9 @@ class LoopedCopies:
         copies = range(len(seeds))
         infos = self._loop.reset(copies, seeds, self._observations, pulse)
         leaves = self._after_reset(copies, infos).leaves
+        self.note = self._never_anew()
         if self._masks is None:
-            self.note = unused_mask((info for _, info in infos), self.action_space)
+            self.note = self.note or unused_mask((info for _, info in infos), self.action_space)
         return leaves
 
     def step(self, actions: Array, pulse: Pulse, copies: Sequence[int] | None = None) -> StepResult:
@@ -226,6 +239,19 @@ class LoopedCopies:
         infos = self._loop.reset(copies, seeds, self._observations, pulse)
         self._fill_in(copies)
         return self._after_reset(copies, infos)
+
+    def _dressed(self, env: gymnasium.Env[Any, Any], which: EnvCopy) -> gymnasium.Env[Any, Any]:
+        """The copy as it is stepped. One that is made anew has the attributes of the old one."""
+        env = without_order_check(env, which)
+        for name, packed in self._attributes.items():
+            set_attribute(which.copy, env, name, unpack(packed))
+        return env
+
+    def _never_anew(self) -> str:
+        """Why no copy is made anew although the run asks for it; empty if that is not so."""
+        if not self._restart_episodes or self._loop.random_state(0) is not None:
+            return ""
+        return CANNOT_RESTART
 
     def _fill_in(self, copies: Sequence[int]) -> None:
         """Fill the row of a copy that was never reset with another copy's observation, because no row may be empty."""
@@ -291,6 +317,7 @@ class LoopedCopies:
 
     def assign(self, name: str, packed: bytes, pulse: Pulse) -> None:
         """Set an attribute of every copy, on the outermost wrapper that has it."""
+        self._attributes[name] = packed
         with self._activity.during(STEPPING):
             for n, env in enumerate(self.envs):
                 set_attribute(n, env, name, unpack(packed))  # a separate value for each, because they may change it

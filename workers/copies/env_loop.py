@@ -3,6 +3,9 @@
 Autoreset is gymnasium's (`gymnasium.vector.AutoresetMode`). NextStep: the step after an episode's end ignores the action and
 resets that copy. SameStep: the step that ends an episode resets the copy, and returns the last observation and info inside
 the new info, as `final_obs` and `final_info`. Disabled: the caller resets.
+
+Rule: a copy that is made anew after some episodes (`restart_episodes`) goes on as it would have done otherwise: it is reset
+with the seed that the copy began with, gets the random numbers that the old environment had, and is reset again.
 """
 
 from __future__ import annotations
@@ -33,7 +36,7 @@ from millrace.workers.activity import (
     activity,
 )
 from millrace.workers.copies.env_errors import CopyFailed
-from millrace.workers.copies.random_state import repeatable, set_state, state_of
+from millrace.workers.copies.random_state import pack, repeatable, set_state, state_of
 from millrace.workers.copy_slots import Dress, as_made, close_copy, make_copy
 
 Autoreset = Literal["NextStep", "SameStep", "Disabled"]
@@ -59,21 +62,24 @@ class EnvLoop:
         first: EnvCopy = FIRST_COPY,
         stepping: int = STEPPING,
         dress: Dress[gymnasium.Env[Any, Any]] = as_made,
+        restart_episodes: int = 0,
     ) -> None:
         """Make the copies, without a reset.
 
         `ended`: they count as truncated, so the first step with NextStep resets them. `first` identifies the first copy; the
         others follow it. `stepping`: the worker's activity during a step. `dress`: takes each copy, and returns what to step
-        in its place; see `make_copy`.
+        in its place; see `make_copy`. `restart_episodes`: after this many resets,
+        each copy is closed and created again before the next one; 0: never.
         """
         self.envs: list[gymnasium.Env[Any, Any]] = []
         self._activity = activity()
-        for n, make in enumerate(makes):
+        self._makes = list(makes)
+        self._first = first
+        self._dress = dress
+        for n in range(len(self._makes)):
             pulse()
             try:
-                which = replace(first, number=first.number + n, copy=first.copy + n)
-                with self._activity.during(MAKING):
-                    self.envs.append(make_copy(which, make, dress))
+                self.envs.append(self._made(n))
             except UsageError:
                 self.close()
                 raise
@@ -92,6 +98,9 @@ class EnvLoop:
         """by copy: state of its environment's random generator before the last reset in a step"""
         self._step_functions = [env.step for env in self.envs]
         self._inner = [repeatable(env) for env in self.envs]
+        self._restart_episodes = restart_episodes
+        self._resets = [0] * len(self.envs)  # of the environments that there are now
+        self._seeds: list[int | None] = [None] * len(self.envs)  # with which the copies began
         self.stepping = stepping
         """the worker's activity during a step"""
         self._all = range(len(self.envs))
@@ -114,7 +123,7 @@ class EnvLoop:
             pulse()
             try:
                 with self._activity.during(RESETTING):
-                    into[n], info = reset_answer(self.envs[n].reset(seed=seed, **further))
+                    into[n], info = self._reset(n, seed, **further)
             except BaseException as error:
                 raise CopyFailed(n, "reset") from error
             self.reward[n] = 0.0  # rule AFTER_RESET
@@ -156,7 +165,7 @@ class EnvLoop:
                 if resets:
                     self.random_states[n] = state_of(self._inner[n])
                     begin(RESETTING)
-                    observation, info = reset_answer(self.envs[n].reset())
+                    observation, info = self._reset(n, None)
                     begin(stepping)
                     reward[n] = 0.0
                     terminated[n] = False
@@ -198,6 +207,36 @@ class EnvLoop:
             self._check_numbers(chosen)
         self.steps += 1
         return infos
+
+    def _made(self, n: int) -> gymnasium.Env[Any, Any]:
+        """Make copy n."""
+        first = self._first
+        with self._activity.during(MAKING):
+            return make_copy(replace(first, number=first.number + n, copy=first.copy + n), self._makes[n], self._dress)
+
+    def _reset(self, n: int, seed: int | None, **further: Any) -> tuple[Any, Any]:
+        """Reset copy n, which is made anew first if its turn has come."""
+        if self._restart_episodes:
+            if self._resets[n] >= self._restart_episodes:
+                self._make_anew(n, seed)
+            self._resets[n] += 1
+            self._seeds[n] = self._seeds[n] if seed is None else seed
+        return reset_answer(self.envs[n].reset(seed=seed, **further))
+
+    def _make_anew(self, n: int, seed: int | None) -> None:
+        """Close copy n, and make it again. Without a seed, the next reset does what the old one would have done."""
+        state = state_of(self._inner[n])
+        if seed is None and state is None:
+            return  # nobody could go on where it was
+        close_copy(self.envs[n])
+        env = self.envs[n] = self._made(n)
+        self._step_functions[n] = env.step
+        self._inner[n] = repeatable(env)
+        self._resets[n] = 0
+        if seed is None:
+            with self._activity.during(RESETTING):
+                env.reset(seed=self._seeds[n])
+            set_state(self._inner[n], pack(state) or b"")
 
     def random_state(self, copy: int) -> dict[str, Any] | None:
         """The current state of the copy's random generator; None if it has no readable one."""

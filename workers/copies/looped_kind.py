@@ -27,9 +27,12 @@ def loop_over(
     """Make this number of copies for a run."""
     makes = [make] * count
     keys = run.policy.critic_keys
+    anew = run.restart_episodes
     if run.seats:
-        return SeatedCopies(makes, pulse, run.seats, run.info_keys, masked=run.masked, critic_keys=keys, first=first)
-    return LoopedCopies(makes, pulse, run.facts, masked=run.masked, critic_keys=keys, first=first)
+        return SeatedCopies(
+            makes, pulse, run.seats, run.info_keys, masked=run.masked, critic_keys=keys, first=first, restart_episodes=anew
+        )
+    return LoopedCopies(makes, pulse, run.facts, masked=run.masked, critic_keys=keys, first=first, restart_episodes=anew)
 
 
 LOOP = CopiesKind(open_loop)

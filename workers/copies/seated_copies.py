@@ -36,9 +36,12 @@ class SeatedCopies(LoopedCopies):
         masked: bool = False,
         critic_keys: Sequence[str] = (),
         first: EnvCopy = FIRST_COPY,
+        restart_episodes: int = 0,
     ) -> None:
         """`seats`: the names of the A agents. `facts`: without the returns of seats. For the rest, see `LoopedCopies`."""
-        super().__init__(makes, pulse, facts, masked=masked, critic_keys=critic_keys, first=first)
+        super().__init__(
+            makes, pulse, facts, masked=masked, critic_keys=critic_keys, first=first, restart_episodes=restart_episodes
+        )
         self._names = seats
         self._seats = len(seats)
         self._allowed: list[Bools | None] = [None] * (self.count * len(seats))  # None: every action
@@ -49,9 +52,10 @@ class SeatedCopies(LoopedCopies):
         copies = range(len(seeds))
         self._allowed = [None] * (self.count * self._seats)
         self._loop.reset(copies, seeds, self._observations, pulse)
+        self.note = self._never_anew()
         if self._masks is None:
             infos = [info for step in self._observations if step is not None for info in step.infos]
-            self.note = unused_mask(infos, self.action_space)
+            self.note = self.note or unused_mask(infos, self.action_space)
         return self._result(copies).leaves
 
     def step(self, actions: Array, pulse: Pulse, copies: Sequence[int] | None = None) -> StepResult:

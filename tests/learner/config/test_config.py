@@ -157,6 +157,8 @@ def test_a_target_that_no_evaluation_can_reach_is_said() -> None:
         ({"max_lag": 8192}, "4 lanes with max_lag 8192: expected lanes * (1 + max_lag) of at most 32768, got 32772"),
         ({"envs": 6}, "6 envs cannot be shared evenly among 4 lanes; take 4 or 8, or 3 lanes"),
         ({"envs": 2}, "2 envs cannot be shared evenly among 4 lanes; take 4, or 2 lanes"),
+        ({"vector": "native", "restart_episodes": 5}, "vector native: restart_episodes makes single env copies anew"),
+        ({"inference": "learner", "max_lag": 0, "restart_episodes": 5}, "restart_episodes: expected 0, got 5"),
         ({"transport": "udp"}, "transport: expected one of inproc, ipc, tcp, got 'udp'"),
         ({"activation": "gelu"}, "activation: expected one of tanh, relu, got 'gelu'"),
         ({"learning_rate": -1.0}, "learning_rate: expected float > 0.0, got -1.0"),

@@ -160,6 +160,16 @@ def test_a_resumed_run_equals_one_that_went_on(tmp_path: Path, variant: str) -> 
     assert_equal(reference, folder)
 
 
+def test_a_resumed_run_whose_copies_are_made_anew_equals_one_whose_copies_stay(tmp_path: Path) -> None:
+    settings = VARIANTS["ppo"]
+    reference = run(tmp_path / "whole", **settings)
+    anew = {**settings, "restart_episodes": 1, "workers": 2}
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path / "resumed", interrupts_at(STOP), **anew)
+    folder = run(tmp_path / "resumed", resume=folder_of(tmp_path / "resumed"), **anew)
+    assert_equal(reference, folder)
+
+
 def test_with_restart_a_resumed_run_equals_one_whose_lanes_were_started_anew(tmp_path: Path) -> None:
     settings = {**VARIANTS["ppo"], "lost_lanes": "restart"}
     reference = restarted(tmp_path, STOP, **settings)

@@ -214,9 +214,11 @@ def all_bits(rollout: Rollout) -> dict[str, object]:
 def assert_goes_on(
     run: RunSpec, borders: list[int], attributes: Attributes = no_attributes, *, resumes: bool = False
 ) -> None:
-    """The lane is lost after so many rollouts, again and again, and it makes no difference."""
+    """The lane is lost after so many rollouts, again and again, and it makes no difference. Nor does it that copies are made
+    anew in between, if the run asks for it.
+    """
     rounds = borders[-1] + MORE
-    undisturbed = random_collector(run)
+    undisturbed = random_collector(replace(run, restart_episodes=0))
     expected = [rollout_of(undisturbed, run, number, attributes, None) for number in range(rounds)]
     collector = random_collector(run)
     found: list[Rollout] = []
@@ -237,14 +239,17 @@ BORDERS = st.lists(st.integers(1, 5), min_size=1, max_size=2, unique=True)
 
 
 @pytest.mark.parametrize("kind", RUNS)
-@given(T=st.integers(1, 14), N=st.integers(1, 3), borders=BORDERS, resumes=st.booleans())
-@example(T=1, N=2, borders=[1], resumes=False)
-@example(T=9, N=2, borders=[2, 3, 5], resumes=True)
+@given(
+    T=st.integers(1, 14), N=st.integers(1, 3), borders=BORDERS, resumes=st.booleans(), restarts=st.sampled_from([0, 1, 3])
+)
+@example(T=1, N=2, borders=[1], resumes=False, restarts=0)
+@example(T=9, N=2, borders=[2, 3, 5], resumes=True, restarts=1)
 @settings(max_examples=8, deadline=None)
 def test_a_lane_that_is_brought_back_goes_on_as_it_would_have(
-    kind: str, T: int, N: int, borders: list[int], resumes: bool
+    kind: str, T: int, N: int, borders: list[int], resumes: bool, restarts: int
 ) -> None:
-    assert_goes_on(RUNS[kind](T, N), sorted(borders), resumes=resumes)
+    run = replace(RUNS[kind](T, N), restart_episodes=restarts)
+    assert_goes_on(run, sorted(borders), resumes=resumes)
 
 
 @pytest.mark.parametrize(
@@ -265,12 +270,14 @@ def test_an_episode_may_end_wherever_rollouts_are_cut(T: int, borders: list[int]
     borders=BORDERS,
     levels=st.lists(st.sampled_from([None, 1, 2, 5]), min_size=8, max_size=8),
     resumes=st.booleans(),
+    restarts=st.sampled_from([0, 1]),
 )
-@example(T=3, N=2, borders=[2], levels=[None, 5, 5, 5, 2, 2, 2, 2], resumes=True)  # the first ones come during an episode
-@example(T=3, N=2, borders=[3], levels=[5, 5, 2, 2, 2, 2, 2, 2], resumes=False)
+# The first ones come during an episode.
+@example(T=3, N=2, borders=[2], levels=[None, 5, 5, 5, 2, 2, 2, 2], resumes=True, restarts=0)
+@example(T=3, N=2, borders=[3], levels=[5, 5, 2, 2, 2, 2, 2, 2], resumes=False, restarts=1)
 @settings(max_examples=40, deadline=None)
 def test_each_row_is_repeated_with_the_attributes_that_it_had(
-    T: int, N: int, borders: list[int], levels: list[int | None], resumes: bool
+    T: int, N: int, borders: list[int], levels: list[int | None], resumes: bool, restarts: int
 ) -> None:
     last: list[int | None] = []  # a run sets an attribute again and again, and never takes one back
     for level in levels:
@@ -280,7 +287,8 @@ def test_each_row_is_repeated_with_the_attributes_that_it_had(
         level = last[min(number, len(last) - 1)]
         return b"" if level is None else pack({"level": level})
 
-    assert_goes_on(run_of(f"{HERE}Leveled-v0", T, N), sorted(borders), attributes, resumes=resumes)
+    run = replace(run_of(f"{HERE}Leveled-v0", T, N), restart_episodes=restarts)
+    assert_goes_on(run, sorted(borders), attributes, resumes=resumes)
 
 
 # ------------------------------------------------------------------------------------------------ no repetition
