@@ -487,7 +487,7 @@ def test_a_worker_that_runs_no_code_refuses_and_says_why(elsewhere: Elsewhere) -
 def test_a_worker_whose_step_hangs_is_ended_and_another_gets_its_lane(
     elsewhere: Elsewhere, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(vector, "_call_timeouts", lambda timeout_s: CallTimeouts(60.0, 3.0))
+    monkeypatch.setattr(vector, "call_timeouts_of", lambda timeout_s: CallTimeouts(60.0, 3.0))
     elsewhere.start("h", "--processes", "2")
     with make(HANGS, workers=None, lanes=2, bind=elsewhere.address, after=1, once=str(tmp_path / "o"),
               timeout=60.0) as env:  # fmt: skip
