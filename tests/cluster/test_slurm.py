@@ -122,7 +122,7 @@ def test_before_its_time_is_up_a_job_saves_and_is_queued_again(
     saved = script.summary()
     assert saved["stop_reason"] == "interrupted"
     accounted(saved)
-    assert re.search("interrupted; go on with", script.said(job))
+    assert re.search("interrupted; continue with", script.said(job))
     assert "TIME LIMIT" not in script.said(job)
     wait_for(lambda: slurm.seen(job)["JobState"] == "RUNNING", 120, "the job to run again")
     wait_for(lambda: script.updates() > saved["updates"], START_S, lambda: script.said(job))
