@@ -26,6 +26,7 @@ import torch
 from millrace.learner.algorithms.replay.available_memory import GIB, available_bytes
 from millrace.learner.algorithms.replay.episode_paths import NO_SLOT, EpisodePaths
 from millrace.learner.algorithms.replay.hindsight import Goals, Hindsight
+from millrace.learner.algorithms.replay.rewinding import Remembered, Rewinding
 from millrace.learner.algorithms.replay.shared_channels import SharedChannels
 from millrace.learner.algorithms.replay.sum_tree import SumTree
 from millrace.learner.algorithms.returns import EpisodeEnds
@@ -122,16 +123,6 @@ class Overwritten(NamedTuple):
     leaves: tuple[Array, ...]  # [K, *leaf] each; none where only rows or priorities are written
 
 
-class Remembered(NamedTuple):
-    """The state of a replay buffer that `roll_back` returns to, without the slots."""
-
-    written: int
-    rows: int
-    highest: float
-    newest: dict[int, Ints]
-    generator: Any
-
-
 def _goes_on(ends: EpisodeEnds, continues: Bools) -> Bools:
     """[T+1, N] whether row t begins with an observation that is stored, because the row before it in its episode led there.
 
@@ -144,7 +135,7 @@ def _goes_on(ends: EpisodeEnds, continues: Bools) -> Bools:
     return goes_on
 
 
-class ReplayBuffer:
+class ReplayBuffer(Rewinding[Overwritten]):
     """The newest transitions of all lanes, drawn uniformly or by priority."""
 
     _purpose = Purpose.REPLAY
@@ -408,30 +399,17 @@ class ReplayBuffer:
 
     # ---------------------------------------------------------------- taking back
 
-    def remember(self) -> None:
-        """Remember this state, for `roll_back`: from now on, what a slot held is kept before it is written."""
-        self._overwritten.clear()
-        self._remembered = Remembered(
-            self._written, self._rows, self._highest, dict(self._newest), self.generator.bit_generator.state
-        )
-
     def roll_back(self) -> None:
         """Return to the state that was remembered last."""
-        remembered = self._remembered
-        assert remembered is not None, "nothing was remembered"
-        self._written = remembered.written
-        self._rows = remembered.rows
-        self._highest = remembered.highest
-        self._newest = dict(remembered.newest)
-        self.generator.bit_generator.state = remembered.generator
-        for old in reversed(self._overwritten):
-            self._row[old.slots] = old.rows
-            for leaf, before in zip(self._per_observation(), old.leaves, strict=False):
-                leaf[old.slots] = before
-            if self._tree is not None and old.weights is not None:
-                self._tree.set(old.slots, old.weights)
-        self._overwritten.clear()
+        super().roll_back()
         self._find_paths()
+
+    def _put_back(self, old: Overwritten) -> None:
+        self._row[old.slots] = old.rows
+        for leaf, before in zip(self._per_observation(), old.leaves, strict=False):
+            leaf[old.slots] = before
+        if self._tree is not None and old.weights is not None:
+            self._tree.set(old.slots, old.weights)
 
     def _find_paths(self) -> None:
         """Find the paths of the rows that are stored now, after these were set in another way than by `add`."""

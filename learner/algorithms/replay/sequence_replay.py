@@ -20,7 +20,8 @@ import numpy as np
 import torch
 
 from millrace.learner.algorithms.replay.available_memory import GIB, available_bytes
-from millrace.learner.algorithms.replay.replay_buffer import PRIORITY_OFFSET, Remembered
+from millrace.learner.algorithms.replay.replay_buffer import PRIORITY_OFFSET
+from millrace.learner.algorithms.replay.rewinding import Remembered, Rewinding
 from millrace.learner.algorithms.replay.sum_tree import SumTree
 from millrace.learner.algorithms.returns import EpisodeEnds, n_step_returns
 from millrace.protocol.arrays import Array, Bools, Doubles, Floats, Ints
@@ -60,7 +61,7 @@ class ReplacedSequences(NamedTuple):
     weights: Doubles | None
 
 
-class SequenceReplay:
+class SequenceReplay(Rewinding[ReplacedSequences]):
     """The newest sequences of all lanes, drawn uniformly or by priority."""
 
     def __init__(
@@ -267,28 +268,11 @@ class SequenceReplay:
 
     # ---------------------------------------------------------------- taking back
 
-    def remember(self) -> None:
-        """Remember this state, for `roll_back`: from now on, what a slot held is kept before it is written."""
-        self._overwritten.clear()
-        self._remembered = Remembered(
-            self._written, self._rows, self._highest, dict(self._newest), self.generator.bit_generator.state
-        )
-
-    def roll_back(self) -> None:
-        """Return to the state that was remembered last."""
-        remembered = self._remembered
-        assert remembered is not None, "nothing was remembered"
-        self._written = remembered.written
-        self._rows = remembered.rows
-        self._highest = remembered.highest
-        self._newest = dict(remembered.newest)
-        self.generator.bit_generator.state = remembered.generator
-        for old in reversed(self._overwritten):
-            for name, array in old.arrays.items():
-                self.arrays[name][old.slots] = array
-            if self._tree is not None and old.weights is not None:
-                self._tree.set(old.slots, old.weights)
-        self._overwritten.clear()
+    def _put_back(self, old: ReplacedSequences) -> None:
+        for name, array in old.arrays.items():
+            self.arrays[name][old.slots] = array
+        if self._tree is not None and old.weights is not None:
+            self._tree.set(old.slots, old.weights)
 
     def _keep(self, slots: Ints, *, all_arrays: bool = False) -> None:
         """Keep what these slots hold, if `remember` was called: they are written next."""
