@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import shlex
+from typing import Any
 
 import msgspec
 import pytest
@@ -120,9 +121,7 @@ def test_all_that_is_chosen_is_nearly_the_best_of_all_sizes() -> None:
         (4, "discrete", {}, "ppo"),
     ],
 )
-def test_the_algorithm_is_that_of_the_manual(
-    each_ms: float, action: ActionKind, others: dict[str, object], algo: str
-) -> None:
+def test_the_algorithm_is_that_of_the_manual(each_ms: float, action: ActionKind, others: dict[str, Any], algo: str) -> None:
     found = choose_algorithm(measured(wait_s=each_ms * TRIED / 1e3, cpu_s=0, action=action, **others), MACHINE)
     assert (found.name, found.value) == ("algo", algo)
     assert found.why

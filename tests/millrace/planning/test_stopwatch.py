@@ -90,10 +90,14 @@ def test_notes_of_a_copy_that_crashes_are_kept(notes: Path) -> None:
 
 
 def test_agents_are_timed_too_and_a_stand_in_has_their_spaces(notes: Path) -> None:
-    spaces = gymnasium.spaces.Box(-1, 1, (3,)), gymnasium.spaces.Discrete(2)
+    spaces: tuple[gymnasium.Space[Any], gymnasium.Space[Any]] = (
+        gymnasium.spaces.Box(-1, 1, (3,)),
+        gymnasium.spaces.Discrete(2),
+    )
     env = seated(stopwatch(StandInOfAgents(*spaces, agents=("a", "b")), str(notes)), "stand-in")
     assert env.seats == ("a", "b")
-    assert (env.observation_space, env.action_space) == spaces
+    found_spaces: tuple[gymnasium.Space[Any], gymnasium.Space[Any]] = (env.observation_space, env.action_space)
+    assert found_spaces == spaces
     env.reset(seed=1)
     env.close()
     (found,) = read_notes(notes)
