@@ -40,6 +40,8 @@ from millrace.learner.run_folder.progress_file import ProgressFile
 from millrace.learner.run_setup import RunSetup
 from millrace.learner.run_spec import run_spec
 from millrace.learner.run_state import RunState, restore, start_from
+from millrace.learner.shards.roles import lead
+from millrace.learner.shards.sharded import new_sharded
 from millrace.learner.torch_setup import threads, torch_device, updates_use_all_cores
 from millrace.protocol.envs.kinds_of_copies import has_attributes
 from millrace.protocol.errors import UsageError
@@ -81,6 +83,8 @@ def open_run(setup: RunSetup, lobby: Lobby, watch: Watch, observer: HubObserver)
 
     def watch_hub(listened: Hub) -> None:
         observer(listened)
+        if setup.learners is not None:
+            setup.learners.still_waits()
         if folder.lock is None or not folder.lock.taken_over:
             progress_file.write(listened.progress, time.time())
 
@@ -161,9 +165,15 @@ def _new_algorithm(setup: RunSetup, spec: RunSpec) -> tuple[Algorithm, PriorData
     config = setup.config
     folder = setup.folder
     policy = spec.policy
-    algorithm = algorithm_class(config.algo)(
-        config.algorithm, policy, total_steps=config.steps, seed=config.seed, device=torch_device(config)
-    )
+    device = torch_device(config)
+    algorithm: Algorithm
+    if setup.learners is None:
+        algorithm = algorithm_class(config.algo)(
+            config.algorithm, policy, total_steps=config.steps, seed=config.seed, device=device
+        )
+    else:
+        algorithm = new_sharded(config, policy, device, setup.learners)
+        lead(setup.learners, config, policy, folder.shown)
     if config.start_from and not setup.resumed:
         folder.started_from = start_from(config, policy, algorithm)
         log_notice(log, folder.started_from)

@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from millrace.learner.algorithms.replay.hindsight import goals_not_used
 from millrace.learner.config.config import Config
@@ -36,6 +37,9 @@ from millrace.protocol.envs.advice.atari_ids import preprocessed
 from millrace.protocol.envs.description import DescribedEnv, agents_in_words
 from millrace.protocol.errors import UsageError
 from millrace.protocol.logs.notices import log_notice
+
+if TYPE_CHECKING:
+    from millrace.learner.shards.learners import Learners
 
 log = logging.getLogger("millrace.learner")
 
@@ -69,6 +73,8 @@ class RunSetup:
     """Entered: signals are noted from now on."""
     elsewhere: bool = False
     """Whether its workers are started elsewhere, and not by this program."""
+    learners: Learners | None = None
+    """The processes that share the updates, in a run with shards."""
 
     def announce(self, bound: Bound) -> None:
         """Write into the lock of the run folder that `millrace status` may ask at this address, or why it can't."""

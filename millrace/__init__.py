@@ -22,6 +22,7 @@ import millrace.protocol.machine.waiting_threads  # noqa: E402, F401  # before t
 from millrace.protocol.errors import (  # noqa: E402
     CheckpointError,
     EnvironmentFailed,
+    LearnerLost,
     MillraceError,
     NoWorkers,
     PolicyFailed,
@@ -62,6 +63,7 @@ __all__ = [
     "EnvCopy",
     "EnvironmentFailed",
     "Evaluation",
+    "LearnerLost",
     "LoadedPolicy",
     "Metrics",
     "MillraceError",

@@ -211,6 +211,17 @@ class TrainKeywords(RolloutKeywords, total=False):
     minibatch's forward pass, at most one for each core. If max_lag is above 0, each local worker then keeps one core,
     unless this would leave half of the cores or less to the learner. Another number changes the last bits of results.
     """
+    shards: int
+    """Number of parts of a batch whose gradients are computed apart, for several learner processes (ppo, a2c, impala,
+    reinforce). torchrun starts the processes; their number must divide this one, and doesn't change the results. Must
+    divide lanes. See docs/how-to/shards.md.
+    """
+    shard_timeout_s: float
+    """Seconds that a learner process waits for the others in an update; then all end with exit code 75."""
+    insecure_shards: bool
+    """Let the learner processes of a run with shards connect over a network, without keys and without encryption. Anyone
+    who can reach their ports can then read, disturb and stop the run.
+    """
     grace_s: float
     """Seconds from SIGTERM, SIGHUP or Ctrl-C to the end of the process. The current update gets at most half of them;
     then it is undone, and the state before it is saved. 0: wait for the update, however long it takes.

@@ -1,17 +1,21 @@
 """Every error millrace knows, in two families.
 
     MillraceError
-    ├── UserFacingError         raised: this side cannot continue; the command line prints its one line, exits with
-    `exit_code` │   ├── UsageError            2   bad flag, unknown environment, unsupported space, folder that exists, … │
-    ├── Refused               2   the learner refused this worker │   ├── RunTakenOver          1   another process trains
-    this run now; this one must write nothing more │   └── RunError              1   the run cannot continue │       ├──
-    CheckpointError   1   a checkpoint is missing, broken or of another format │       ├── NoWorkers         1   no worker is
-    left, or none ever joined │       ├── WorkerLost        1   a worker is gone, and so are its env copies, although none
-    may be lost │       ├── Stalled           1   a deadline passed; the text says what was waited for │       ├──
-    PolicyFailed 1   a policy that the user wrote raised in a worker, hung, or returned something unusable │       └──
-    EnvironmentFailed 1 the environment raised too often; the text carries its traceback └── PeerError             counted
-    and answered, never raised into the loop: a peer sent something wrong ├── BadMessage            not a valid message:
-    shape, size, type or version └── BadRollout            a rollout that breaks the row format
+    ├── UserFacingError         raised: this side cannot continue; the command line prints its line, exits with `exit_code`
+    │   ├── UsageError            2   bad flag, unknown environment, unsupported space, folder that exists, …
+    │   ├── Refused               2   the learner refused this worker
+    │   ├── RunTakenOver          1   another process trains this run now; this one must write nothing more
+    │   └── RunError              1   the run cannot continue
+    │       ├── CheckpointError   1   a checkpoint is missing, broken or of another format
+    │       ├── NoWorkers         1   no worker is left, or none ever joined
+    │       ├── WorkerLost        1   a worker is gone, and so are its env copies, although none may be lost
+    │       ├── LearnerLost      75   another process of a run with shards is gone; start all of them again
+    │       ├── Stalled           1   a deadline passed; the text says what was waited for
+    │       ├── PolicyFailed      1   a policy that the user wrote raised in a worker, hung, or returned something unusable
+    │       └── EnvironmentFailed 1   the environment raised too often; the text carries its traceback
+    └── PeerError             counted and answered, never raised into the loop: a peer sent something wrong
+        ├── BadMessage            not a valid message: shape, size, type or version
+        └── BadRollout            a rollout that breaks the row format
 
 A message is one line: who, what, expected, got, what to do next. `WorkerTraceback` is in neither family: it is a cause.
 """
@@ -216,6 +220,20 @@ class NoWorkers(RunError):
     ...     print("start a worker: millrace worker ADDRESS")
     start a worker: millrace worker ADDRESS
     """
+
+
+class LearnerLost(RunError):
+    """Another learner process of a run with shards is gone, or doesn't answer in time. The state was saved by rank 0.
+
+    Its exit code 75 says that trying again may help: whoever started the processes starts all of them again, with
+    `--resume auto`.
+
+    >>> import millrace
+    >>> millrace.LearnerLost("learner: rank 1 is gone").exit_code
+    75
+    """
+
+    exit_code = 75
 
 
 class WorkerLost(RunError):

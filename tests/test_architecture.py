@@ -44,6 +44,7 @@ LEARNER = {  # what each folder of the learner may import of the learner; train.
     "algorithm_check": {"algorithms", "config", "torch_setup"},
     "members": set[str](),
     "rollouts": {"members", "run_folder"},
+    "shards": {"algorithms", "config", "interrupts", "run_folder", "torch_setup"},
     "vector_env": {"members"},
     "run_folder": {"rehearsed_pickle"},
 }

@@ -96,8 +96,8 @@ GROUPS = {
     "errors": Group(
         "Errors",
         "Each message is one line that says what to do next.",
-        "MillraceError UserFacingError UsageError RunError CheckpointError NoWorkers WorkerLost Stalled EnvironmentFailed "
-        "PolicyFailed",
+        "MillraceError UserFacingError UsageError RunError CheckpointError NoWorkers WorkerLost LearnerLost Stalled "
+        "EnvironmentFailed PolicyFailed",
     ),
 }
 """The groups, by the names of their pages"""

@@ -21,7 +21,15 @@ from millrace.learner.algorithms.algorithm import Algorithm
 from millrace.learner.algorithms.gradient_descent import GradientDescent, UpdateMetrics, clip_norm
 from millrace.learner.algorithms.kernels.optimizer_step import make_optimizer, take_step
 from millrace.learner.algorithms.kernels.trained_networks import actor_critic_network
-from millrace.learner.algorithms.minibatches import LossInput, Minibatch, Observations, flat_tensor
+from millrace.learner.algorithms.minibatches import (
+    ColumnObservations,
+    LossInput,
+    Minibatch,
+    Observations,
+    UpdateRows,
+    WholeBatch,
+    flat_tensor,
+)
 from millrace.learner.algorithms.returns import EpisodeEnds, gae
 from millrace.learner.config.hyperparameters import ActorCriticConfig, AlgorithmConfig, PolicyGradientConfig, RecurrentConfig
 from millrace.protocol.arrays import Array, Bools, Floats
@@ -146,7 +154,7 @@ class ActorCritic(GradientDescent):
             self.env_steps += batch.env_steps
             return {}
         self.set_schedules()
-        observations = self.observations(batch)
+        rows = self.rows(batch)
         self.count(batch)
         reward = self.scaled(batch.reward)
         estimates: list[Estimates] = []
@@ -154,13 +162,12 @@ class ActorCritic(GradientDescent):
         ended = False
         while len(epochs) < self.n_epochs and not ended:
             if not estimates or self.estimates_each_epoch:
-                estimates.append(estimate := self.estimate(batch, observations, reward, pulse))
-                rows = Minibatch.of(batch, observations, estimate.advantage, estimate.target)
+                estimates.append(estimate := self.estimate(batch, rows.observations, reward, pulse))
                 count = self.minibatch_count(int(np.count_nonzero(estimate.used)))
-                minibatches = rows.epochs(estimate.used, count, self.generator)
+                minibatches = rows.epochs(estimate.advantage, estimate.target, estimate.used, count, self.generator)
             epochs.append([])
             for minibatch in next(minibatches):
-                measured, ended = self.step(minibatch)
+                measured, ended = self.step(*minibatch)
                 epochs[-1].append(measured)
                 pulse()
                 if ended:
@@ -169,20 +176,30 @@ class ActorCritic(GradientDescent):
         self.count_update(batch, len(epochs))
         return self.metrics(epochs, estimates)
 
-    def step(self, minibatch: Minibatch) -> tuple[UpdateMetrics, bool]:
+    def step(self, *minibatch: Minibatch) -> tuple[UpdateMetrics, bool]:
         """One gradient step on a minibatch. Returns the metrics, and True if they end the update (then no step was taken).
 
-        Sets the gradient to zero, differentiates the loss, raises `RunError` unless the loss, the logged numbers and the
-        gradient's norm are finite, scales the gradient by min(1, max_grad_norm / norm), and steps torch's optimizer.
+        `minibatch`: the parts of it that this process learns from: all its rows in one part, unless the run has shards.
+
+        Scales the gradient by min(1, max_grad_norm / norm), and steps torch's optimizer. Raises `RunError` before that if
+        the loss, the logged numbers or the gradient's norm are not finite.
         """
-        optimizer = self.optimizers["optimizer"]
-        loss, numbers = _checked(self.loss(self.evaluate(minibatch)), type(self).__name__)
-        metrics = self.differentiate(loss, optimizer, {**numbers, "loss": loss})
+        metrics = self.gradient(minibatch)
         clip_norm(self.net.flat, metrics["grad_norm"], self.config.max_grad_norm)
         ends = self.stops(metrics)
         if not ends:
-            take_step(optimizer)
+            take_step(self.optimizers["optimizer"])
         return metrics, ends
+
+    def gradient(self, minibatch: Sequence[Minibatch]) -> UpdateMetrics:
+        """Write the gradient of the loss of a minibatch. Returns the loss, the logged numbers and the gradient's norm."""
+        (rows,) = minibatch
+        loss, numbers = self.checked_loss(rows)
+        return self.differentiate(loss, self.optimizers["optimizer"], {**numbers, "loss": loss})
+
+    def checked_loss(self, rows: Minibatch) -> tuple[Tensor, Mapping[str, Tensor | float]]:
+        """The loss of these rows, and the numbers to log. Raises `UsageError` if `loss` returns anything else."""
+        return _checked(self.loss(self.evaluate(rows)), type(self).__name__)
 
     def evaluate(self, minibatch: Minibatch) -> LossInput:
         """The rows of a minibatch with the network's outputs: a forward pass, and the action distribution on top.
@@ -192,8 +209,9 @@ class ActorCritic(GradientDescent):
         """
         action = minibatch.action
         outputs = self.net.evaluate(minibatch.features, minibatch.images, minibatch.recurrent, action, minibatch.mask)
-        raw = minibatch.advantage
-        advantage = losses.standardized(raw) if self.standardizes_advantages() else raw
+        advantage = raw = minibatch.advantage
+        if self.standardizes_advantages():
+            advantage = losses.standardized(raw) if minibatch.standardized is None else minibatch.standardized
         return LossInput(action, minibatch.log_prob, advantage, raw, minibatch.target, *outputs)
 
     def count_update(self, batch: Batch, epochs: int) -> None:
@@ -217,14 +235,18 @@ class ActorCritic(GradientDescent):
 
     # ---------------------------------------------------------------- the network's outputs for a batch
 
-    def observations(self, batch: Batch) -> Observations:
+    def rows(self, batch: Batch) -> UpdateRows:
+        """The rows of a batch, as the update uses them."""
+        return WholeBatch(batch, self.observations(batch))
+
+    def observations(self, batch: Batch) -> ColumnObservations:
         """The observations, normalized as the workers' policy saw them."""
         x, images = self.normalizer.inputs(batch.obs, self.statistics)
         recurrent = None
         if self.policy.core is not None:
             recurrent = _recurrent_input(batch, self.tensor)
         features, *pixels = (flat_tensor(array, self.net.flat.device) for array in (x, *images))
-        return Observations(x.shape[:2], features, tuple(pixels), recurrent)
+        return ColumnObservations(x.shape[:2], features, tuple(pixels), recurrent)
 
     def values(self, observations: Observations, pulse: Pulse) -> Floats:
         """V(obs) [T+1, ΣN] with the current weights."""

@@ -9,8 +9,8 @@ time order. B is the number of rows of a minibatch, and C the number of its colu
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
-from typing import NamedTuple
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -33,7 +33,24 @@ class NetworkInput(NamedTuple):
     recurrent: RecurrentInput | None  # None without a core
 
 
-class Observations(NamedTuple):
+class Observations(Protocol):
+    """The T+1 observations of a batch, for which an algorithm computes values or log-probabilities."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """(T+1, ΣN)."""
+        ...
+
+    def evaluate(self, steps: int, function: Callable[[NetworkInput, Index], Tensor], pulse: Callable[[], None]) -> Floats:
+        """Apply `function` to the observations of the first `steps` steps, in chunks and without gradients.
+
+        `function` gets the network input of a chunk, and the numbers of its rows in the batch. It returns one number for
+        each row. Returns [steps, ΣN]. `pulse` is called after each chunk.
+        """
+        ...
+
+
+class ColumnObservations(NamedTuple):
     """The T+1 observations of ΣN env copies, normalized by the statistics that the workers acted with."""
 
     shape: tuple[int, ...]  # (T+1, ΣN)
@@ -48,10 +65,7 @@ class Observations(NamedTuple):
 
     @torch.no_grad()
     def evaluate(self, steps: int, function: Callable[[NetworkInput, Index], Tensor], pulse: Callable[[], None]) -> Floats:
-        """Apply `function` to the observations of the first `steps` steps, in chunks and without gradients.
-
-        `function` returns one number for each row. Returns [steps, ΣN]. `pulse` is called after each chunk.
-        """
+        """See `Observations`."""
         values = torch.empty(steps * self.shape[1], device=self.features.device)
         for columns, rows in self._chunks(steps):
             values[rows] = function(self.network_input(steps, columns, rows), rows)
@@ -83,9 +97,10 @@ class Minibatch(NamedTuple):
     target: Tensor  # [B] float32, target of the value function
     recurrent: RecurrentInput | None = None  # with a core, features and images are [T · C, …], and it selects B of them
     mask: Tensor | None = None  # [B, choices] bool, which actions are allowed; None unless the run uses action masks
+    standardized: Tensor | None = None  # [B] advantages, standardized over all parts of a minibatch; None: this is all
 
     @staticmethod
-    def of(batch: Batch, observations: Observations, advantage: Floats, target: Floats) -> Minibatch:
+    def of(batch: Batch, observations: ColumnObservations, advantage: Floats, target: Floats) -> Minibatch:
         """All T · ΣN rows of a batch, including rows that are not valid. `advantage` and `target` are [T, ΣN]."""
         inputs = observations.network_input(len(batch.valid), slice(None), slice(batch.valid.size))
         device = inputs.features.device
@@ -132,22 +147,50 @@ class Minibatch(NamedTuple):
         With a core, whole columns stay together, because the core learns from rows that follow each other. Then there are at
         most as many minibatches as columns. Without a generator, the rows stay in order.
         """
-        device = self.features.device
-        # With a core, only the columns with a used row: a column without one would make an empty minibatch.
-        index = torch.from_numpy(np.flatnonzero(used if self.recurrent is None else used.any(0)))
-        if generator is not None:
-            index = index[torch.randperm(len(index), generator=generator)]
+        index = units_in_order(used, generator, whole_columns=self.recurrent is not None)
         if not len(index):
             return
-        of_columns = None if self.recurrent is None else torch.from_numpy(used).to(device)
-        for chosen in index.to(device).tensor_split(min(count, len(index))):
-            yield self.select(chosen) if of_columns is None else self.select_columns(chosen, of_columns)
+        of_rows = torch.from_numpy(used).to(self.features.device)
+        for chosen in index.to(self.features.device).tensor_split(min(count, len(index))):
+            yield self.chosen(chosen, of_rows)
 
-    def epochs(self, used: Bools, count: int, generator: torch.Generator) -> Iterator[Iterable[Minibatch]]:
-        """The minibatches of each epoch, without end. A single minibatch per epoch is made once, with its rows in order."""
-        single = tuple(self.shuffled(used, 1, None)) if count == 1 else ()
+    def chosen(self, units: Tensor, used: Tensor) -> Minibatch:
+        """A copy of some of the `units_in_order` of the rows where `used` [T, ΣN] is True."""
+        return self.select(units) if self.recurrent is None else self.select_columns(units, used)
+
+
+class UpdateRows(Protocol):
+    """The rows of a batch, as an update uses them."""
+
+    @property
+    def observations(self) -> Observations:
+        """For the estimates."""
+        ...
+
+    def epochs(
+        self, advantage: Floats, target: Floats, used: Bools, count: int, generator: torch.Generator
+    ) -> Iterator[Iterable[Sequence[Minibatch]]]:
+        """The minibatches of each epoch, without end, each in the parts that this process learns from.
+
+        A single minibatch per epoch is made once, with its rows in order. The arrays are [T, ΣN].
+        """
+        ...
+
+
+class WholeBatch(NamedTuple):
+    """All rows of a batch. A minibatch has a single part."""
+
+    batch: Batch
+    observations: ColumnObservations
+
+    def epochs(
+        self, advantage: Floats, target: Floats, used: Bools, count: int, generator: torch.Generator
+    ) -> Iterator[Iterable[Sequence[Minibatch]]]:
+        """See `UpdateRows`."""
+        rows = Minibatch.of(self.batch, self.observations, advantage, target)
+        single = tuple((part,) for part in rows.shuffled(used, 1, None)) if count == 1 else ()
         while True:
-            yield single or self.shuffled(used, count, generator)
+            yield single or ((part,) for part in rows.shuffled(used, count, generator))
 
 
 class LossInput(NamedTuple):
@@ -179,6 +222,15 @@ def flat_tensor(array: Array, device: torch.device | str) -> Tensor:
     return torch.from_numpy(array.reshape(array.shape[0] * array.shape[1], *array.shape[2:])).to(device)
 
 
+def units_in_order(used: Bools, generator: torch.Generator | None, *, whole_columns: bool) -> Tensor:
+    """The numbers of the rows where `used` [T, N] is True, shuffled; without a generator in order.
+
+    `whole_columns`: the numbers of the columns with such a row. A column without one would make an empty minibatch.
+    """
+    units = torch.from_numpy(np.flatnonzero(used.any(0) if whole_columns else used))
+    return units if generator is None else units[torch.randperm(len(units), generator=generator)]
+
+
 def rows_of_columns(steps: int, columns: int, chosen: Tensor) -> Tensor:
     """The numbers of all rows of the chosen columns, in time order. There are `steps` × `columns` rows."""
     return (torch.arange(steps, device=chosen.device)[:, None] * columns + chosen).flatten()
@@ -186,9 +238,11 @@ def rows_of_columns(steps: int, columns: int, chosen: Tensor) -> Tensor:
 
 def log_probs(net: ActorCriticNetwork, observations: Observations, batch: Batch, pulse: Callable[[], None]) -> Floats:
     """Log π(action) [T, ΣN] with the weights of `net`."""
-    rows = Minibatch.of(batch, observations, batch.reward, batch.reward)
+    device = net.flat.device
+    action = flat_tensor(batch.action, device)
+    mask = None if batch.mask is None else flat_tensor(batch.mask[:-1], device)
 
     def log_prob(inputs: NetworkInput, at: Index) -> Tensor:
-        return net.evaluate(*inputs, rows.action[at], None if rows.mask is None else rows.mask[at])[0]
+        return net.evaluate(*inputs, action[at], None if mask is None else mask[at])[0]
 
     return observations.evaluate(len(batch.valid), log_prob, pulse)

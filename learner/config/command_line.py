@@ -45,6 +45,7 @@ GROUPS = {
         "lanes", "max_lag", "vector", "critic_keys", "action_masks", "inference", "acting_dtype", "torch_threads",
         "max_env_copies", "min_workers", "launched_workers",
     ),
+    "several learner processes": ("shards", "shard_timeout_s", "insecure_shards"),
     "network": ("transport", "bind", "advertise", "keys", "insecure"),
     "timeouts and failures": (
         "lost_lanes", "replay_limit", "restart_episodes", "worker_timeout_s", "no_workers_timeout_s", "start_timeout_s",

@@ -15,7 +15,7 @@ import msgspec
 import tomli_w
 from msgspec import Meta
 
-from millrace.flags.fields import Flag, NotNegative
+from millrace.flags.fields import Flag, NotNegative, Positive
 from millrace.learner.config.hyperparameters import HYPERPARAMETERS, AlgorithmConfig, PPOConfig
 from millrace.learner.config.resume_rules import Fixed, Free
 from millrace.learner.config.rollout_config import RolloutConfig
@@ -110,6 +110,18 @@ class Config(RolloutConfig, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     1; with images, an encoder or a layer of 512 x 512 weights it is one for each 34 million multiply-adds of a minibatch's
     forward pass, at most one for each core. If max_lag is above 0, each local worker then keeps one core, unless this would
     leave half of the cores or less to the learner. Another number changes the last bits of results.
+    """
+
+    shards: Fixed[Count] = 1
+    """Number of parts of a batch whose gradients are computed apart, for several learner processes (ppo, a2c, impala,
+    reinforce). torchrun starts the processes; their number must divide this one, and doesn't change the results. Must divide
+    lanes. See docs/how-to/shards.md.
+    """
+    shard_timeout_s: Free[Positive] = 600.0
+    """Seconds that a learner process waits for the others in an update; then all end with exit code 75."""
+    insecure_shards: Free[bool] = False
+    """Let the learner processes of a run with shards connect over a network, without keys and without encryption. Anyone who
+    can reach their ports can then read, disturb and stop the run.
     """
 
     grace_s: Free[NotNegative] = 30.0

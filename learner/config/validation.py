@@ -40,6 +40,7 @@ def validate(config: Config) -> None:
     if config.inference == "learner":
         _check_learner_inference(config)
     _check_prior(config)
+    _check_shards(config)
     check_copies(config, "max_env_copies", config.max_env_copies)
     encoder = getattr(config.algorithm, "encoder", None)
     if encoder is not None and not is_name(encoder):
@@ -208,6 +209,16 @@ def _check_learner_inference(config: Config) -> None:
     else:
         return
     raise UsageError(f"inference learner: {wrong}")
+
+
+def _check_shards(config: Config) -> None:
+    if config.lanes % config.shards:
+        raise UsageError(f"shards: expected a divisor of lanes {config.lanes}, got {config.shards}")
+    match config.algorithm:
+        case OffPolicyConfig() if config.shards > 1:
+            raise UsageError(
+                f"shards {config.shards}: {config.algo} learns in one process; expected ppo, a2c, impala or reinforce"
+            )
 
 
 def _check_prior(config: Config) -> None:

@@ -25,4 +25,4 @@ def _train(argv: list[str], command: Literal["train", "learner"]) -> int:
     shown = ShownRun(argv, new=None if resume else config, command=command)
     with shown.progress() as watch:
         run = training.train(config, resume, watch, elsewhere=command == "learner")
-    return shown.end(run)
+    return shown.end(run) if training.leads(config) else 0

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import logging
-from contextlib import AbstractContextManager, ExitStack
+import os
+from collections.abc import Callable
+from contextlib import AbstractContextManager, ExitStack, nullcontext
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from millrace.launch.crew import Crew, crew_of_run
 from millrace.launch.worker_pool import WorkerPool, open_worker_pool
@@ -23,12 +26,18 @@ from millrace.learner.run_setup import (
     named_environment,
     prometheus_observer,
     run_folder,
+    stopped,
 )
-from millrace.learner.torch_setup import one_thread
+from millrace.learner.shards.place import ALONE, Place, check_loopback
+from millrace.learner.torch_setup import one_thread, torch_device
 from millrace.learner.whole_run import train_to_the_end
 from millrace.protocol.env_spec import EnvSpec
+from millrace.protocol.logs.notices import log_notice
 from millrace.workers.machine_slots import LIMIT_VARIABLE, copies_per_machine
 from millrace.workers.supervise.supervisor import STOP_WITHIN_S
+
+if TYPE_CHECKING:
+    from millrace.learner.shards.learners import Learners
 
 log = logging.getLogger("millrace.learner")
 
@@ -38,11 +47,34 @@ def train(config: Config, resume: Path | None, watch: Watch, env: EnvSpec | None
 
     `elsewhere`: the workers are started elsewhere and join at `config.bind`. Raises `UserFacingError`, or `Interrupted` if
     the user stopped the run.
+
+    In a run with shards, only rank 0 of the learner processes does this; the others take part in its updates.
     """
-    return unless_finished(config, resume, lambda checked: _train(config, checked, watch, env, elsewhere=elsewhere))
+    place = _place(config)
+    check_loopback(place, insecure=config.insecure_shards)
+
+    def train_or_follow(checked: Resumption | None) -> Path:
+        if place.rank == 0:
+            return _train(config, checked, watch, env, place, elsewhere=elsewhere)
+        from millrace.learner.shards.roles import follow  # imports PyTorch
+
+        return follow(config, place)
+
+    return unless_finished(config, resume, train_or_follow)
 
 
-def _train(config: Config, resume: Resumption | None, watch: Watch, env: EnvSpec | None, *, elsewhere: bool) -> Path:
+def leads(config: Config) -> bool:
+    """Whether this process has the run folder; in a run with shards only rank 0 has it."""
+    return _place(config).rank == 0
+
+
+def _place(config: Config) -> Place:
+    return Place.of(os.environ) if config.shards > 1 else ALONE
+
+
+def _train(
+    config: Config, resume: Resumption | None, watch: Watch, env: EnvSpec | None, place: Place, *, elsewhere: bool
+) -> Path:
     check_packages(config)
     env = env or named_environment(config)
     acts = config.inference == "learner"
@@ -72,13 +104,30 @@ def _train(config: Config, resume: Resumption | None, watch: Watch, env: EnvSpec
             open_run,  # imports PyTorch, unless it was imported while a worker described the environment
         )
 
-        with interrupts, one_thread():
-            setup = RunSetup(config, known, folder, resume is not None, interrupts, elsewhere)
+        def poll(line: str) -> None:
+            if line:
+                log_notice(log, f"rank 0 {line}")
+            lobby.listen()
+            if interrupts.received:
+                raise stopped(None if resume is None else resume.run)
+
+        with interrupts, one_thread(), _learners(config, place, poll) as learners:
+            setup = RunSetup(config, known, folder, resume is not None, interrupts, elsewhere, learners)
             run = open_run(setup, lobby, watch, observer)
             pool.report(run.parts.hub.status)
             setup.announce(pool.bound)
             train_to_the_end(run, 1 if acts else workers)
         return folder.shown
+
+
+def _learners(config: Config, place: Place, poll: Callable[[str], None]) -> AbstractContextManager[Learners | None]:
+    """The processes that share the updates, while it is entered; None in a run without shards."""
+    if config.shards == 1:
+        return nullcontext()
+    from millrace.learner.shards.learners import connected  # imports PyTorch
+    from millrace.learner.shards.roles import timeouts
+
+    return connected(place, config.shards, torch_device(config), timeouts(config), poll)
 
 
 def _pool(config: Config, env: EnvSpec, workers: int, *, elsewhere: bool) -> AbstractContextManager[WorkerPool]:

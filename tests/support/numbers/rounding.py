@@ -28,7 +28,7 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from millrace.protocol.arrays import Array
-from millrace.protocol.policy.networks import FlatNetwork, network_of
+from millrace.protocol.policy.networks import FlatNetwork, RecurrentInput, network_of
 
 UNIT = 2.0**-24
 ELEMENTWISE = 16  # roundings that an activation, a softmax or a log-probability adds
@@ -36,6 +36,7 @@ SAMPLES = 16
 
 EXACT = (
     *("_to_copy", "_unsafe_view", "abs", "amax", "cat", "clamp", "clone", "eq", "gather", "ge", "gt", "index", "le", "lt"),
+    "index_put",  # of rows that were each selected once
     *("logical_and", "masked_fill", "minimum", "maximum", "neg", "new_ones", "new_zeros", "ones_like", "randn", "relu"),
     *("scalar_tensor", "scatter_add", "select_backward", "slice_backward", "stack", "threshold_backward", "unsafe_split"),
     "where",
@@ -123,7 +124,9 @@ def in_float64(net: FlatNetwork) -> Any:
 
 
 def in_double(value: Any) -> Any:
-    """A float tensor in float64; anything else as it is."""
+    """A float tensor in float64, also in the input of a core; anything else as it is."""
+    if isinstance(value, RecurrentInput):
+        return RecurrentInput(*map(in_double, value))
     return value.double() if isinstance(value, Tensor) and value.is_floating_point() else value
 
 

@@ -68,9 +68,9 @@ def watched(algorithm: ActorCritic) -> list[Minibatch]:
     minibatches: list[Minibatch] = []
     step = algorithm.step
 
-    def recorded_step(minibatch: Minibatch) -> tuple[dict[str, float], bool]:
-        minibatches.append(minibatch)
-        return step(minibatch)
+    def recorded_step(*minibatch: Minibatch) -> tuple[dict[str, float], bool]:
+        minibatches.extend(minibatch)
+        return step(*minibatch)
 
     algorithm.step = recorded_step  # type: ignore[method-assign]
     return minibatches

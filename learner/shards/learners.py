@@ -1,0 +1,246 @@
+"""The learner processes of a run, connected by torch.distributed: gloo between CPUs, NCCL between GPUs. A thin shell.
+
+Rules: the number of collectives follows from what rank 0 has told, and each is one tensor of a fixed size. A process that is
+gone, or that takes longer than the timeout, ends all of them with `LearnerLost`: the program that started them starts them
+again. torch.distributed checks nobody's identity, so it listens on loopback unless the settings say otherwise.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import socket
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from datetime import timedelta
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+import torch
+from torch import Tensor, distributed
+from torch.distributed import (  # type: ignore[attr-defined]
+    DistNetworkError,
+    DistStoreError,
+    PrefixStore,
+    Store,
+    TCPStore,
+)
+
+from millrace.learner.shards.division import Division
+from millrace.learner.shards.messages import End, FromRankZero, StillThere
+from millrace.learner.shards.place import Place
+from millrace.learner.shards.reports import Report
+from millrace.protocol.arrays import Array
+from millrace.protocol.errors import LearnerLost, UsageError, first_line
+
+POLL_S = 0.1
+TELL_EVERY_S = 30.0
+TELL_BEFORE = 0.1  # of the time that others wait for a message
+PATIENCE_S = 3.0  # for a try to connect
+JOINED = "millrace/rank/"
+
+
+class Timeouts(NamedTuple):
+    """How long a process waits for others."""
+
+    join_s: float
+    """for all to be there"""
+    reply_s: float
+    """in a collective, or for the next message"""
+
+
+class Header(msgspec.Struct, frozen=True):
+    """A message, and the dtype and shape of each array that follows it."""
+
+    message: FromRankZero
+    arrays: tuple[tuple[str, tuple[int, ...]], ...]
+
+
+HEADER = msgspec.msgpack.Decoder(Header)
+
+
+class Learners:
+    """The learner processes of a run, as one of them sees them. A single one needs no group."""
+
+    def __init__(self, division: Division, *, reply_s: float = math.inf) -> None:
+        """`reply_s`: how long the others wait for a message."""
+        self.division = division
+        self.in_update = False
+        """Whether an update is under way, or was broken off: then the others expect no message."""
+        self._tell_every_s = reply_s * TELL_BEFORE
+        self._told_s = time.monotonic()
+
+    @property
+    def leads(self) -> bool:
+        """Whether this process is rank 0, which has the workers and the run folder."""
+        return self.division.rank == 0
+
+    @property
+    def others(self) -> range:
+        """The ranks that follow rank 0."""
+        return range(1, self.division.processes)
+
+    def gather(self, own: Tensor) -> Tensor:
+        """From [own shards, ...] of each process, [S, ...] of all shards. Every process calls it, with one shape."""
+        if self.division.processes == 1:
+            return own
+        of_processes = [torch.empty_like(own) for _ in range(self.division.processes)]
+        with _lost():
+            distributed.all_gather(of_processes, own)
+        return torch.cat(of_processes)
+
+    def agree(self, error: str = "") -> None:
+        """Raise `UsageError` in all processes if one of them has an error. Every process calls it."""
+        own = Report(0, error=error).encoded()
+        reports = [Report.of(each) for each in self.gather(torch.stack([own] * len(self.division.own)))]
+        if errors := [report.error for report in reports if report.error]:
+            raise UsageError(errors[0])
+
+    def still_waits(self) -> None:
+        """Tell the others, now and then, that rank 0 is there and waits for rollouts. It may be called at any time."""
+        if not self.in_update and time.monotonic() - self._told_s > self._tell_every_s:
+            self.tell_all(StillThere())
+
+    def end(self, reason: str) -> None:
+        """Tell the others that the run has ended, unless they are in an update: then the lost connection tells them."""
+        if self.leads and not self.in_update:
+            self.tell_all(End(reason))
+
+    def tell_all(self, message: FromRankZero) -> None:
+        """Send a message without arrays to all other processes."""
+        for rank in self.others:
+            self.tell(rank, message)
+
+    def tell(self, rank: int, message: FromRankZero, arrays: Sequence[Array] = ()) -> None:
+        """Send a message and its arrays to another process."""
+        self._told_s = time.monotonic()
+        told = Header(message, tuple((array.dtype.str, array.shape) for array in arrays))
+        header = np.frombuffer(bytearray(msgspec.msgpack.encode(told)), np.uint8)
+        with _lost():
+            distributed.send(torch.tensor([len(header)]), rank)
+            for array in (header, *arrays):
+                if array.size:
+                    distributed.send(_bytes_of(array), rank)
+
+    def hear(self) -> tuple[FromRankZero, list[Array]]:
+        """The next message of rank 0, and its arrays."""
+        with _lost():
+            size = torch.zeros(1, dtype=torch.int64)
+            distributed.recv(size, 0)
+            header = np.empty(int(size), np.uint8)
+            distributed.recv(_bytes_of(header), 0)
+            told = HEADER.decode(header.data)
+            arrays = [np.empty(shape, dtype) for dtype, shape in told.arrays]
+            for array in arrays:
+                if array.size:
+                    distributed.recv(_bytes_of(array), 0)
+        return told.message, arrays
+
+
+@contextmanager
+def connected(place: Place, shards: int, device: str, timeouts: Timeouts, poll: Callable[[str], None]) -> Iterator[Learners]:
+    """Connect the processes of a run, and disconnect them at the end.
+
+    `poll` is called now and then while this process waits for others, with a line that says for whom. Raises `UsageError` if
+    `shards` can't be divided among them, and `LearnerLost` if not all come in time.
+    """
+    division = place.division(shards)
+    if place.processes == 1:
+        yield Learners(division)
+        return
+    store = _store(place, timeouts, poll)
+    store.set(f"{JOINED}{place.rank}", socket.gethostname())
+    awaited = range(1, place.processes) if place.rank == 0 else range(1)
+    _wait(
+        lambda: [rank for rank in awaited if not store.check([f"{JOINED}{rank}"])],
+        place,
+        timeouts.join_s,
+        poll,
+    )
+    if device == "cuda":
+        torch.cuda.set_device(int(os.environ.get("LOCAL_RANK", 0)))
+    with _lost():
+        distributed.init_process_group(
+            "cpu:gloo,cuda:nccl" if device == "cuda" else "gloo",
+            store=store,
+            rank=place.rank,
+            world_size=place.processes,
+            timeout=timedelta(seconds=timeouts.reply_s),
+        )
+    learners = Learners(division, reply_s=timeouts.reply_s)
+    try:
+        yield learners
+        learners.end("the run has ended")
+    except LearnerLost:
+        raise
+    except BaseException as error:
+        with suppress(LearnerLost):
+            learners.end(f"rank 0 has ended: {first_line(error, type(error).__name__)}")
+        raise
+    finally:
+        distributed.destroy_process_group()
+
+
+def _store(place: Place, timeouts: Timeouts, poll: Callable[[str], None]) -> Store:
+    """The key-value store in which the processes meet. torchrun has opened one; else rank 0 opens it."""
+    opens = place.rank == 0 and os.environ.get("TORCHELASTIC_USE_AGENT_STORE") != "True"
+    found: list[Store] = []
+
+    def missing() -> list[int]:
+        with suppress(DistNetworkError, DistStoreError):
+            patience = timedelta(seconds=PATIENCE_S)
+            found.append(TCPStore(place.host, place.port, is_master=opens, wait_for_workers=False, timeout=patience))
+        return [] if found else [0]
+
+    if opens and missing():
+        raise UsageError(
+            f"MASTER_PORT {place.port}: nobody can listen there at {place.host}; expected a free port of this machine"
+        )
+    if not found:
+        _wait(missing, place, timeouts.join_s, poll)
+    # torchrun keeps the keys of the processes that it has started before.
+    return PrefixStore(os.environ.get("TORCHELASTIC_RESTART_COUNT", "0"), found[0])
+
+
+def _wait(missing: Callable[[], list[int]], place: Place, seconds: float, poll: Callable[[str], None]) -> None:
+    """Wait until no rank is missing. Raises `LearnerLost` after these seconds."""
+    end_s = time.monotonic() + seconds
+    tell_s = time.monotonic() + POLL_S * 10
+    while ranks := missing():
+        who = f"rank {', '.join(map(str, ranks))} of {place.processes}"
+        now_s = time.monotonic()
+        if now_s > end_s:
+            raise LearnerLost(
+                f"learner: rank {place.rank}: expected {who} at {place.host}:{place.port} within {seconds:.0f} s, got none; "
+                "start all of them"
+            )
+        line = ""
+        if now_s > tell_s:
+            tell_s = now_s + TELL_EVERY_S
+            line = f"waits for {who}, which must come to {place.host}:{place.port}"
+        poll(line)
+        time.sleep(POLL_S)
+
+
+def _bytes_of(array: Array) -> Tensor:
+    """The memory of an array, as a tensor of bytes; of a copy if it is not contiguous."""
+    return torch.from_numpy(np.ascontiguousarray(array).reshape(-1).view(np.uint8))
+
+
+@contextmanager
+def _lost() -> Iterator[None]:
+    """Errors of torch.distributed become one line."""
+    try:
+        yield
+    except (RuntimeError, ValueError) as error:  # distributed.DistError is a RuntimeError
+        raise LearnerLost(
+            f"learner: another learner process is lost, or too slow ({_cause(error)}); start all of them again, with "
+            "--resume auto"
+        ) from error
+
+
+def _cause(error: Exception) -> str:
+    """What gloo says, without the line of its source code before it and the general advice behind it."""
+    return first_line(error).partition(". This is")[0].rpartition(".cc:")[2].partition("] ")[2] or first_line(error)

@@ -1,0 +1,72 @@
+"""Which learner process this one is: torchrun, or whatever starts them, says so by environment variables. Pure."""
+
+from __future__ import annotations
+
+import os
+import socket
+from collections.abc import Mapping
+from typing import NamedTuple
+
+from millrace.learner.shards.division import Division
+from millrace.protocol.address import is_local
+from millrace.protocol.errors import UsageError
+
+LOOPBACK = ("lo", "lo0")  # names of the loopback interface, on Linux and on macOS
+
+
+class Place(NamedTuple):
+    """A process among those that a launcher has started: torchrun, or whatever sets the same variables."""
+
+    rank: int
+    processes: int
+    host: str
+    """where rank 0 listens"""
+    port: int
+
+    @staticmethod
+    def of(environment: Mapping[str, str]) -> Place:
+        """The place that RANK, WORLD_SIZE, MASTER_ADDR and MASTER_PORT name; without WORLD_SIZE there is one process.
+
+        Raises `UsageError` if they are incomplete.
+        """
+        if "WORLD_SIZE" not in environment:
+            return ALONE
+        try:
+            numbers = [int(environment[name]) for name in ("RANK", "WORLD_SIZE")]
+            if numbers[1] == 1:
+                return ALONE
+            rank, processes = numbers
+            place = Place(rank, processes, environment["MASTER_ADDR"], int(environment["MASTER_PORT"]))
+        except (KeyError, ValueError) as error:
+            raise UsageError(
+                f"shards: expected RANK, WORLD_SIZE, MASTER_ADDR and MASTER_PORT, as torchrun sets them, got {error}"
+            ) from None
+        if not 0 <= rank < processes:
+            raise UsageError(f"shards: expected RANK from 0 to {processes - 1}, got {rank}")
+        return place
+
+    def division(self, shards: int) -> Division:
+        """The shards of the processes. Raises `UsageError` if they can't be divided."""
+        if shards % self.processes:
+            raise UsageError(
+                f"shards {shards}: expected a multiple of {self.processes}, the number of learner processes (WORLD_SIZE)"
+            )
+        return Division(shards, self.processes, self.rank)
+
+
+ALONE = Place(0, 1, "", 0)
+
+
+def check_loopback(place: Place, *, insecure: bool) -> None:
+    """Raise `UsageError` if torch.distributed would listen on a network, unless that is wanted."""
+    if place.processes == 1:
+        return
+    if is_local(f"tcp://{place.host}:{place.port}"):
+        names = {name for _, name in socket.if_nameindex()}
+        for name in names.intersection(LOOPBACK):
+            os.environ.setdefault("GLOO_SOCKET_IFNAME", name)
+    elif not insecure:
+        raise UsageError(
+            f"MASTER_ADDR {place.host}: expected localhost, because torch.distributed checks nobody's identity and encrypts "
+            "nothing; in a network that only you can reach, add --insecure-shards"
+        )

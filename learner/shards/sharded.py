@@ -1,0 +1,223 @@
+"""An actor-critic whose updates several learner processes share. Its state is the same in all of them, to the bit.
+
+Law of an update: rank 0 tells the others the batch. Every process passes its own shards through the network, one shard at a
+time, and all of them gather the numbers and the gradients of all shards. From there on, each computes the same. A gradient
+is that of a mean over the rows of a minibatch, so the loss must be a mean over the rows that it gets.
+
+What rank 0 does to the state besides updates (a resume, `--from`, cloning, an update that was undone) the others learn with
+the next batch, which then carries the whole state.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+from collections.abc import Callable, Sequence
+from functools import cache
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from millrace.learner.algorithms import Algorithm, algorithm_class
+from millrace.learner.algorithms.actor_critic import ActorCritic
+from millrace.learner.algorithms.algorithm import Start
+from millrace.learner.algorithms.gradient_descent import ADVICE, UpdateMetrics, check_finite
+from millrace.learner.algorithms.minibatches import Minibatch, UpdateRows, WholeBatch
+from millrace.learner.config.config import Config
+from millrace.learner.shards.division import pairwise_sum, part_of
+from millrace.learner.shards.learners import Learners
+from millrace.learner.shards.messages import SMALL, Learn, arrays_of, batch_of
+from millrace.learner.shards.reports import Report, averaged
+from millrace.learner.shards.rows import ShardObservations, ShardRows
+from millrace.protocol.arrays import Array
+from millrace.protocol.errors import RunError, UsageError, first_line
+from millrace.protocol.rollout import Batch
+from millrace.protocol.specs import PolicySpec
+
+COMPARE_EVERY = 50  # updates: then all processes compare their weights
+LANE = SMALL.index("lane")
+
+
+class Sharded(ActorCritic):
+    """An algorithm with shards: `sharded` makes a class of this and of the algorithm."""
+
+    learners: Learners
+    """set before the first update"""
+
+    _others_know_state = False
+    _stopped: BaseException | None = None
+    """what `pulse` raised in this update"""
+    _failed: Exception | None = None
+    """what went wrong in this process, in the current minibatch"""
+
+    # ---------------------------------------------------------------- what rank 0 tells, and the others do
+
+    def update(self, batch: Batch, pulse: Callable[[], None]) -> UpdateMetrics:
+        """See `ActorCritic`. What `pulse` raises ends the update in all processes, at the next gradient step or the end."""
+        self._stopped = None
+        if self.learners.leads:
+            self._tell(batch)
+
+        def noted() -> None:
+            try:
+                pulse()
+            except BaseException as error:
+                self._stopped = self._stopped or error
+
+        self.learners.in_update = True
+        metrics = super().update(batch, noted)
+        self.learners.in_update = False
+        if self._stopped is not None:
+            raise self._stopped
+        return metrics
+
+    def _tell(self, batch: Batch) -> None:
+        state = [] if self._others_know_state else [_packed(self.state_dict())]
+        compares = not state and self.version % COMPARE_EVERY == 0
+        learn = Learn(
+            columns_per_rollout=batch.columns_per_rollout,
+            leaves=len(batch.obs),
+            extras=len(batch.extras),
+            masked=batch.mask is not None,
+            seats=batch.resets is not None,
+            state=bool(state),
+            digest=self.digest() if compares and self.learners.others else "",
+        )
+        for rank in self.learners.others:
+            columns = self.learners.division.columns_of_process(batch.lane, rank)
+            self.learners.tell(rank, learn, [self.statistics, *arrays_of(batch, columns), *state])
+        self._others_know_state = True
+
+    def follow(self, learn: Learn, arrays: Sequence[Array]) -> None:
+        """Make the update that rank 0 makes now."""
+        statistics, *rest = arrays
+        division = self.learners.division
+        if learn.state:
+            self.load_state_dict(_unpacked(rest.pop()))
+        elif learn.digest and learn.digest != self.digest():
+            self._failed = RunError(
+                f"learner: rank {division.rank}: its weights differ from those of rank 0 after update "
+                f"{self.version}; use machines with the same processors and the same packages"
+            )
+        self.statistics = statistics
+        columns = division.columns_of_process(rest[LANE], division.rank)
+        self.update(batch_of(learn, rest, columns), lambda: None)
+
+    def digest(self) -> str:
+        """SHA-256 of the weights and of the optimizer's state."""
+        found = hashlib.sha256()
+        tensors = [*self.tensors.values()]
+        for optimizer in self.optimizers.values():
+            for state in optimizer.state.values():
+                tensors += [each for _, each in sorted(state.items()) if isinstance(each, Tensor)]
+        for tensor in tensors:
+            found.update(tensor.detach().cpu().numpy().tobytes())
+        return found.hexdigest()
+
+    # ---------------------------------------------------------------- an update
+
+    def rows(self, batch: Batch) -> UpdateRows:
+        """See `ActorCritic`."""
+        division = self.learners.division
+        columns = division.columns(batch.lane)
+        parts = [part_of(batch, columns[shard]) for shard in division.own]
+        observed = [WholeBatch(part, self.observations(part)) for part in parts]
+        observations = ShardObservations(batch, columns, division.own, observed, self.learners.gather)
+        return ShardRows(observations, self.standardizes_advantages())
+
+    def count(self, batch: Batch) -> None:
+        """See `GradientDescent`. Only rank 0 has all observations; it tells the statistics with each batch."""
+        if self.learners.leads:
+            super().count(batch)
+        elif self.config.normalize_rewards:
+            self.rewards.count(batch)
+
+    def gradient(self, minibatch: Sequence[Minibatch]) -> UpdateMetrics:
+        """See `ActorCritic`. The gradients of all shards, each weighted by its rows, added in a fixed order."""
+        flat = self.net.flat
+        assert flat.grad is not None
+        own = torch.zeros(len(minibatch), len(flat), device=flat.device)
+        reports = [self._learned_from(part, gradient) for part, gradient in zip(minibatch, own, strict=True)]
+        reports = self._reports(reports)
+        rows = sum(report.rows for report in reports)
+        flat.grad.copy_(pairwise_sum(list(self.learners.gather(own))) / rows)
+        metrics = averaged(reports) | {"grad_norm": flat.grad.norm().item()}
+        check_finite(metrics, self.version, ADVICE)
+        return metrics
+
+    def _learned_from(self, rows: Minibatch, gradient: Tensor) -> Report:
+        """Write the gradient of the loss of a shard's rows, times their number. Notes an error for `_reports`."""
+        count = len(rows.action)
+        if not count or self._failed is not None:
+            return Report(0)
+        try:
+            loss, numbers = self.checked_loss(rows)
+            metrics = self.differentiate(loss * count, self.optimizers["optimizer"], {**numbers, "loss": loss})
+            assert self.net.flat.grad is not None
+            gradient.copy_(self.net.flat.grad)
+            del metrics["grad_norm"]  # that of a part
+            return Report(count, metrics)
+        except Exception as error:
+            self._failed = error
+            return Report(0)
+
+    def _reports(self, own: list[Report]) -> list[Report]:
+        """The reports of all shards. Raises what went wrong in this process, or `RunError` for another one."""
+        wrong = self._failed or self._stopped
+        if wrong is not None:
+            text = first_line(wrong, type(wrong).__name__)
+            who = f"learner: rank {self.learners.division.rank}: "
+            own = [Report(0, error=who + text.removeprefix(who))] * len(own)
+        padded = self.learners.gather(torch.stack([each.encoded() for each in own]))
+        if wrong is not None:
+            raise wrong
+        reports = [Report.of(each) for each in padded]
+        if errors := [report.error for report in reports if report.error]:
+            raise RunError(errors[0])
+        return reports
+
+    # ---------------------------------------------------------------- the state
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """See `Algorithm`."""
+        self._others_know_state = False
+        super().load_state_dict(state)
+
+    def start_from(self, start: Start) -> None:
+        """See `Algorithm`."""
+        self._others_know_state = False
+        super().start_from(start)
+
+
+@cache
+def sharded(algorithm: type[Algorithm], shards: int) -> type[Sharded]:
+    """The class of an algorithm with shards. Raises `UsageError` if it can't have any."""
+    if not issubclass(algorithm, ActorCritic):
+        raise UsageError(
+            f"shards {shards}: {algorithm.__name__} learns in one process; expected ppo, a2c, impala, reinforce or a "
+            "subclass of millrace.algorithms.ActorCritic"
+        )
+    return type(algorithm.__name__, (Sharded, algorithm), {"__module__": algorithm.__module__})
+
+
+def new_sharded(config: Config, policy: PolicySpec, device: str, learners: Learners) -> Sharded:
+    """The algorithm of these settings, with the weights of version 0. Raises `UsageError` if it can't have shards."""
+    cls: Any = sharded(algorithm_class(config.algo), config.shards)
+    algorithm: Sharded = cls(config.algorithm, policy, total_steps=config.steps, seed=config.seed, device=device)
+    algorithm.learners = learners
+    return algorithm
+
+
+def _packed(state: dict[str, Any]) -> Array:
+    """A state as bytes."""
+    file = io.BytesIO()
+    torch.save(state, file)
+    return np.frombuffer(bytearray(file.getvalue()), np.uint8)
+
+
+def _unpacked(content: Array) -> dict[str, Any]:
+    """The state in these bytes. Reading it executes no code."""
+    state: dict[str, Any] = torch.load(io.BytesIO(content.tobytes()), map_location="cpu", weights_only=True)
+    return state
