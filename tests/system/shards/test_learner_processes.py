@@ -1,0 +1,149 @@
+"""Learner processes of a run with shards, as real processes: what each says and how it ends, whatever happens to another."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from millrace.learner.run_folder.metrics_log import read_rows
+from tests.system.stage.processes import free_port, wait_for
+
+WITHIN_S = 120.0
+RUNS = "runs"
+FLAGS = (
+    *("train", "CartPole-v1", "--shards", "2", "--lanes", "2", "--envs", "4", "--workers", "1", "--rollout-steps", "64"),
+    *("--torch-threads", "1", "--eval-episodes", "2", "--checkpoint-every-s", "0"),
+)
+OTHER_VERSIONS = """
+import sys
+from millrace.learner.shards import roles
+roles.versions = lambda: {"torch": "0.0.1"}
+from millrace.cli.main import main
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+class Ranks(list[subprocess.Popen[str]]):
+    """The processes of a run, by rank."""
+
+    def end(self) -> list[tuple[int, str]]:
+        """The exit code of each, and what it said."""
+        ended = [each.communicate(timeout=WITHIN_S)[0] for each in self]
+        return [(each.returncode, said) for each, said in zip(self, ended, strict=True)]
+
+
+@contextmanager
+def ranks(
+    folder: Path,
+    count: int,
+    *flags: str,
+    steps: int = 4096,
+    of_rank: Mapping[int, Sequence[str]] = {},
+    program: Mapping[int, Sequence[str]] = {},
+) -> Iterator[Ranks]:
+    """Start a run with this number of processes. `of_rank`: more flags of a rank; `program`: what it runs."""
+    started = Ranks()
+    port = free_port()
+    try:
+        for rank in range(count):
+            place = {"RANK": rank, "WORLD_SIZE": count, "MASTER_ADDR": "localhost", "MASTER_PORT": port}
+            command = [sys.executable, *program.get(rank, ("-m", "millrace")), *FLAGS, "--steps", str(steps)]
+            started.append(
+                subprocess.Popen(
+                    [*command, "--run-dir", str(folder / RUNS), *flags, *of_rank.get(rank, ())],
+                    env=os.environ | {name: str(value) for name, value in place.items()},
+                    stdout=subprocess.PIPE,
+                    stderr=subprocess.STDOUT,
+                    text=True,
+                )
+            )
+        yield started
+    finally:
+        for each in started:
+            each.kill()
+            each.communicate()
+
+
+def run_in(folder: Path) -> Path:
+    (run,) = (folder / RUNS).iterdir()
+    return run
+
+
+def updates(folder: Path) -> int:
+    """How many updates the run in this folder has made."""
+    return sum(len(read_rows(file)) for file in folder.glob(f"{RUNS}/*/metrics.jsonl"))
+
+
+def policy(folder: Path) -> bytes:
+    return (run_in(folder) / "policy.safetensors").read_bytes()
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """The policy of the run with one process."""
+    folder = tmp_path_factory.mktemp("one")
+    with ranks(folder, 1) as started:
+        ((code, said),) = started.end()
+    assert code == 0, said
+    return policy(folder)
+
+
+def test_settings_of_rank_0_count_and_the_policy_is_that_of_one_process(tmp_path: Path, undisturbed: bytes) -> None:
+    with ranks(tmp_path, 2, of_rank={1: ("--seed", "7", "--learning-rate", "0.1")}) as started:
+        (code, said), (other_code, other_said) = started.end()
+    assert (code, other_code) == (0, 0), said + other_said
+    assert "2 shards, 1 for each of 2 learner processes" in said
+    assert f"rank 1 of 2 takes part in the updates of run {run_in(tmp_path)}" in other_said
+    assert policy(tmp_path) == undisturbed
+
+
+def test_a_killed_rank_ends_all_and_a_run_that_is_resumed_with_fewer_is_the_same(tmp_path: Path, undisturbed: bytes) -> None:
+    with ranks(tmp_path, 2) as started:
+        wait_for(lambda: updates(tmp_path) >= 3, WITHIN_S, "three updates")
+        started[1].kill()
+        (code, said), _ = started.end()
+    assert code == 75
+    assert "learner: another learner process is lost, or too slow (" in said
+    assert "; start all of them again, with --resume auto" in said
+    with ranks(tmp_path, 1, "--resume", "auto") as started:
+        ((code, said),) = started.end()
+    assert code == 0, said
+    assert policy(tmp_path) == undisturbed
+
+
+def test_a_rank_that_hangs_ends_all_after_the_timeout(tmp_path: Path) -> None:
+    with ranks(tmp_path, 2, "--shard-timeout-s", "5", steps=1_000_000) as started:
+        wait_for(lambda: updates(tmp_path) >= 1, WITHIN_S, "an update")
+        started[1].send_signal(signal.SIGSTOP)
+        assert started[0].wait(WITHIN_S) == 75
+        started[1].send_signal(signal.SIGCONT)
+        assert [code for code, _ in started.end()] == [75, 75]
+
+
+def test_an_interrupted_rank_0_ends_all_and_saves(tmp_path: Path) -> None:
+    """A launcher sends the signal to every process."""
+    with ranks(tmp_path, 2, steps=1_000_000) as started:
+        wait_for(lambda: updates(tmp_path) >= 1, WITHIN_S, "an update")
+        for each in started:
+            each.send_signal(signal.SIGTERM)
+        (code, said), (other_code, other_said) = started.end()
+    assert (code, other_code) == (130, 0), said + other_said
+    assert "millrace: interrupted; continue with: " in said, said
+    assert "rank 1: rank 0 has ended" in other_said
+
+
+def test_a_rank_with_other_packages_is_refused_by_all(tmp_path: Path) -> None:
+    with ranks(tmp_path, 2, program={1: ("-c", OTHER_VERSIONS)}) as started:
+        ended = started.end()
+    for code, said in ended:
+        assert code == 2
+        assert "learner: rank 1: python: expected " in said
+        assert ", as rank 0 has, got none; install the same in both" in said
+    assert not (tmp_path / RUNS).exists()
