@@ -29,6 +29,7 @@ from benchmarks.scores import (
 from millrace.launch.policy_workers import PlayingWorkers, policy_player
 from millrace.learner.config.config import TABLES, Config
 from millrace.learner.config.layers import config_of_run, resolve
+from millrace.learner.config.local_workers import local_workers
 from millrace.learner.config.presets import added, environment_name
 from millrace.learner.policy_player import saved_policy
 from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan, evaluation_of
@@ -75,7 +76,7 @@ def _played(path: Path, config: Config, found: Evaluation | None, which: Which) 
     """The mean return over `EPISODES` episodes. They are played here if the run's own evaluation had another number."""
     if found is not None and found.episodes != EPISODES:
         plan = EvaluationPlan.of(EPISODES, OTHER_EPISODES, config.eval_copies, config.eval_max_steps)
-        with policy_player(saved_policy(path, which), PlayingWorkers(config.workers), lambda text: None) as player:
+        with policy_player(saved_policy(path, which), PlayingWorkers(local_workers(config)), lambda text: None) as player:
             found = evaluation_of(player.play(plan))
     return None if found is None else found.return_mean
 

@@ -27,8 +27,10 @@ class RolloutKeywords(TypedDict, total=False):
     """
     seed: int
     """Seed of all random numbers of the run."""
-    workers: int
-    """Number of worker processes on this machine (train only)."""
+    workers: int | None
+    """Number of worker processes on this machine (train only). none: one for each core, but at most one for each lane.
+    Take more if steps wait for something else than the CPU.
+    """
     envs: int
     """Number of env copies, summed over all workers. Must be a multiple of lanes."""
     lanes: int

@@ -52,8 +52,10 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     """
     seed: Fixed[Annotated[int, Meta(ge=0)]] = 1
     """Seed of all random numbers of the run."""
-    workers: Free[Count] = 2
-    """Number of worker processes on this machine (train only)."""
+    workers: Free[Count | None] = None
+    """Number of worker processes on this machine (train only). none: one for each core, but at most one for each lane. Take
+    more if steps wait for something else than the CPU.
+    """
     envs: Adaptable[Count] = 8
     """Number of env copies, summed over all workers. Must be a multiple of lanes."""
 

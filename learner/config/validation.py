@@ -91,18 +91,6 @@ def check_copies(config: Config, limit: str, most: int) -> None:
         )
 
 
-def idle_workers(config: Config) -> str:
-    """A line for the user if some workers of a run on this machine will have no lane; else empty."""
-    idle = config.workers - config.lanes
-    if idle <= 0:
-        return ""
-    envs = -(-config.envs // config.workers) * config.workers
-    return (
-        f"{idle} of {config.workers} workers have nothing to collect, because there are {config.lanes} lanes; to use all, "
-        f"take --lanes {config.workers}" + (f" --envs {envs}" if envs != config.envs else "")
-    )
-
-
 def workers_to_wait_for(config: RolloutConfig, local: int | None) -> int:
     """How many workers must have joined before collection starts. Raises `UsageError` if that many can't join.
 

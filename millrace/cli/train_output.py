@@ -14,11 +14,14 @@ from typing import TYPE_CHECKING
 
 from millrace.flags.parse import typed_flags
 from millrace.flags.program_name import typed_name
+from millrace.learner.config.local_workers import chosen_workers
 from millrace.learner.config.presets import origin
 from millrace.learner.run_folder.results import ALL_STEPS_DONE
 from millrace.learner.run_folder.run_folder import RunFolder
 from millrace.learner.standard_streams import unfailing
+from millrace.protocol.errors import joined
 from millrace.protocol.logs.notices import log_notice
+from millrace.protocol.machine.cpu_cores import usable_cores
 from millrace.terminal import progress_view
 
 if TYPE_CHECKING:
@@ -46,7 +49,7 @@ class ShownRun:
     def progress(self) -> Iterator[Watch]:
         """While it is entered, shows each progress that it is called with."""
         with unfailing("stdout"), progress_view(self._log_json) as watch:
-            yield watch if self._new is None else _after_origin(self._new, watch)
+            yield watch if self._new is None else _after_origin(self._new, self._command, watch)
 
     def end(self, run: Path) -> int:
         """Print how the run in this folder ended. Returns the exit code."""
@@ -58,9 +61,10 @@ class ShownRun:
         return 0
 
 
-def _after_origin(config: Config, watch: Callable[[Progress], None]) -> Callable[[Progress], None]:
-    """Wraps a function so that it first logs where the settings come from."""
-    lines = iter([origin(config)])
+def _after_origin(config: Config, command: str, watch: Callable[[Progress], None]) -> Callable[[Progress], None]:
+    """Wraps a function so that it first logs where the settings come from, and how many workers `train` has chosen."""
+    workers = chosen_workers(config, usable_cores()) if command == "train" else ""
+    lines = iter([joined(origin(config), workers)])
 
     def logged(progress: Progress) -> None:
         for line in lines:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from millrace.learner.config.config import Config
+from millrace.learner.config.local_workers import local_workers
 from millrace.learner.config.rollout_config import RolloutConfig
 from millrace.learner.run_folder.regular_files import open_regular, reason, subfolder
 from millrace.protocol.errors import UsageError
@@ -78,7 +79,7 @@ def crew_of_run(config: Config, run: Path) -> Crew:
 
     Raises `UsageError` if the logs can't be there.
     """
-    count = config.workers + config.eval_workers
+    count = local_workers(config) + config.eval_workers
     if config.transport == "inproc":
         return Crew(count, config.eval_workers)
     cores = [] if config.eval_workers else worker_cores(config)
@@ -107,4 +108,4 @@ def worker_cores(config: RolloutConfig) -> list[int]:
     if not hasattr(os, "sched_setaffinity"):
         return []
     cores = sorted(os.sched_getaffinity(0))
-    return cores if config.max_lag == 0 and config.workers % len(cores) == 0 else []
+    return cores if config.max_lag == 0 and local_workers(config) % len(cores) == 0 else []

@@ -18,6 +18,7 @@ from millrace.launch.crew import Crew
 from millrace.launch.vector import VectorEnvPool, open_vector_env_pool
 from millrace.launch.worker_pool import STOP_BEFORE_RUN_S, ActingPool, open_worker_pool
 from millrace.learner.config.config import Config
+from millrace.learner.config.local_workers import local_workers
 from millrace.learner.members.bound import Bound
 from millrace.learner.members.events import Failed
 from millrace.learner.members.lobby import Lobby, LobbySettings
@@ -71,7 +72,7 @@ def settings_of_run(config: Config, env: EnvSpec, where: BindSettings, workers: 
     copies = VectorEnvSettings(
         env,
         config.envs,
-        workers=None if where.bind else config.workers,
+        workers=None if where.bind else local_workers(config),
         lanes=config.lanes,
         listen=where,
         transport=config.transport,

@@ -7,6 +7,7 @@ from contextlib import ExitStack
 
 from millrace.launch.crew import Crew, worker_cores
 from millrace.launch.worker_pool import open_worker_pool
+from millrace.learner.config.local_workers import local_workers
 from millrace.learner.config.rollout_config import RolloutConfig
 from millrace.learner.config.validation import workers_to_wait_for
 from millrace.learner.env_spaces import EnvSpaces
@@ -39,11 +40,11 @@ def start(
 
     `listens`: wait for workers elsewhere at `config.bind`, instead of starting some. Raises `UserFacingError`.
     """
-    workers = workers_to_wait_for(config, None if listens else config.workers)
+    workers = workers_to_wait_for(config, None if listens else local_workers(config))
     code = env.called_code or ("a policy's factory" if isinstance(policy, OwnPolicy) else "")
     where = BindSettings(config.bind if listens else "", config.keys, config.insecure, config.advertise)
     pool = resources.enter_context(open_worker_pool(where, config.transport, code))
-    crew = Crew() if listens else Crew(config.workers, cores=worker_cores(config))
+    crew = Crew() if listens else Crew(local_workers(config), cores=worker_cores(config))
     lobby = resources.enter_context(pool.start(crew, lobby_settings(config)))
     described = lobby.describe(Unknown(env, config.vector), check_interrupt)
     spaces = EnvSpaces.of_description(described, config.action_masks)

@@ -13,7 +13,8 @@ from millrace.launch.crew import Crew, crew_of_run
 from millrace.launch.worker_pool import WorkerPool, open_worker_pool
 from millrace.learner.callbacks.callbacks import Watch
 from millrace.learner.config.config import Config
-from millrace.learner.config.validation import check_copies, idle_workers, workers_to_wait_for
+from millrace.learner.config.local_workers import local_workers, uneven_lanes
+from millrace.learner.config.validation import check_copies, workers_to_wait_for
 from millrace.learner.extras import check_packages
 from millrace.learner.interrupts import Interrupts
 from millrace.learner.members.who_may_connect import BindSettings
@@ -80,9 +81,10 @@ def _train(
     acts = config.inference == "learner"
     if not elsewhere:
         check_copies(config, LIMIT_VARIABLE, copies_per_machine())  # all copies of the run are on this machine
-        if not acts and (line := idle_workers(config)):
+        if not acts and (line := uneven_lanes(config)):
             log.warning("%s", line)
-    stepping = min(config.workers, config.envs) if acts else config.workers
+    here = local_workers(config)
+    stepping = min(here, config.envs) if acts else here
     workers = workers_to_wait_for(config, None if elsewhere else stepping)
     with ExitStack() as stack:
         # A run to resume is locked before the address is bound, so that a second learner of the run gets the right error.

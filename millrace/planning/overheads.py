@@ -19,6 +19,7 @@ from millrace.learner.algorithms import algorithm_class
 from millrace.learner.config.config import Config
 from millrace.learner.config.costs import minibatch_rows
 from millrace.learner.config.hyperparameters import OffPolicyConfig, QLearningConfig
+from millrace.learner.config.local_workers import local_workers
 from millrace.learner.update_time import UpdateTime, update_time
 from millrace.planning.measurements import Overheads
 from millrace.planning.stand_in import StandIn, StandInOfAgents
@@ -163,7 +164,7 @@ def _update(config: Config, env: StoodFor) -> tuple[UpdateTime, bool]:
 
         policy = service.run.policy
         taken = msgspec.structs.replace(config, torch_threads=None)
-        return update_time(taken, policy, collect, OF_UPDATES_S, config.workers), policy.convolves
+        return update_time(taken, policy, collect, OF_UPDATES_S, local_workers(config)), policy.convolves
 
 
 def _steps_of_update(config: Config) -> int:

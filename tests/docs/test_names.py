@@ -32,7 +32,7 @@ NAMES_OF_OTHERS = "docs/how-to/moving_from"
 """Pages that set flags of other libraries beside ours"""
 OWN_METRICS = {"is_success", "distance", "is_success_missing", "success", "NAME"}
 """Names that examples choose for numbers of their own"""
-EXIT_CODES = {0, 1, 2, 130, 137, 143}
+EXIT_CODES = {0, 1, 2, 75, 130, 137, 143}
 FILE = re.compile(r"^(?:learner|workers|protocol|millrace|tests|docs|examples|benchmarks|docker|website)/[\w./-]*[\w/]$")
 ENVIRONMENT = re.compile(r"-v\d+$")
 MADE_BY_COMMANDS = {"benchmarks/results", "benchmarks/results/", "benchmarks/peers/envs"}

@@ -29,6 +29,7 @@ from millrace.algorithms import (
 )
 from millrace.learner.algorithm_check.same_bits import first_difference
 from millrace.learner.algorithms import ALGORITHMS, Algorithm, algorithm_class
+from millrace.learner.algorithms.minibatches import ColumnObservations
 from millrace.protocol.arrays import Floats
 from millrace.protocol.errors import MillraceError, RunError, UsageError
 from millrace.protocol.specs import ActionSpec
@@ -97,7 +98,7 @@ class DrawsGlobalNumbers(Sound):
 
 
 class ChangesTheBatch(Sound):
-    def observations(self, batch: Batch) -> Observations:
+    def observations(self, batch: Batch) -> ColumnObservations:
         np.divide(batch.reward, 10, out=batch.reward)
         return super().observations(batch)
 
