@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ import pytest
 from millrace.cli.main import main
 from millrace.learner.run_folder.metrics_log import read_rows
 from tests.cluster.slurm import Slurm, why_not
-from tests.system.stage.processes import SMALL, START_S, TOY, Stage, wait_for
+from tests.system.stage.processes import ROOT, SMALL, START_S, TOY, Stage, free_port, wait_for
 from tests.system.stage.runs import accounted
 
 pytestmark = [pytest.mark.cluster, pytest.mark.timeout(600)]
@@ -166,3 +167,27 @@ def worker_processes(folder: Path) -> list[psutil.Process]:
         if command[1:4] == ["-m", "millrace", "worker"] and any(word.startswith(str(folder)) for word in command):
             found.append(process)
     return found
+
+
+SHARDS = """#!/bin/bash
+#SBATCH --nodes=2 --ntasks=2 --output={folder}/millrace-%j.log --chdir={folder}
+export PATH={programs}:$PATH
+{srun}
+"""
+
+
+def test_two_nodes_share_the_updates_of_a_run_by_the_line_of_the_docs(slurm: Slurm, tmp_path: Path) -> None:
+    page = (ROOT / "docs/how-to/shards.md").read_text()
+    found = re.search(r"\n    (srun .*?)\n    ```", page, re.DOTALL)
+    assert found is not None
+    small = " --steps 2000 --rollout-steps 64 --eval-episodes 1 --workers 1 --run-dir runs --shards 2"
+    srun = found[1].replace(" --shards 2", small).replace("29500", str(free_port()))
+    path = tmp_path / "shards.sbatch"
+    path.write_text(SHARDS.format(folder=tmp_path, programs=Path(sys.executable).parent, srun=srun))
+    job = slurm.submit(path)
+    said = tmp_path / f"millrace-{job}.log"
+    assert ends(slurm, job)["JobState"] == "COMPLETED", said.read_text()
+    assert "2 shards, 1 for each of 2 learner processes" in said.read_text()
+    assert "rank 1 of 2 takes part in the updates of run runs/" in said.read_text()
+    (run,) = (tmp_path / "runs").iterdir()
+    assert json.loads((run / "summary.json").read_text())["stop_reason"] == "all steps done"
