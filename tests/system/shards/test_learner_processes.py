@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import os
+import random
 import signal
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pytest
@@ -51,6 +52,8 @@ def ranks(
     """Start a run with this number of processes. `of_rank`: more flags of a rank; `program`: what it runs."""
     started = Ranks()
     port = free_port()
+    own = {"TMPDIR": str(folder / "of_ranks")}  # a learner that is killed before its workers start leaves a folder there
+    (folder / "of_ranks").mkdir(exist_ok=True)
     try:
         for rank in range(count):
             place = {"RANK": rank, "WORLD_SIZE": count, "MASTER_ADDR": "localhost", "MASTER_PORT": port}
@@ -58,7 +61,7 @@ def ranks(
             started.append(
                 subprocess.Popen(
                     [*command, "--run-dir", str(folder / RUNS), *flags, *of_rank.get(rank, ())],
-                    env=os.environ | {name: str(value) for name, value in place.items()},
+                    env=os.environ | own | {name: str(value) for name, value in place.items()},
                     stdout=subprocess.PIPE,
                     stderr=subprocess.STDOUT,
                     text=True,
@@ -72,8 +75,8 @@ def ranks(
 
 
 def run_in(folder: Path) -> Path:
-    (run,) = (folder / RUNS).iterdir()
-    return run
+    """The newest run; one that was killed before its first checkpoint is not continued."""
+    return max((folder / RUNS).iterdir())
 
 
 def updates(folder: Path) -> int:
@@ -147,3 +150,32 @@ def test_a_rank_with_other_packages_is_refused_by_all(tmp_path: Path) -> None:
         assert "learner: rank 1: python: expected " in said
         assert ", as rank 0 has, got none; install the same in both" in said
     assert not (tmp_path / RUNS).exists()
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("seed", range(10))
+def test_a_run_whose_processes_are_killed_at_random_is_the_same(tmp_path: Path, undisturbed: bytes, seed: int) -> None:
+    """Each start has one or two processes, until one of them is killed, is told to end, or hangs."""
+    generator = random.Random(seed)
+    ends: list[tuple[int, signal.Signals, list[int]]] = []
+    while True:
+        with ranks(tmp_path, generator.choice([1, 2, 2]), "--resume", "auto", "--shard-timeout-s", "5") as started:
+            hit = generator.choice(started)
+            number = generator.choice([signal.SIGKILL, signal.SIGTERM, signal.SIGSTOP])
+            with suppress(subprocess.TimeoutExpired):  # in the end it is left alone
+                started[0].wait(generator.uniform(2, 9) if len(ends) < 8 else WITHIN_S)
+            hit.send_signal(number)
+            others = [each for each in started if each is not hit]
+            if number == signal.SIGSTOP:
+                with suppress(subprocess.TimeoutExpired):  # they may not have met yet
+                    _ = [each.wait(10) for each in others]
+                hit.kill()
+            for each in others:
+                each.send_signal(signal.SIGTERM)  # as torchrun does
+            ends.append((started.index(hit), number, []))
+            ends[-1][2].extend(code for code, _ in started.end())
+        codes = ends[-1][2]
+        assert {*codes} <= {0, 75, 130, -signal.SIGKILL}, ends
+        if codes[0] == 0:
+            break
+    assert policy(tmp_path) == undisturbed, ends
