@@ -73,6 +73,9 @@ BENCHMARKS = {
     "memory": Benchmark(
         "memory", "memory of all processes of a run, compared with Stable-Baselines3", brief=("--rounds", "1")
     ),
+    "gpu": Benchmark(
+        "gpu", "PPO from frames by its parts, for a machine with a GPU", brief=("--seconds", "1", "--updates", "4")
+    ),
     "worker": Benchmark("worker", "cost of a worker process: seconds to its first rollout, memory"),
 }
 

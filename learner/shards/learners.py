@@ -150,6 +150,10 @@ def connected(place: Place, shards: int, device: str, timeouts: Timeouts, poll: 
     if place.processes == 1:
         yield Learners(division)
         return
+    if distributed.is_initialized():  # by the program that has started this process, such as Ray Train
+        with _told_of_the_end(Learners(division, reply_s=timeouts.reply_s)) as learners:
+            yield learners
+        return
     store = _store(place, timeouts, poll)
     store.set(f"{JOINED}{place.rank}", socket.gethostname())
     awaited = range(1, place.processes) if place.rank == 0 else range(1)
@@ -169,7 +173,16 @@ def connected(place: Place, shards: int, device: str, timeouts: Timeouts, poll: 
             world_size=place.processes,
             timeout=timedelta(seconds=timeouts.reply_s),
         )
-    learners = Learners(division, reply_s=timeouts.reply_s)
+    try:
+        with _told_of_the_end(Learners(division, reply_s=timeouts.reply_s)) as learners:
+            yield learners
+    finally:
+        distributed.destroy_process_group()
+
+
+@contextmanager
+def _told_of_the_end(learners: Learners) -> Iterator[Learners]:
+    """When it is left, rank 0 tells the others that the run has ended, and why."""
     try:
         yield learners
         learners.end("the run has ended")
@@ -179,8 +192,6 @@ def connected(place: Place, shards: int, device: str, timeouts: Timeouts, poll: 
         with suppress(LearnerLost):
             learners.end(f"rank 0 has ended: {first_line(error, type(error).__name__)}")
         raise
-    finally:
-        distributed.destroy_process_group()
 
 
 def _store(place: Place, timeouts: Timeouts, poll: Callable[[str], None]) -> Store:
