@@ -219,7 +219,9 @@ class TrainKeywords(RolloutKeywords, total=False):
     divide lanes. See docs/how-to/shards.md.
     """
     shard_timeout_s: float
-    """Seconds that a learner process waits for the others in an update; then all end with exit code 75."""
+    """Seconds that a learner process waits for the others in an update, or for rank 0 between updates, such as during a
+    callback; then all end with exit code 75.
+    """
     insecure_shards: bool
     """Let the learner processes of a run with shards connect over a network, without keys and without encryption. Anyone
     who can reach their ports can then read, disturb and stop the run.

@@ -67,7 +67,7 @@ def part_of(batch: Batch, columns: Columns) -> Batch:
         resets = resets[:, columns[::seats] // seats]
     return msgspec.structs.replace(
         batch,
-        obs=tuple(leaf[:, columns] for leaf in batch.obs),
+        obs=tuple(leaf.take(columns, axis=1) for leaf in batch.obs),  # contiguous, so that torch needs no other copy
         action=batch.action[:, columns],
         log_prob=batch.log_prob[:, columns],
         reward=batch.reward[:, columns],

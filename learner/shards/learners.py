@@ -67,8 +67,8 @@ class Learners:
     def __init__(self, division: Division, *, reply_s: float = math.inf) -> None:
         """`reply_s`: how long the others wait for a message."""
         self.division = division
-        self.in_update = False
-        """Whether an update is under way, or was broken off: then the others expect no message."""
+        self.others_wait = True
+        """Whether the others wait for a message: not during an update or a message, nor after one that was broken off."""
         self._tell_every_s = reply_s * TELL_BEFORE
         self._told_s = time.monotonic()
 
@@ -83,35 +83,40 @@ class Learners:
         return range(1, self.division.processes)
 
     def gather(self, own: Tensor) -> Tensor:
-        """From [own shards, ...] of each process, [S, ...] of all shards. Every process calls it, with one shape."""
+        """From [own shards, ...] of each process, [S, ...] of all shards. Every process calls it, with the same shape.
+
+        Different shapes would end processes with SIGABRT, because gloo checks sizes in a thread of its own.
+        """
         if self.division.processes == 1:
             return own
-        of_processes = [torch.empty_like(own) for _ in range(self.division.processes)]
+        every = own.new_empty(self.division.processes, *own.shape)
         with _lost():
-            distributed.all_gather(of_processes, own)
-        return torch.cat(of_processes)
+            distributed.all_gather([*every], own)
+        return every.flatten(0, 1)
 
     def agree(self, error: str = "") -> None:
         """Raise `UsageError` in all processes if one of them has an error. Every process calls it."""
-        own = Report(0, error=error).encoded()
-        reports = [Report.of(each) for each in self.gather(torch.stack([own] * len(self.division.own)))]
+        reports = [Report.of(each) for each in self.gather(Report(0, error=error).encoded()[None])]
         if errors := [report.error for report in reports if report.error]:
             raise UsageError(errors[0])
 
     def still_waits(self) -> None:
         """Tell the others, now and then, that rank 0 is there and waits for rollouts. It may be called at any time."""
-        if not self.in_update and time.monotonic() - self._told_s > self._tell_every_s:
+        if self.others_wait and time.monotonic() - self._told_s > self._tell_every_s:
             self.tell_all(StillThere())
 
-    def end(self, reason: str) -> None:
-        """Tell the others that the run has ended, unless they are in an update: then the lost connection tells them."""
-        if self.leads and not self.in_update:
-            self.tell_all(End(reason))
+    def end(self, reason: str, *, failed: bool = False) -> None:
+        """Tell the others that the run has ended, unless they expect no message: then the lost connection tells them."""
+        if self.leads and self.others_wait:
+            self.tell_all(End(reason, failed))
+            self.others_wait = False
 
     def tell_all(self, message: FromRankZero) -> None:
-        """Send a message without arrays to all other processes."""
+        """Send a message without arrays to all other processes. If one does not get it, no other message can follow."""
+        self.others_wait = False
         for rank in self.others:
             self.tell(rank, message)
+        self.others_wait = True
 
     def tell(self, rank: int, message: FromRankZero, arrays: Sequence[Array] = ()) -> None:
         """Send a message and its arrays to another process."""
@@ -144,7 +149,8 @@ def connected(place: Place, shards: int, device: str, timeouts: Timeouts, poll: 
     """Connect the processes of a run, and disconnect them at the end.
 
     `poll` is called now and then while this process waits for others, with a line that says for whom. Raises `UsageError` if
-    `shards` can't be divided among them, and `LearnerLost` if not all come in time.
+    `shards` can't be divided among them or this program has connected processes itself, and `LearnerLost` if not all come in
+    time.
     """
     division = place.division(shards)
     if place.processes == 1:
@@ -155,14 +161,15 @@ def connected(place: Place, shards: int, device: str, timeouts: Timeouts, poll: 
             yield learners
         return
     store = _store(place, timeouts, poll)
-    store.set(f"{JOINED}{place.rank}", socket.gethostname())
-    awaited = range(1, place.processes) if place.rank == 0 else range(1)
-    _wait(
-        lambda: [rank for rank in awaited if not store.check([f"{JOINED}{rank}"])],
-        place,
-        timeouts.join_s,
-        poll,
-    )
+
+    def missing() -> list[int]:
+        with _lost():
+            return [rank for rank in range(place.processes) if not store.check([f"{JOINED}{rank}"])]
+
+    with _lost():
+        store.set(f"{JOINED}{place.rank}", socket.gethostname())
+    # All wait here for all, because nothing can interrupt the wait that follows.
+    _wait(missing, place, timeouts.join_s, poll)
     if device == "cuda":
         torch.cuda.set_device(int(os.environ.get("LOCAL_RANK", 0)))
     with _lost():
@@ -190,29 +197,50 @@ def _told_of_the_end(learners: Learners) -> Iterator[Learners]:
         raise
     except BaseException as error:
         with suppress(LearnerLost):
-            learners.end(f"rank 0 has ended: {first_line(error, type(error).__name__)}")
+            why = first_line(error, type(error).__name__)
+            learners.end(f"rank 0 has ended: {why}", failed=not isinstance(error, KeyboardInterrupt))
         raise
 
 
 def _store(place: Place, timeouts: Timeouts, poll: Callable[[str], None]) -> Store:
     """The key-value store in which the processes meet. torchrun has opened one; else rank 0 opens it."""
-    opens = place.rank == 0 and os.environ.get("TORCHELASTIC_USE_AGENT_STORE") != "True"
+    patience = timedelta(seconds=PATIENCE_S)
     found: list[Store] = []
 
     def missing() -> list[int]:
-        with suppress(DistNetworkError, DistStoreError):
-            patience = timedelta(seconds=PATIENCE_S)
-            found.append(TCPStore(place.host, place.port, is_master=opens, wait_for_workers=False, timeout=patience))
+        # PyTorch prints a stack trace for each try that fails, so it tries only where somebody listens.
+        with suppress(OSError, DistNetworkError, DistStoreError):
+            socket.create_connection((place.host, place.port), PATIENCE_S).close()
+            found.append(TCPStore(place.host, place.port, is_master=False, wait_for_workers=False, timeout=patience))
         return [] if found else [0]
 
-    if opens and missing():
-        raise UsageError(
-            f"MASTER_PORT {place.port}: nobody can listen there at {place.host}; expected a free port of this machine"
-        )
-    if not found:
+    if place.rank == 0 and os.environ.get("TORCHELASTIC_USE_AGENT_STORE") != "True":
+        listens = listening(place).detach()
+        with _lost():
+            store = TCPStore(
+                place.host, place.port, is_master=True, wait_for_workers=False, timeout=patience, master_listen_fd=listens
+            )
+        found.append(store)
+    else:
         _wait(missing, place, timeouts.join_s, poll)
     # torchrun keeps the keys of the processes that it has started before.
     return PrefixStore(os.environ.get("TORCHELASTIC_RESTART_COUNT", "0"), found[0])
+
+
+def listening(place: Place) -> socket.socket:
+    """A socket for the store. PyTorch's own would listen at all addresses of the machine, for localhost too."""
+    try:
+        if place.is_local:
+            family = socket.getaddrinfo(place.host, place.port, type=socket.SOCK_STREAM)[0][0]
+            return socket.create_server((place.host, place.port), family=family)
+        if socket.has_dualstack_ipv6():
+            return socket.create_server(("", place.port), family=socket.AF_INET6, dualstack_ipv6=True)
+        return socket.create_server(("", place.port))
+    except OSError as error:
+        raise UsageError(
+            f"MASTER_PORT {place.port}: expected a free port of this machine, to listen at {place.host}, got: "
+            f"{first_line(error)}; set another one for all ranks"
+        ) from None
 
 
 def _wait(missing: Callable[[], list[int]], place: Place, seconds: float, poll: Callable[[str], None]) -> None:

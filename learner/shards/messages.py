@@ -57,6 +57,8 @@ class End(msgspec.Struct, frozen=True, tag=True):
     """The run has ended."""
 
     reason: str
+    failed: bool
+    """whether by an error: then a launcher should start all processes again, not only rank 0"""
 
 
 FromRankZero = Begin | Learn | StillThere | End
@@ -69,7 +71,7 @@ def arrays_of(batch: Batch, columns: Array) -> list[Array]:
         *(getattr(batch, name) for name in SMALL),
         *batch.extras,
         *optional,
-        *(leaf[:, columns] for leaf in batch.obs),
+        *(leaf.take(columns, axis=1) for leaf in batch.obs),
     ]
 
 

@@ -12,6 +12,7 @@ from millrace.protocol.address import is_local
 from millrace.protocol.errors import UsageError
 
 LOOPBACK = ("lo", "lo0")  # names of the loopback interface, on Linux and on macOS
+INTERFACES = ("GLOO_SOCKET_IFNAME", "NCCL_SOCKET_IFNAME")  # variables that name the one where gloo and NCCL listen
 
 
 class Place(NamedTuple):
@@ -45,6 +46,11 @@ class Place(NamedTuple):
             raise UsageError(f"shards: expected RANK from 0 to {processes - 1}, got {rank}")
         return place
 
+    @property
+    def is_local(self) -> bool:
+        """Whether only processes of this machine can reach it."""
+        return is_local(f"tcp://{self.host}:{self.port}")
+
     def division(self, shards: int) -> Division:
         """The shards of the processes. Raises `UsageError` if they can't be divided."""
         if shards % self.processes:
@@ -61,10 +67,12 @@ def check_loopback(place: Place, *, insecure: bool) -> None:
     """Raise `UsageError` if torch.distributed would listen on a network, unless that is wanted."""
     if place.processes == 1:
         return
-    if is_local(f"tcp://{place.host}:{place.port}"):
+    if place.is_local:
         names = {name for _, name in socket.if_nameindex()}
         for name in names.intersection(LOOPBACK):
-            os.environ.setdefault("GLOO_SOCKET_IFNAME", name)
+            for variable in INTERFACES:
+                # Clusters often set them for all jobs, to a network.
+                os.environ[variable] = os.environ.get(variable, name) if insecure else name
     elif not insecure:
         raise UsageError(
             f"MASTER_ADDR {place.host}: expected localhost, because torch.distributed checks nobody's identity and encrypts "

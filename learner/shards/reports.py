@@ -31,7 +31,8 @@ class Report(msgspec.Struct, frozen=True, array_like=True):
 
     def encoded(self) -> Tensor:
         """As a tensor of bytes [MOST_BYTES]. Raises `UsageError` if there are too many numbers."""
-        content = msgspec.msgpack.encode(msgspec.structs.replace(self, error=self.error[:MOST_ERROR]))
+        error = self.error[:MOST_ERROR].encode(errors="replace").decode()
+        content = msgspec.msgpack.encode(msgspec.structs.replace(self, error=error))
         if len(content) > MOST_BYTES:
             raise UsageError(
                 f"shards: a loss logs {len(self.numbers)} numbers, {len(content)} bytes; expected at most {MOST_BYTES} bytes"

@@ -20,7 +20,7 @@ from millrace.learner.shards.messages import Begin, End, Learn, StillThere
 from millrace.learner.shards.place import Place
 from millrace.learner.shards.sharded import Sharded, new_sharded
 from millrace.learner.torch_setup import one_thread, torch_device
-from millrace.protocol.errors import RunError, UserFacingError
+from millrace.protocol.errors import RunError, first_line
 from millrace.protocol.logs.notices import log_notice
 from millrace.protocol.specs import PolicySpec
 
@@ -41,7 +41,8 @@ def lead(learners: Learners, config: Config, policy: PolicySpec, run: Path) -> N
 
 
 def follow(config: Config, place: Place) -> Path:
-    """Take part in the updates of a run that rank 0 leads. Returns the path of its folder, which may be on another machine.
+    """Take part in the updates of a run that rank 0 leads. Returns the path of its folder, which may be on another machine;
+    that of the folder of all runs if the run was finished before.
 
     Ctrl-C and SIGTERM don't end this process once the run has begun: launchers send them to all processes, and rank 0 ends
     the run. `config`: only its timeouts count, and whether there is a GPU.
@@ -61,7 +62,12 @@ def follow(config: Config, place: Place) -> Path:
     ):
         match learners.hear():
             case Begin() as begin, _:
-                algorithm = _algorithm(begin, learners)
+                algorithm = algorithm_of(begin, learners)
+            case End(reason, failed=False), _:
+                log_notice(log, f"rank {place.rank}: {reason}")
+                return Path(config.run_dir)
+            case End(reason), _:
+                raise RunError(f"learner: rank {place.rank}: {reason}")
             case other, _:
                 raise RunError(f"learner: rank {place.rank}: expected the run from rank 0, got {type(other).__name__}")
         log_notice(log, f"rank {place.rank} of {place.processes} takes part in the updates of run {begin.run}")
@@ -69,8 +75,11 @@ def follow(config: Config, place: Place) -> Path:
             match learners.hear():
                 case Learn() as learn, arrays:
                     algorithm.follow(learn, arrays)
+                    del arrays  # before the next come
                 case StillThere(), _:
                     pass
+                case End(reason, failed=True), _:
+                    raise RunError(f"learner: rank {place.rank}: {reason}")
                 case End(reason), _:
                     log_notice(log, f"rank {place.rank}: {reason}")
                     return Path(begin.run)
@@ -78,16 +87,17 @@ def follow(config: Config, place: Place) -> Path:
                     raise RunError(f"learner: rank {place.rank}: expected a batch, got {type(other).__name__}")
 
 
-def _algorithm(begin: Begin, learners: Learners) -> Sharded:
+def algorithm_of(begin: Begin, learners: Learners) -> Sharded:
     """The algorithm of rank 0, in this process. All processes fail if it can't be made here."""
     rank = learners.division.rank
     try:
         config = config_from_toml(begin.config, "the settings of rank 0")
+        learners.division = learners.division._replace(shards=config.shards)
         torch.set_num_threads(config.torch_threads or 1)
         algorithm = new_sharded(config, begin.policy, begin.device, learners)
         error = _other_versions(begin.versions, versions())
-    except UserFacingError as refused:
-        error = str(refused)
+    except Exception as refused:  # whatever it is, the others wait to hear it
+        error = first_line(refused, type(refused).__name__)
     learners.agree(f"learner: rank {rank}: {error}" if error else "")
     return algorithm
 

@@ -12,26 +12,27 @@ from __future__ import annotations
 
 import hashlib
 import io
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import cache
 from typing import Any
 
 import numpy as np
 import torch
+from msgspec.structs import replace
 from torch import Tensor
 
 from millrace.learner.algorithms import Algorithm, algorithm_class
-from millrace.learner.algorithms.actor_critic import ActorCritic
+from millrace.learner.algorithms.actor_critic import ActorCritic, Estimates
 from millrace.learner.algorithms.algorithm import Start
 from millrace.learner.algorithms.gradient_descent import ADVICE, UpdateMetrics, check_finite
-from millrace.learner.algorithms.minibatches import Minibatch, UpdateRows, WholeBatch
+from millrace.learner.algorithms.minibatches import Minibatch, Observations, UpdateRows, WholeBatch
 from millrace.learner.config.config import Config
 from millrace.learner.shards.division import pairwise_sum, part_of
 from millrace.learner.shards.learners import Learners
 from millrace.learner.shards.messages import SMALL, Learn, arrays_of, batch_of
 from millrace.learner.shards.reports import Report, averaged
 from millrace.learner.shards.rows import ShardObservations, ShardRows
-from millrace.protocol.arrays import Array
+from millrace.protocol.arrays import Array, Floats
 from millrace.protocol.errors import RunError, UsageError, first_line
 from millrace.protocol.rollout import Batch
 from millrace.protocol.specs import PolicySpec
@@ -57,6 +58,7 @@ class Sharded(ActorCritic):
     def update(self, batch: Batch, pulse: Callable[[], None]) -> UpdateMetrics:
         """See `ActorCritic`. What `pulse` raises ends the update in all processes, at the next gradient step or the end."""
         self._stopped = None
+        self.learners.others_wait = False
         if self.learners.leads:
             self._tell(batch)
 
@@ -66,9 +68,8 @@ class Sharded(ActorCritic):
             except BaseException as error:
                 self._stopped = self._stopped or error
 
-        self.learners.in_update = True
         metrics = super().update(batch, noted)
-        self.learners.in_update = False
+        self.learners.others_wait = True
         if self._stopped is not None:
             raise self._stopped
         return metrics
@@ -98,22 +99,18 @@ class Sharded(ActorCritic):
             self.load_state_dict(_unpacked(rest.pop()))
         elif learn.digest and learn.digest != self.digest():
             self._failed = RunError(
-                f"learner: rank {division.rank}: its weights differ from those of rank 0 after update "
-                f"{self.version}; use machines with the same processors and the same packages"
+                f"learner: rank {division.rank}: its state differs from that of rank 0 after update {self.version}; use "
+                "machines with the same processors and the same packages, and a loss that changes nothing"
             )
         self.statistics = statistics
         columns = division.columns_of_process(rest[LANE], division.rank)
         self.update(batch_of(learn, rest, columns), lambda: None)
 
     def digest(self) -> str:
-        """SHA-256 of the weights and of the optimizer's state."""
+        """SHA-256 of the state, without the statistics of observations, which only rank 0 counts."""
         found = hashlib.sha256()
-        tensors = [*self.tensors.values()]
-        for optimizer in self.optimizers.values():
-            for state in optimizer.state.values():
-                tensors += [each for _, each in sorted(state.items()) if isinstance(each, Tensor)]
-        for tensor in tensors:
-            found.update(tensor.detach().cpu().numpy().tobytes())
+        for content in _contents({**self.state_dict(), "observations": None}):
+            found.update(content)
         return found.hexdigest()
 
     # ---------------------------------------------------------------- an update
@@ -127,12 +124,9 @@ class Sharded(ActorCritic):
         observations = ShardObservations(batch, columns, division.own, observed, self.learners.gather)
         return ShardRows(observations, self.standardizes_advantages())
 
-    def count(self, batch: Batch) -> None:
-        """See `GradientDescent`. Only rank 0 has all observations; it tells the statistics with each batch."""
-        if self.learners.leads:
-            super().count(batch)
-        elif self.config.normalize_rewards:
-            self.rewards.count(batch)
+    def estimate(self, batch: Batch, observations: Observations, reward: Floats, pulse: Callable[[], None]) -> Estimates:
+        """See `ActorCritic`. The batch has no observations and no episodes: only rank 0 would have all of them."""
+        return super().estimate(replace(batch, obs=(), episodes=()), observations, reward, pulse)
 
     def gradient(self, minibatch: Sequence[Minibatch]) -> UpdateMetrics:
         """See `ActorCritic`. The gradients of all shards, each weighted by its rows, added in a fixed order."""
@@ -165,12 +159,16 @@ class Sharded(ActorCritic):
 
     def _reports(self, own: list[Report]) -> list[Report]:
         """The reports of all shards. Raises what went wrong in this process, or `RunError` for another one."""
+        try:
+            encoded = [each.encoded() for each in own]
+        except Exception as error:
+            self._failed = error
         wrong = self._failed or self._stopped
         if wrong is not None:
-            text = first_line(wrong, type(wrong).__name__)
             who = f"learner: rank {self.learners.division.rank}: "
-            own = [Report(0, error=who + text.removeprefix(who))] * len(own)
-        padded = self.learners.gather(torch.stack([each.encoded() for each in own]))
+            text = first_line(wrong, type(wrong).__name__).removeprefix(who).removeprefix("learner: ")
+            encoded = [Report(0, error=who + text).encoded()] * len(own)
+        padded = self.learners.gather(torch.stack(encoded))
         if wrong is not None:
             raise wrong
         reports = [Report.of(each) for each in padded]
@@ -206,8 +204,29 @@ def new_sharded(config: Config, policy: PolicySpec, device: str, learners: Learn
     """The algorithm of these settings, with the weights of version 0. Raises `UsageError` if it can't have shards."""
     cls: Any = sharded(algorithm_class(config.algo), config.shards)
     algorithm: Sharded = cls(config.algorithm, policy, total_steps=config.steps, seed=config.seed, device=device)
+    if algorithm.optimizers.keys() != {"optimizer"}:
+        raise UsageError(
+            f"shards {config.shards}: {type(algorithm).__name__}: expected one optimizer, because the processes share one "
+            f"gradient, got {', '.join(algorithm.optimizers)}; train it without shards"
+        )
     algorithm.learners = learners
     return algorithm
+
+
+def _contents(state: object) -> Iterator[bytes]:
+    """The content of a state: tensors and plain data."""
+    match state:
+        case dict():
+            for name in sorted(state, key=str):
+                yield repr(name).encode()
+                yield from _contents(state[name])
+        case list() | tuple():
+            for each in state:
+                yield from _contents(each)
+        case Tensor():
+            yield state.detach().cpu().contiguous().numpy().tobytes()
+        case _:
+            yield repr(state).encode()
 
 
 def _packed(state: dict[str, Any]) -> Array:

@@ -53,15 +53,20 @@ def train(config: Config, resume: Path | None, watch: Watch, env: EnvSpec | None
     """
     place = _place(config)
     check_loopback(place, insecure=config.insecure_shards)
-
-    def train_or_follow(checked: Resumption | None) -> Path:
-        if place.rank == 0:
-            return _train(config, checked, watch, env, place, elsewhere=elsewhere)
+    if place.rank > 0:  # perhaps on a machine without the folder of the run, or of the run that it starts from
         from millrace.learner.shards.roles import follow  # imports PyTorch
 
         return follow(config, place)
+    trained: list[Path] = []
 
-    return unless_finished(config, resume, train_or_follow)
+    def lead(checked: Resumption | None) -> Path:
+        trained.append(_train(config, checked, watch, env, place, elsewhere=elsewhere))
+        return trained[0]
+
+    run = unless_finished(config, resume, lead)
+    if not trained and place.processes > 1:
+        _tell_finished(config, place)
+    return run
 
 
 def leads(config: Config) -> bool:
@@ -120,6 +125,18 @@ def _train(
             setup.announce(pool.bound)
             train_to_the_end(run, 1 if acts else workers)
         return folder.shown
+
+
+def _tell_finished(config: Config, place: Place) -> None:
+    """Tell the others, which can't know it, that there is nothing to do."""
+
+    def poll(line: str) -> None:
+        if line:
+            log_notice(log, f"rank 0 {line}")
+
+    with _learners(config, place, poll) as learners:
+        if learners is not None:
+            learners.end("the run was finished before")
 
 
 def _learners(config: Config, place: Place, poll: Callable[[str], None]) -> AbstractContextManager[Learners | None]:

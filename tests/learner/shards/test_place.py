@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import os
+from ipaddress import ip_address
 
 import numpy as np
 import pytest
+from torch import distributed
 
 from millrace.learner.config.layers import resolve
 from millrace.learner.shards.division import Division, pairwise_sum
-from millrace.learner.shards.place import ALONE, Place, check_loopback
+from millrace.learner.shards.learners import Timeouts, connected, listening
+from millrace.learner.shards.place import ALONE, INTERFACES, LOOPBACK, Place, check_loopback
 from millrace.protocol.errors import UsageError
 
 VARIABLES = {"RANK": "1", "WORLD_SIZE": "2", "MASTER_ADDR": "localhost", "MASTER_PORT": "29500"}
@@ -47,6 +50,35 @@ def test_a_network_is_used_only_if_a_flag_says_so(monkeypatch: pytest.MonkeyPatc
         check_loopback(elsewhere, insecure=False)
     check_loopback(elsewhere, insecure=True)
     assert "GLOO_SOCKET_IFNAME" not in os.environ
+
+
+def test_a_network_that_the_cluster_names_is_not_used_without_the_flag(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in INTERFACES:
+        monkeypatch.setenv(name, "eth0")
+    check_loopback(Place.of(VARIABLES), insecure=True)
+    assert {os.environ[name] for name in INTERFACES} == {"eth0"}
+    check_loopback(Place.of(VARIABLES), insecure=False)
+    assert {os.environ[name] for name in INTERFACES} <= set(LOOPBACK)
+
+
+def test_the_store_of_this_machine_listens_on_loopback() -> None:
+    with listening(Place(0, 2, "localhost", 0)) as store:
+        host, port, *_ = store.getsockname()
+        assert ip_address(host).is_loopback
+        taken = Place(0, 2, "localhost", port)
+        with pytest.raises(UsageError, match=rf"^MASTER_PORT {port}: expected a free port .*; set another one"):
+            listening(taken)
+    with listening(Place(0, 2, "10.0.0.1", 0)) as store:
+        assert ip_address(store.getsockname()[0]).is_unspecified
+
+
+def test_a_program_that_has_connected_processes_itself_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(distributed, "is_initialized", lambda: True)
+    with (
+        pytest.raises(UsageError, match=r"^shards 2: this program has called torch\.distributed\.init_process_group"),
+        connected(Place.of(VARIABLES), 2, "cpu", Timeouts(0.0, 0.0), lambda line: None),
+    ):
+        pass
 
 
 def test_every_column_belongs_to_one_shard_and_every_shard_to_one_process() -> None:

@@ -12,15 +12,18 @@ import torch
 
 from millrace.learner.algorithm_check.same_bits import first_difference
 from millrace.learner.algorithms import algorithm_class
-from millrace.learner.algorithms.actor_critic import ActorCritic
+from millrace.learner.algorithms.a2c import A2C
+from millrace.learner.algorithms.actor_critic import ActorCritic, Estimates
 from millrace.learner.algorithms.minibatches import Minibatch
 from millrace.learner.config.hyperparameters import HYPERPARAMETERS
+from millrace.learner.config.layers import resolve
 from millrace.learner.shards.division import Division
 from millrace.learner.shards.learners import Learners
-from millrace.learner.shards.messages import Learn
-from millrace.learner.shards.sharded import COMPARE_EVERY, Sharded, sharded
+from millrace.learner.shards.messages import FromRankZero, Learn, StillThere
+from millrace.learner.shards.reports import MOST_BYTES, Report
+from millrace.learner.shards.sharded import COMPARE_EVERY, Sharded, new_sharded, sharded
 from millrace.protocol.arrays import Array
-from millrace.protocol.errors import RunError, UsageError
+from millrace.protocol.errors import LearnerLost, RunError, UsageError
 from millrace.protocol.rollout import Batch
 from millrace.protocol.specs import PolicySpec
 from tests.support.in_process.learner_threads import in_threads
@@ -46,9 +49,44 @@ POLICIES = {
 }
 
 
+class Counting(A2C):
+    """Has a state of its own, which it counts."""
+
+    total = 0.0
+
+    def count(self, batch: Batch) -> None:
+        super().count(batch)
+        self.total += float(batch.reward.sum())
+
+    def other_state(self) -> dict[str, Any]:
+        return super().other_state() | {"total": self.total}
+
+    def load_other_state(self, state: dict[str, Any]) -> None:
+        super().load_other_state(state)
+        self.total = state["total"]
+
+
+class Looking(A2C):
+    """Its estimate looks at the observations of the batch."""
+
+    def estimate(self, batch: Batch, *rest: Any) -> Estimates:
+        return super().estimate(msgspec.structs.replace(batch, reward=batch.obs[0][:-1, :, 0]), *rest)
+
+
+class TwoOptimizers(A2C):
+    """Has another optimizer."""
+
+    def __init__(self, *given: Any, **named: Any) -> None:
+        super().__init__(*given, **named)
+        self.optimizers["other"] = self.optimizers["optimizer"]
+
+
+OWN: dict[str, Any] = {"counting": Counting, "looking": Looking}
+
+
 def make(name: str, spec: PolicySpec, learners: Learners | None, seed: int = 0, **settings: Any) -> ActorCritic:
-    config = msgspec.convert(settings or SETTINGS[name], HYPERPARAMETERS[name])
-    cls: Any = algorithm_class(name)
+    config = msgspec.convert(settings or SETTINGS.get(name, {}), HYPERPARAMETERS.get(name, A2C.Config))
+    cls: Any = OWN.get(name) or algorithm_class(name)
     if learners is None:
         whole: ActorCritic = cls(config, spec, total_steps=10_000, seed=seed)
         return whole
@@ -136,6 +174,7 @@ def of_run(name: str, spec: PolicySpec, batches: Sequence[Batch], processes: int
         ("impala", "discrete"),
         ("impala", "lstm"),
         ("reinforce", "gru"),
+        ("counting", "discrete"),
     ],
 )
 def test_the_bits_do_not_depend_on_the_number_of_processes(name: str, policy: str) -> None:
@@ -278,7 +317,89 @@ def test_weights_that_differ_are_found() -> None:
 
     leading, other = results_of(2, body)
     assert str(leading) == str(other)
-    assert str(leading).startswith(f"learner: rank 1: its weights differ from those of rank 0 after update {COMPARE_EVERY}")
+    assert str(leading).startswith(f"learner: rank 1: its state differs from that of rank 0 after update {COMPARE_EVERY}")
+
+
+def test_an_own_state_that_a_loss_changes_in_one_process_is_found() -> None:
+    batches = [wide(make("counting", DISCRETE, None), seed) for seed in range(COMPARE_EVERY + 2)]
+
+    def body(learners: Learners) -> Any:
+        return train(learners, "counting", DISCRETE, batches, after=differ if learners.division.rank == 1 else None)
+
+    def differ(algorithm: ActorCritic) -> None:
+        assert isinstance(algorithm, Counting)
+        algorithm.total += 1
+
+    for each in results_of(2, body):
+        assert "rank 1: its state differs" in str(each)
+
+
+@pytest.mark.parametrize("processes", [1, 2])
+def test_an_estimate_that_looks_at_observations_fails_for_any_number_of_processes(processes: int) -> None:
+    batches = [wide(make("a2c", DISCRETE, None), 0)]
+    for each in results_of(processes, lambda learners: train(learners, "looking", DISCRETE, batches)):
+        assert isinstance(each, IndexError)
+
+
+def test_all_processes_learn_that_one_logs_too_much() -> None:
+    batches = [wide(make("ppo", DISCRETE, None), 0)]
+
+    def logs_much(algorithm: ActorCritic) -> None:
+        loss = algorithm.loss
+        much = {f"number {each}": 0.0 for each in range(1000)}
+        algorithm.loss = lambda rows: (loss(rows)[0], much)  # type: ignore[method-assign]
+
+    def body(learners: Learners) -> Any:
+        return train(learners, "ppo", DISCRETE, batches, change=logs_much if learners.division.rank == 1 else None)
+
+    leading, other = results_of(2, body)
+    assert isinstance(other, UsageError)
+    assert str(leading).startswith("learner: rank 1: shards: a loss logs 1001 numbers, ")
+
+
+def test_an_error_is_told_whatever_characters_it_has() -> None:
+    error = "\ud800" + "\U0001f600" * MOST_BYTES
+    assert Report.of(Report(0, error=error).encoded()).error.startswith("?\U0001f600")
+
+
+class OneIsGone(Learners):
+    """Of three processes, rank 2 is gone."""
+
+    def __init__(self) -> None:
+        super().__init__(Division(3, 3, 0), reply_s=0.0)
+        self.told: list[FromRankZero] = []
+
+    def tell(self, rank: int, message: FromRankZero, arrays: Sequence[Array] = ()) -> None:
+        if rank == 2:
+            raise LearnerLost("rank 2 is gone")
+        self.told.append(message)
+
+
+def test_after_a_message_that_not_all_get_no_other_follows() -> None:
+    """Rank 1 may be in a collective then, where a message would make gloo end the process."""
+    learners = OneIsGone()
+    with pytest.raises(LearnerLost):
+        learners.still_waits()
+    learners.still_waits()
+    learners.end("the run has ended")
+    assert learners.told == [StillThere()]
+
+
+def test_after_a_batch_that_not_all_get_no_message_follows() -> None:
+    learners = OneIsGone()
+    algorithm = make("a2c", DISCRETE, learners)
+    algorithm.learners.division = Division(SHARDS, 4, 0)  # type: ignore[attr-defined]
+    with pytest.raises(LearnerLost):
+        algorithm.update(wide(algorithm, 0), no_pulse)
+    learners.still_waits()
+    learners.end("the run has ended")
+    assert [type(each) for each in learners.told] == [Learn]
+
+
+def test_an_algorithm_with_two_optimizers_is_refused() -> None:
+    config = resolve("CartPole-v1", algo=f"{__name__}:TwoOptimizers", shards=2, lanes=2, envs=2)
+    with pytest.raises(UsageError, match=r"^shards 2: TwoOptimizers: expected one optimizer, .* got optimizer, other; "):
+        new_sharded(config, DISCRETE, "cpu", Learners(Division(2, 1, 0)))
 
 
 def test_others_get_the_state_that_was_loaded() -> None:

@@ -29,6 +29,14 @@ roles.versions = lambda: {"torch": "0.0.1"}
 from millrace.cli.main import main
 sys.exit(main(sys.argv[1:]))
 """
+FAILS_BETWEEN_UPDATES = """
+import sys
+from millrace.learner.between_updates.audience import Audience
+def fails(*given): raise ValueError("no callback today")
+Audience.updated = fails
+from millrace.cli.main import main
+sys.exit(main(sys.argv[1:]))
+"""
 
 
 class Ranks(list[subprocess.Popen[str]]):
@@ -99,12 +107,25 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> bytes:
 
 
 def test_settings_of_rank_0_count_and_the_policy_is_that_of_one_process(tmp_path: Path, undisturbed: bytes) -> None:
-    with ranks(tmp_path, 2, of_rank={1: ("--seed", "7", "--learning-rate", "0.1")}) as started:
+    others = ("--seed", "7", "--learning-rate", "0.1", "--shards", "4", "--lanes", "4")
+    with ranks(tmp_path, 2, of_rank={1: others}) as started:
         (code, said), (other_code, other_said) = started.end()
     assert (code, other_code) == (0, 0), said + other_said
     assert "2 shards, 1 for each of 2 learner processes" in said
     assert f"rank 1 of 2 takes part in the updates of run {run_in(tmp_path)}" in other_said
+    assert "Exception raised from" not in other_said  # PyTorch's traces of tries to connect
     assert policy(tmp_path) == undisturbed
+
+
+def test_a_rank_that_cannot_see_the_folder_learns_that_the_run_was_finished(tmp_path: Path) -> None:
+    with ranks(tmp_path, 1, steps=256) as started:
+        ((code, said),) = started.end()
+    assert code == 0, said
+    elsewhere = ("--run-dir", str(tmp_path / "elsewhere"))
+    with ranks(tmp_path, 2, "--resume", "auto", steps=256, of_rank={1: elsewhere}) as started:
+        (code, said), (other_code, other_said) = started.end()
+    assert (code, other_code) == (0, 0), said + other_said
+    assert "rank 1: the run was finished before" in other_said
 
 
 def test_a_killed_rank_ends_all_and_a_run_that_is_resumed_with_fewer_is_the_same(tmp_path: Path, undisturbed: bytes) -> None:
@@ -140,6 +161,14 @@ def test_an_interrupted_rank_0_ends_all_and_saves(tmp_path: Path) -> None:
     assert (code, other_code) == (130, 0), said + other_said
     assert "millrace: interrupted; continue with: " in said, said
     assert "rank 1: rank 0 has ended" in other_said
+
+
+def test_an_error_of_rank_0_between_updates_ends_all_with_it(tmp_path: Path) -> None:
+    """Otherwise a launcher that starts each process again by itself would start rank 0 alone."""
+    with ranks(tmp_path, 2, program={0: ("-c", FAILS_BETWEEN_UPDATES)}) as started:
+        (code, said), (other_code, other_said) = started.end()
+    assert (code, other_code) == (1, 1), said + other_said
+    assert "rank 1: rank 0 has ended: no callback today" in other_said
 
 
 def test_a_rank_with_other_packages_is_refused_by_all(tmp_path: Path) -> None:
