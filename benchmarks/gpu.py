@@ -16,6 +16,7 @@ import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import msgspec
 import numpy as np
 import torch
 from rich.console import Console
@@ -24,8 +25,9 @@ from rich.table import Table
 import millrace
 from benchmarks.writing import processor, write
 from millrace.launch.training import train
-from millrace.learner.config.config import Config
+from millrace.learner.config.config import TABLES, Config
 from millrace.learner.config.layers import resolve
+from millrace.learner.config.presets import environment_presets
 from millrace.learner.run_folder.metrics_log import METRICS_FILE, read_rows
 from millrace.learner.torch_setup import torch_device
 from millrace.learner.update_time import update_time
@@ -35,6 +37,7 @@ from millrace.protocol.rollout import Batch
 from millrace.protocol.specs import PolicySpec
 
 ENV = "benchmarks.frames:Frames-v0"
+ATARI = "millrace/Atari-v0"
 WORKERS = (1, 8, 12, 16)
 COPIES = 4  # of a worker
 STEPS = 128  # of a rollout
@@ -61,19 +64,9 @@ class Parts(NamedTuple):
 
 def settings(workers: int, **others: Any) -> Config:
     """Those of the preset for Atari, for so many workers."""
-    lanes = workers
-    return resolve(
-        ENV,
-        preset="millrace/Atari-v0",
-        env_kwargs={},
-        eval_env_kwargs={},
-        workers=workers,
-        lanes=lanes,
-        envs=COPIES * workers,
-        rollout_steps=STEPS,
-        normalize_rewards=False,
-        **others,
-    )
+    of_atari = {name: value for name, value in environment_presets("ppo")[ATARI].items() if name not in TABLES}
+    sizes = {"workers": workers, "lanes": workers, "envs": COPIES * workers, "rollout_steps": STEPS}
+    return resolve(ENV, preset="none", **of_atari | sizes | others)
 
 
 def numbers_of_workers(cores: int) -> list[int]:
@@ -119,8 +112,9 @@ def collected(workers: int, seconds: float) -> Collected:
             batch = service.gather()
             publish_s.append(published_s - began_s)
             collect_s.append(time.perf_counter() - published_s)
-        medians = [statistics.median(each[WARM_UP:]) for each in (collect_s, publish_s)]
-        return Collected(*medians, batch, service.run.policy)
+        return Collected(
+            statistics.median(collect_s[WARM_UP:]), statistics.median(publish_s[WARM_UP:]), batch, service.run.policy
+        )
 
 
 def parts(workers: int, seconds: float) -> Parts:
@@ -128,11 +122,11 @@ def parts(workers: int, seconds: float) -> Parts:
     collect_s, publish_s, batch, policy = collected(workers, seconds)
     config = settings(workers)
     device = torch_device(config)
-    (frames,) = batch.obs
+    frames = batch.obs
     of_lanes = np.split(frames, workers, axis=1)
 
     def collect(parameters: Floats, buffers: Floats) -> Batch:
-        return batch
+        return msgspec.structs.replace(batch, obs=(frames,))
 
     update = update_time(config, policy, collect, seconds, workers)
     return Parts(
@@ -171,18 +165,7 @@ def main() -> None:
     device = torch_device(settings(1))
     where = torch.cuda.get_device_name() if device == "cuda" else "no GPU"
     table = Table(title=f"milliseconds of an update, {where}, {cores} cores ({processor()})")
-    for column in (
-        "workers",
-        "batch",
-        "collect",
-        "stack",
-        "copy",
-        "update",
-        "publish",
-        "env steps/s in turn",
-        "lag 0",
-        "lag 1",
-    ):
+    for column in ("workers", "batch", "collect", "stack", "copy", "update", "publish", "in turn", "lag 0", "lag 1"):
         table.add_column(column, justify="right")
     found: dict[str, Any] = {}
     for workers in numbers_of_workers(cores):
@@ -202,8 +185,8 @@ def main() -> None:
     console = Console(width=130)
     console.print(table)
     console.print(
-        "In turn: by the sum of collect, copy, update and publish. Stacking is a part of collecting. What lag 0 is slower than "
-        "this is lost outside of the parts; lag 1 is limited by the longer of collecting and the rest."
+        "In turn: env steps/s by the sum of collect, copy, update and publish; stacking is a part of collecting. What lag 0 "
+        "is slower than this is lost outside of the parts. Lag 1 is limited by the longer of collecting and the rest."
     )
     write("gpu", found, [])
 

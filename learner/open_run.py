@@ -139,7 +139,9 @@ def _opponent_pool(config: Config, spec: RunSpec, state: PoolState) -> OpponentP
 def _use_threads(setup: RunSetup, policy: PolicySpec, processes: WorkerProcesses) -> RunSetup:
     """Let PyTorch use the run's number of threads. Returns the setup with that number."""
     config = setup.config
-    if config.torch_threads is None:
+    if config.torch_threads is None and config.shards > 1:
+        config = msgspec.structs.replace(config, torch_threads=1)  # the processes of a machine share its cores
+    elif config.torch_threads is None:
         # Another number changes the last bits, so the run keeps it, wherever it is resumed or repeated.
         chosen = threads(policy, minibatch_rows(config), config.max_lag, processes.expected)
         config = msgspec.structs.replace(config, torch_threads=chosen.number)

@@ -142,7 +142,7 @@ class RolloutService:
             rollout_steps: T, env steps of an env copy in a batch.
             restore: a file that `save` wrote; `restored` then has its arrays.
             **settings: those of `millrace train` for environments, workers, network and timeouts, with the same names and
-                defaults: `workers=2`, `envs=8`, `lanes=4`, `max_lag=0`. With `bind="tcp://0.0.0.0:5555"` no worker is
+                defaults: `envs=8`, `lanes=4`, `max_lag=0`. With `bind="tcp://0.0.0.0:5555"` no worker is
                 started here: workers elsewhere join with `millrace worker`.
 
         Raises `UsageError` if an argument is wrong, `NoWorkers` if too few workers join in time, `EnvironmentFailed` if the

@@ -109,7 +109,7 @@ class Config(RolloutConfig, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     """Number of PyTorch threads in the learner. none: chosen when the run starts, and kept in its config.toml. The choice is
     1; with images, an encoder or a layer of 512 x 512 weights it is one for each 34 million multiply-adds of a minibatch's
     forward pass, at most one for each core. If max_lag is above 0, each local worker then keeps one core, unless this would
-    leave half of the cores or less to the learner. Another number changes the last bits of results.
+    leave half of the cores or less to the learner. With shards it is 1. Another number changes the last bits of results.
     """
 
     shards: Fixed[Count] = 1

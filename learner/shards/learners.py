@@ -149,8 +149,7 @@ def connected(place: Place, shards: int, device: str, timeouts: Timeouts, poll: 
     """Connect the processes of a run, and disconnect them at the end.
 
     `poll` is called now and then while this process waits for others, with a line that says for whom. Raises `UsageError` if
-    `shards` can't be divided among them or this program has connected processes itself, and `LearnerLost` if not all come in
-    time.
+    `shards` can't be divided among them, and `LearnerLost` if not all come in time.
     """
     division = place.division(shards)
     if place.processes == 1:

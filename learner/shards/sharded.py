@@ -197,6 +197,12 @@ def sharded(algorithm: type[Algorithm], shards: int) -> type[Sharded]:
             f"shards {shards}: {algorithm.__name__} learns in one process; expected ppo, a2c, impala, reinforce or a "
             "subclass of millrace.algorithms.ActorCritic"
         )
+    for name in ("step", "gradient", "rows"):
+        if getattr(algorithm, name) is not getattr(ActorCritic, name):
+            raise UsageError(
+                f"shards {shards}: {algorithm.__name__} defines {name}, which differs in a run with shards; define loss or "
+                "estimate, or train it without shards"
+            )
     return type(algorithm.__name__, (Sharded, algorithm), {"__module__": algorithm.__module__})
 
 

@@ -72,13 +72,13 @@ def test_the_store_of_this_machine_listens_on_loopback() -> None:
         assert ip_address(store.getsockname()[0]).is_unspecified
 
 
-def test_a_program_that_has_connected_processes_itself_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_group_of_a_program_that_has_connected_the_processes_is_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is neither made nor destroyed."""
     monkeypatch.setattr(distributed, "is_initialized", lambda: True)
-    with (
-        pytest.raises(UsageError, match=r"^shards 2: this program has called torch\.distributed\.init_process_group"),
-        connected(Place.of(VARIABLES), 2, "cpu", Timeouts(0.0, 0.0), lambda line: None),
-    ):
-        pass
+    for name in ("init_process_group", "destroy_process_group"):
+        monkeypatch.delattr(distributed, name)
+    with connected(Place.of(VARIABLES), 2, "cpu", Timeouts(0.0, 0.0), lambda line: None) as learners:
+        assert learners.division == Division(2, 2, 1)
 
 
 def test_every_column_belongs_to_one_shard_and_every_shard_to_one_process() -> None:
