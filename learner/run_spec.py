@@ -12,7 +12,7 @@ from millrace.learner.rollouts.opponent_pool import teams_of
 from millrace.protocol.bounds import MAX_FACTS
 from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.errors import UsageError
-from millrace.protocol.policy.encoder import describe_encoder
+from millrace.protocol.policy.own_encoder import describe_encoder
 from millrace.protocol.specs import SCORE, PolicySpec, RunSpec
 
 

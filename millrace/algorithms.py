@@ -95,15 +95,10 @@ from millrace.learner.config.hyperparameters import (
 )
 from millrace.learner.config.resume_rules import Adaptable, Fixed, Free
 from millrace.protocol.errors import UsageError
+from millrace.protocol.policy.autograd_leaves import trainable
+from millrace.protocol.policy.encoder import Encoder, RecurrentInput
 from millrace.protocol.policy.features import features
-from millrace.protocol.policy.networks import (
-    ActorAndCritics,
-    ActorCriticNetwork,
-    Encoder,
-    QNetwork,
-    RecurrentInput,
-    trainable,
-)
+from millrace.protocol.policy.networks import ActorAndCritics, ActorCriticNetwork, QNetwork
 from millrace.protocol.policy.normalize import normalize
 from millrace.protocol.policy.torch_distributions import log_prob_and_entropy, policy_log_prob, squashed_sample
 from millrace.protocol.random_streams import Purpose, torch_seed

@@ -264,7 +264,7 @@ class TrainKeywords(RolloutKeywords, total=False):
     """Activation function of the hidden layers."""
     encoder: str | None
     """A torch module of your own in front of the hidden layers, such as my_package.networks:factory. See
-    protocol/policy/encoder.py.
+    protocol/policy/own_encoder.py.
     """
     normalize_observations: bool
     """ppo: Normalize observations, except images: subtract the running mean, divide by the running standard deviation,

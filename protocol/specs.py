@@ -131,7 +131,7 @@ class NamedShape(msgspec.Struct, frozen=True, array_like=True):
 
 
 class EncoderSpec(msgspec.Struct, frozen=True):
-    """A torch module written by the user, which comes before all other layers; see `protocol/policy/encoder.py`."""
+    """A torch module written by the user, which comes before all other layers; see `protocol/policy/own_encoder.py`."""
 
     factory: str
     """the callable that makes it, as `my_package.networks:encoder`"""
@@ -213,6 +213,11 @@ class PolicySpec(msgspec.Struct, frozen=True):
     def needs_torch(self) -> bool:
         """True for policies with images (convolutions) or an encoder. Every other policy acts in numpy."""
         return self.own is None and (self.encoder is not None or self.convolves)
+
+    @property
+    def has_encoder_layers(self) -> bool:
+        """True if layers come before the hidden layers: convolutions, an encoder or a core."""
+        return self.needs_torch or (self.own is None and self.core is not None)
 
     @property
     def convolves(self) -> bool:

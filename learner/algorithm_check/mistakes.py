@@ -40,7 +40,7 @@ from millrace.learner.config.hyperparameters import AlgorithmConfig
 from millrace.learner.torch_setup import one_thread
 from millrace.protocol.bounds import one_line
 from millrace.protocol.errors import UsageError, first_line
-from millrace.protocol.policy.encoder import describe_encoder
+from millrace.protocol.policy.own_encoder import describe_encoder
 from millrace.protocol.rollout import Batch
 from millrace.protocol.specs import PolicySpec
 

@@ -34,7 +34,8 @@ from millrace.learner.algorithms.returns import EpisodeEnds, gae
 from millrace.learner.config.hyperparameters import ActorCriticConfig, AlgorithmConfig, PolicyGradientConfig, RecurrentConfig
 from millrace.protocol.arrays import Array, Bools, Floats
 from millrace.protocol.errors import RunError, UsageError
-from millrace.protocol.policy.networks import ActorCriticNetwork, RecurrentInput
+from millrace.protocol.policy.encoder import RecurrentInput
+from millrace.protocol.policy.networks import ActorCriticNetwork
 from millrace.protocol.random_streams import Purpose, torch_seed
 from millrace.protocol.rollout import Batch
 from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec

@@ -76,7 +76,7 @@ class DQN(OffPolicy):
     def transitions(self, sample: Sample | SequenceSample) -> Transitions:
         """See `OffPolicy`; x, next_x and target_x are encoded, so that losses need neither images nor sequences."""
         rows = super().transitions(sample)
-        if not self.policy.needs_torch and self.policy.core is None:
+        if not self.policy.has_encoder_layers:
             return rows
         return rows.encoded(self.net.encode)._replace(target_x=rows.encoded_next(self.target.encode))
 

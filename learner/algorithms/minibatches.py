@@ -17,7 +17,8 @@ import torch
 from torch import Tensor
 
 from millrace.protocol.arrays import Array, Bools, Floats
-from millrace.protocol.policy.networks import ActorCriticNetwork, RecurrentInput
+from millrace.protocol.policy.encoder import RecurrentInput
+from millrace.protocol.policy.networks import ActorCriticNetwork
 from millrace.protocol.rollout import Batch
 
 Index = Tensor | slice

@@ -19,7 +19,7 @@ from millrace.learner.algorithms.replay.off_policy import CriticLoss
 from millrace.learner.algorithms.replay.transitions import Transitions
 from millrace.learner.config.hyperparameters import SACConfig
 from millrace.protocol.errors import UsageError
-from millrace.protocol.policy.networks import trainable
+from millrace.protocol.policy.autograd_leaves import trainable
 from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
 
 

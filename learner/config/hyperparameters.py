@@ -34,7 +34,7 @@ class AlgorithmConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
     """Activation function of the hidden layers."""
     encoder: Fixed[str | None] = None
     """A torch module of your own in front of the hidden layers, such as my_package.networks:factory.
-    See protocol/policy/encoder.py.
+    See protocol/policy/own_encoder.py.
     """
     normalize_observations: Fixed[bool] = False
     """Normalize observations, except images: subtract the running mean, divide by the running standard deviation, clip to

@@ -21,7 +21,7 @@ def multiply_adds(spec: PolicySpec) -> int:
             total += math.prod(field.shape) * places.get(field.name, 1)
     if spec.encoder is None or spec.own is not None:
         return total
-    from millrace.protocol.policy.encoder import multiply_adds_of_encoder
+    from millrace.protocol.policy.own_encoder import multiply_adds_of_encoder
 
     return total + multiply_adds_of_encoder(spec)
 

@@ -23,7 +23,7 @@ from millrace.learner.config.layers import resolve
 from millrace.learner.run_folder.run_format import POLICY_ARRAYS
 from millrace.learner.torch_setup import one_thread, threads
 from millrace.protocol.machine.waiting_threads import VARIABLE as WAIT
-from millrace.protocol.policy.encoder import describe_encoder
+from millrace.protocol.policy.own_encoder import describe_encoder
 from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
 
 CORES = {2, 3}

@@ -11,7 +11,7 @@ import torch
 
 import millrace
 from millrace.learner.torch_setup import one_thread
-from millrace.protocol.policy.encoder import describe_encoder
+from millrace.protocol.policy.own_encoder import describe_encoder
 from millrace.protocol.specs import ActionSpec, Leaf
 
 SMALL: dict[str, Any] = {

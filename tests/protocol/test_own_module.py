@@ -15,7 +15,7 @@ from millrace.protocol.envs.spaces import action_spec, observation_leaves
 from millrace.protocol.errors import PolicyFailed, UserFacingError
 from millrace.protocol.own_module import own_callable
 from millrace.protocol.policy.called_policy import CalledPolicy
-from millrace.protocol.policy.encoder import describe_encoder
+from millrace.protocol.policy.own_encoder import describe_encoder
 from millrace.protocol.specs import OwnPolicySpec, PolicySpec
 
 OBSERVATION, ACTION = observation_leaves(Box(-1, 1, (4,))), action_spec(Discrete(2))

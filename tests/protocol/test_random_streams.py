@@ -23,7 +23,7 @@ from millrace.learner.rollouts.evaluation_dealer import episode_seeds
 from millrace.learner.vector_env.lost_lanes import replacement_seeds
 from millrace.protocol.messages import Evaluate
 from millrace.protocol.policy.called_policy import Acted, CalledPolicy
-from millrace.protocol.policy.encoder import describe_encoder
+from millrace.protocol.policy.own_encoder import describe_encoder
 from millrace.protocol.policy.policy import make_policy
 from millrace.protocol.random_streams import Purpose, RoundStreams, env_seed, generator, torch_seed
 from millrace.protocol.specs import PolicySpec

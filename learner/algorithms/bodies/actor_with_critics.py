@@ -15,9 +15,11 @@ from torch import Tensor
 
 from millrace.learner.algorithms.bodies.stacked_mlps import MLPShape, StackedMLPs, initial, initial_statistics
 from millrace.protocol.arrays import Floats
+from millrace.protocol.policy.autograd_leaves import trainable
+from millrace.protocol.policy.encoder import Encoder
 from millrace.protocol.policy.layout import LOG_STD_BOUNDS, encoder_layout
 from millrace.protocol.policy.malloc import keep_freed_memory
-from millrace.protocol.policy.networks import Encoder, initial_fields, trainable
+from millrace.protocol.policy.networks import initial_fields
 from millrace.protocol.policy.torch_distributions import squashed_sample
 from millrace.protocol.random_streams import Purpose, torch_seed
 from millrace.protocol.specs import PolicySpec

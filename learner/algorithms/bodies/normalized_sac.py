@@ -19,8 +19,8 @@ from millrace.learner.algorithms.replay.transitions import Transitions
 from millrace.learner.algorithms.sac import SAC
 from millrace.learner.config.hyperparameters import NormalizedConfig
 from millrace.protocol.errors import UsageError
+from millrace.protocol.policy.autograd_leaves import trainable
 from millrace.protocol.policy.layout import total_size
-from millrace.protocol.policy.networks import trainable
 from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
 
 

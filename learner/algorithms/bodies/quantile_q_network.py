@@ -17,9 +17,11 @@ from torch import Tensor
 
 from millrace.learner.algorithms.bodies.stacked_mlps import MLPShape, Normalized, StackedMLPs, initial, initial_statistics
 from millrace.protocol.arrays import Floats
+from millrace.protocol.policy.autograd_leaves import trainable
+from millrace.protocol.policy.encoder import Encoder
 from millrace.protocol.policy.layout import encoder_layout, named_views
 from millrace.protocol.policy.malloc import keep_freed_memory
-from millrace.protocol.policy.networks import Encoder, QNetwork, initial_fields, trainable
+from millrace.protocol.policy.networks import QNetwork, initial_fields
 from millrace.protocol.random_streams import Purpose, torch_seed
 from millrace.protocol.specs import PolicySpec
 

@@ -15,16 +15,11 @@ from torch import Tensor
 from millrace.learner.algorithms.kernels.distribution_kernels import EvaluatedActions, SquashedSample, distribution_kernel
 from millrace.learner.algorithms.kernels.mlp import SmallMLP, Trunks, Values
 from millrace.protocol.arrays import Array, Floats
+from millrace.protocol.policy.autograd_leaves import trainable
+from millrace.protocol.policy.encoder import Encoder, RecurrentInput
 from millrace.protocol.policy.features import feature_size
 from millrace.protocol.policy.layout import CRITICS, hidden_names
-from millrace.protocol.policy.networks import (
-    ActorAndCritics,
-    ActorCriticNetwork,
-    Encoder,
-    QNetwork,
-    RecurrentInput,
-    trainable,
-)
+from millrace.protocol.policy.networks import ActorAndCritics, ActorCriticNetwork, QNetwork
 from millrace.protocol.specs import PolicySpec
 
 MAX_UNITS = 256  # of a layer; in larger layers, matrix products take nearly all the time (`benchmarks.update`)
@@ -32,7 +27,7 @@ MAX_UNITS = 256  # of a layer; in larger layers, matrix products take nearly all
 
 def is_small(spec: PolicySpec, device: str) -> bool:
     """Whether this is only an MLP without large layers, on the CPU."""
-    if device != "cpu" or spec.needs_torch or spec.core is not None or spec.critic:
+    if device != "cpu" or spec.has_encoder_layers or spec.critic:
         return False
     return max((feature_size(spec), *spec.net)) <= MAX_UNITS
 

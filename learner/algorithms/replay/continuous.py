@@ -28,7 +28,7 @@ from millrace.learner.algorithms.replay.transitions import Transitions
 from millrace.learner.config.hyperparameters import ContinuousConfig
 from millrace.protocol.arrays import Floats
 from millrace.protocol.errors import UsageError
-from millrace.protocol.policy.networks import Encoder
+from millrace.protocol.policy.encoder import Encoder
 from millrace.protocol.random_streams import Purpose, torch_seed
 from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
 
@@ -143,7 +143,7 @@ class Continuous(OffPolicy):
         """
         rows = super().transitions(sample)
         rows = rows._replace(action=rows.action.reshape(len(rows.action), -1).to(rows.x))
-        if not self.policy.needs_torch and self.policy.core is None:
+        if not self.policy.has_encoder_layers:
             return rows
         images = self._shifted(rows.images)
         next_images = images if rows.sequences is not None else self._shifted(rows.next_images)

@@ -27,7 +27,7 @@ from millrace.learner.algorithms.replay.transitions import Sequences, Transition
 from millrace.learner.config.hyperparameters import AlgorithmConfig, OffPolicyConfig
 from millrace.protocol.arrays import Array
 from millrace.protocol.errors import UsageError
-from millrace.protocol.policy.networks import RecurrentInput
+from millrace.protocol.policy.encoder import RecurrentInput
 from millrace.protocol.rollout import Batch
 from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
 

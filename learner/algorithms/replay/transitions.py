@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from millrace.protocol.policy.networks import Encoder, RecurrentInput
+from millrace.protocol.policy.encoder import Encoder, RecurrentInput
 
 
 class Sequences(NamedTuple):

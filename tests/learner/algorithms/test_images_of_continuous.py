@@ -13,7 +13,7 @@ from torch import Tensor
 from millrace.learner.algorithms import algorithm_class
 from millrace.learner.algorithms.replay.random_shift import random_shift
 from millrace.learner.config.hyperparameters import HYPERPARAMETERS
-from millrace.protocol.policy.encoder import describe_encoder
+from millrace.protocol.policy.own_encoder import describe_encoder
 from millrace.protocol.policy.torch_policy import TorchPolicy
 from tests.support.numbers.batches import GAUSSIAN, IMAGE, batch, no_pulse
 

@@ -15,7 +15,7 @@ from millrace.learner.algorithms.replay.sequence_replay import SequenceSample
 from millrace.learner.algorithms.replay.transitions import Transitions
 from millrace.learner.config.hyperparameters import HYPERPARAMETERS
 from millrace.protocol.errors import UsageError
-from millrace.protocol.policy.networks import RecurrentInput
+from millrace.protocol.policy.encoder import RecurrentInput
 from millrace.protocol.policy.policy import make_policy
 from millrace.protocol.rollout import Batch, stack_rollouts
 from millrace.workers.collect.collector import Collector

@@ -8,9 +8,9 @@ from msgspec.structs import replace
 from torch.utils.flop_counter import FlopCounterMode
 
 from millrace.protocol.policy.arithmetic import multiply_adds
-from millrace.protocol.policy.encoder import describe_encoder
 from millrace.protocol.policy.features import feature_size
 from millrace.protocol.policy.networks import ActorCriticNetwork
+from millrace.protocol.policy.own_encoder import describe_encoder
 from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
 
 ACTION = ActionSpec("discrete", (), "int64", (2,), (0,))

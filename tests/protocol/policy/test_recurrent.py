@@ -20,8 +20,9 @@ from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.errors import BadRollout
 from millrace.protocol.messages import Evaluate
 from millrace.protocol.policy.distributions import distribution
+from millrace.protocol.policy.encoder import RecurrentInput
 from millrace.protocol.policy.layout import buffer_size
-from millrace.protocol.policy.networks import ActorCriticNetwork, RecurrentInput
+from millrace.protocol.policy.networks import ActorCriticNetwork
 from millrace.protocol.policy.numpy_policy import NumpyPolicy
 from millrace.protocol.policy.policy import make_policy
 from millrace.protocol.policy.recurrent import advance, zero_state

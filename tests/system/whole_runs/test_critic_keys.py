@@ -17,8 +17,8 @@ from millrace.learner.config.layers import resolve
 from millrace.learner.policy_player import saved_policy
 from millrace.learner.run_folder import checkpoint
 from millrace.protocol.errors import UsageError
+from millrace.protocol.policy.encoder import RecurrentInput
 from millrace.protocol.policy.layout import acting_size
-from millrace.protocol.policy.networks import RecurrentInput
 from tests.support.users_code.hidden_envs import REWARDS
 from tests.system.stage.run_folders import policy_of
 

@@ -17,8 +17,8 @@ from millrace.learner.algorithms.bodies.stacked_mlps import (
     initial,
     initial_statistics,
 )
+from millrace.protocol.policy.autograd_leaves import trainable
 from millrace.protocol.policy.layout import total_size
-from millrace.protocol.policy.networks import trainable
 from tests.learner.algorithms.bodies import plain_formula as plain
 from tests.support.variants import variants
 

@@ -17,9 +17,10 @@ from millrace.learner.config.layers import resolve
 from millrace.learner.run_folder.run_folder import RunFolder
 from millrace.protocol.env_spec import AllowedCode, EnvSpec
 from millrace.protocol.errors import UsageError
-from millrace.protocol.policy.encoder import describe_encoder, make_encoder
+from millrace.protocol.policy.encoder import RecurrentInput
 from millrace.protocol.policy.layout import acting_size
-from millrace.protocol.policy.networks import ActorCriticNetwork, QNetwork, RecurrentInput
+from millrace.protocol.policy.networks import ActorCriticNetwork, QNetwork
+from millrace.protocol.policy.own_encoder import describe_encoder, make_encoder
 from millrace.protocol.policy.policy import make_policy
 from millrace.protocol.policy.torch_policy import TorchPolicy
 from millrace.protocol.specs import NamedShape, PolicySpec

@@ -1,0 +1,22 @@
+"""Leaves of autograd's graph in the memory of flat tensors, so that one operation changes all parameters of a network."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from torch import Tensor
+
+from millrace.protocol.policy.layout import Field, named_views
+
+
+def trainable(values: Tensor, gradient: Tensor | None) -> Tensor:
+    """A leaf of autograd's graph in the memory of `values`, which are changed in place, and of their gradient."""
+    leaf = values.detach().requires_grad_()
+    leaf.grad = gradient
+    return leaf
+
+
+def named_leaves(values: Tensor, gradient: Tensor, fields: Sequence[Field]) -> dict[str, Tensor]:
+    """A leaf of autograd's graph for each field, by name: views of `values`, whose gradients are views of `gradient`."""
+    gradients = named_views(gradient, fields)
+    return {name: trainable(view, gradients[name]) for name, view in named_views(values, fields).items()}
