@@ -5,35 +5,53 @@ Rule: a message holds consecutive rows of one episode. It is sent when it has `C
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from millrace.protocol.arrays import Array
 from millrace.protocol.bounds import MOST_FRAMES
 from millrace.protocol.messages import EpisodeRows, Evaluate
-from millrace.protocol.specs import PolicySpec
 
 CHUNK_BYTES = 8 * 2**20
 
 SendRows = Callable[[EpisodeRows], None]
 
 
+class PlayedRows(NamedTuple):
+    """L consecutive rows of one episode. With seats, an observation and an action have an entry for each seat."""
+
+    obs: tuple[Array, ...]
+    """[L, *leaf] each, the observation after each row"""
+    action: Array
+    """[L, *action]"""
+    reward: Array
+    """[L] float64"""
+    terminated: Array
+    truncated: Array
+    """[L] bool each"""
+
+    def part(self, begin: int, end: int) -> PlayedRows:
+        """A copy of some of these rows."""
+        obs = tuple(leaf[begin:end].copy() for leaf in self.obs)
+        return PlayedRows(obs, *(array[begin:end].copy() for array in self[1:]))
+
+
 class RowSender:
     """Collects the rows of one episode and sends them."""
 
-    def __init__(self, order: Evaluate, episode: int, policy: PolicySpec, send: SendRows) -> None:
+    def __init__(self, order: Evaluate, episode: int, send: SendRows) -> None:
         """`episode` is the index of its seed."""
         self.episode = episode
         self._order = order
-        self._policy = policy
         self._send = send
         self._first_step = 0
-        self._obs: list[tuple[Array, ...]] = []
+        self._before: tuple[Array, ...] = ()  # [1, *leaf] each: the observation before the first of these rows
+        self._rows: list[PlayedRows] = []
         self._frames: list[Array] = []
         self._frames_so_far = 0
-        self._rows: list[tuple[Array, float, bool, bool]] = []  # action, reward, terminated, truncated
         self._bytes = 0
 
     @property
@@ -41,51 +59,59 @@ class RowSender:
         """Whether the next observation should come with a frame."""
         return self._order.send_frames and self._frames_so_far < MOST_FRAMES
 
-    def observe(self, leaves: Sequence[Array], frame: Array | None) -> None:
-        """Add an observation: its arrays, which are copied, and the rendered frame.
-
-        Raises `ValueError` if the frame's size differs.
-        """
-        if frame is not None and self._frames and frame.shape != self._frames[-1].shape:
+    def show(self, frame: Array) -> None:
+        """Take the frame of the next observation. Raises `ValueError` if its size differs from the frame before."""
+        if self._frames and frame.shape != self._frames[-1].shape:
             before = list(self._frames[-1].shape)
             now = list(frame.shape)
             raise ValueError(f"render: expected frames of one size, {before} as before, got {now}")
-        self._obs.append(tuple(leaf.copy() for leaf in leaves))
-        self._bytes += sum(leaf.nbytes for leaf in leaves)
-        if frame is not None:
-            self._frames.append(frame)
-            self._frames_so_far += 1
-            self._bytes += frame.nbytes
+        self._frames.append(frame)
+        self._frames_so_far += 1
+        self._bytes += frame.nbytes
 
-    def step(self, action: Array, reward: float, terminated: bool, truncated: bool) -> None:
-        """Add a row. The observation after it must have been added."""
-        self._rows.append((action.copy(), reward, terminated, truncated))
-        self._bytes += action.nbytes + 10
+    def begin(self, obs: Sequence[Array]) -> None:
+        """Take the first observation, whose arrays [1, *leaf] are copied."""
+        self._before = tuple(leaf.copy() for leaf in obs)
+        self._bytes += sum(leaf.nbytes for leaf in obs)
+
+    def add(self, rows: PlayedRows) -> None:
+        """Add rows, which are copied. While frames are wanted, there is one row at a time."""
         was_last_frame = bool(self._frames) and self._frames_so_far == MOST_FRAMES
-        if terminated or truncated or was_last_frame or self._bytes >= CHUNK_BYTES:
-            self._flush()  # rule ROWS_FIRST
+        ends = was_last_frame or bool(rows.terminated[-1] or rows.truncated[-1])
+        L = len(rows.reward)
+        bytes_of_row = (sum(leaf.nbytes for leaf in rows.obs) + rows.action.nbytes) // L + 10
+        at = 0
+        while at < L:
+            room = math.ceil((CHUNK_BYTES - self._bytes) / bytes_of_row)  # rows until the message is full
+            end = min(L, at + max(1, room))
+            self._rows.append(rows.part(at, end))
+            self._bytes += (end - at) * bytes_of_row
+            at = end
+            if self._bytes >= CHUNK_BYTES or (ends and at == L):
+                self._flush()  # rule ROWS_FIRST
 
     def _flush(self) -> None:
-        spec = self._policy
         order = self._order
-        actions, rewards, terminated, truncated = zip(*self._rows, strict=True)
-        has_frames = len(self._frames) == len(self._obs)
+        of_leaves, actions, *numbers = zip(*self._rows, strict=True)
+        reward, terminated, truncated = map(np.concatenate, numbers)
+        obs = tuple(np.concatenate(parts) for parts in zip(self._before, *of_leaves, strict=True))
+        has_frames = len(self._frames) == len(reward) + 1
         self._send(
             EpisodeRows(  # rule EPISODE_ROWS
                 session=order.session,
                 ticket=order.ticket,
                 episode=self.episode,
                 first_step=self._first_step,
-                obs=tuple(np.stack(leaf) for leaf in zip(*self._obs, strict=True)),
-                action=np.stack(actions).astype(spec.action.stored_dtype, copy=False),
-                reward=np.array(rewards, np.float64),
-                terminated=np.array(terminated, bool),
-                truncated=np.array(truncated, bool),
-                frames=np.stack(self._frames) if has_frames and self._frames else None,
+                obs=obs,
+                action=np.concatenate(actions),
+                reward=reward,
+                terminated=terminated,
+                truncated=truncated,
+                frames=np.stack(self._frames) if has_frames else None,
             )
         )
-        self._first_step += len(self._rows)
-        self._obs = self._obs[-1:]
+        self._first_step += len(reward)
+        self._before = tuple(leaf[-1:] for leaf in obs)
         self._rows = []
         self._bytes = 0
         self._frames = self._frames[-1:] if self._frames_so_far < MOST_FRAMES else []

@@ -2,8 +2,8 @@
 
 Rule: an order has k seeds, and is played on one lane of k env copies. The policy always sees a batch [1, k · A, ...], where
 A is the number of seats of a copy: a copy whose episode has ended stays in the batch and is not stepped. Rows are played in
-small groups and then checked; rows that are sent are played one by one. The copies are apart from the lanes of training.
-They are opened once, and reset with a seed before each episode.
+small groups, and then checked and sent; one by one if the environment has to render between them. The copies are apart from
+the lanes of training. They are opened once, and reset with a seed before each episode.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from millrace.workers.copies.env_loop import Pulse
 from millrace.workers.copies.looped_kind import loop_over
 from millrace.workers.copies.value_checks import check_acted
 from millrace.workers.copy_slots import EnvMaker
-from millrace.workers.evaluate.episode_rows import RowSender, SendRows, as_frame
+from millrace.workers.evaluate.episode_rows import PlayedRows, RowSender, SendRows, as_frame
 from millrace.workers.lanes.lane import Lane
 from millrace.workers.lanes.rows import EpisodesLost, Rows, RowsOfLane
 from millrace.workers.lanes.runner import LaneRunner
@@ -116,21 +116,24 @@ class Evaluator:
         lane.reset(order.seeds, pulse)
         senders = []
         if order.send_rows or order.send_frames:
-            senders = [RowSender(order, n, run.policy, send) for n in range(k)]
-        rows = Rows(run, [lane], 1 if senders else ROWS_AT_ONCE)
+            senders = [RowSender(order, n, send) for n in range(k)]
+        rows = Rows(run, [lane], 1 if order.send_frames else ROWS_AT_ONCE)
         (of_lane,) = rows.of_lanes
         for sender in senders:
-            self._observe(sender, of_lane, 0, copies)
+            self._show_frame(sender, copies)
+            sender.begin(self._shown(sender.episode, of_lane, slice(0, 1)))
         actions = _PlayedActions(run, self._runner.acting, rows, drawn, greedy=order.greedy)  # rule GREEDY
         ended_by_copy: dict[int, EndedEpisode] = {}
         while len(ended_by_copy) < k:
-            playing = lane.playing.nonzero()[0].tolist()
             self._fill(rows, actions, pulse)
             for each in of_lane.ended:
                 ended_by_copy[each.copy] = each
-            for n in playing if senders else ():
-                self._observe(senders[n], of_lane, 1, copies)
-                self._send_row(senders[n], of_lane, actions.chosen, cut=n in ended_by_copy and ended_by_copy[n].cut)
+            for sender in senders:
+                n = sender.episode
+                played = rows.filled - np.count_nonzero(of_lane.resets[: rows.filled, n])
+                if played:
+                    self._show_frame(sender, copies)
+                    sender.add(self._played(n, played, of_lane, actions.chosen, ended_by_copy.get(n)))
             rows.begin_again()
         ended = [ended_by_copy[n] for n in range(k)]
         return Evaluated(  # rule CUT
@@ -168,39 +171,54 @@ class Evaluator:
         check_spaces(self._run, copies)
         return copies
 
-    def _observe(self, sender: RowSender, rows: RowsOfLane, row: int, copies: EvaluationCopies) -> None:
-        """Add an observation of the sender's episode to what it sends."""
+    def _show_frame(self, sender: RowSender, copies: EvaluationCopies) -> None:
+        """Let the sender have what its copy renders, if it wants that."""
+        if not sender.wants_frame:
+            return
         n = sender.episode
-        shown = [self._of_copy(n, leaf[row]) for leaf in rows.obs[: len(self._run.policy.observation)]]  # without the mask
         try:
-            sender.observe(shown, as_frame(copies.render(n)) if sender.wants_frame else None)
+            sender.show(as_frame(copies.render(n)))
         except ValueError as error:
             raise environment_failed(None, f"copy {n}, {error}") from error
 
-    def _send_row(self, sender: RowSender, rows: RowsOfLane, chosen: Array, *, cut: bool) -> None:
-        """Add the row of the sender's episode to what it sends. `chosen` [k · A, *action]: the actions of all copies."""
-        n = sender.episode
-        if rows.columns is not None:
-            terminated = rows.columns.over[n]
-            truncated = False
+    def _played(self, n: int, L: int, rows: RowsOfLane, chosen: Array, ended: EndedEpisode | None) -> PlayedRows:
+        """The first L of these rows, of the episode of copy n. `chosen` [T, k · A, *action]: the actions of all copies.
+
+        `ended`: the episode, if it ended in the last of them.
+        """
+        cut = ended is not None and ended.cut
+        if self._run.seats:
+            terminated = np.zeros(L, bool)
+            terminated[-1] = ended is not None and not cut
+            truncated = np.zeros(L, bool)
         else:
-            terminated = rows.terminated[0, n]
-            truncated = rows.truncated[0, n]
-        reward = rows.reward[0].reshape(-1, self._run.seats_of_copy)[n].sum()
-        sender.step(self._of_copy(n, chosen), float(reward), bool(terminated), bool(truncated) or cut)
+            terminated = rows.terminated[:L, n]
+            truncated = rows.truncated[:L, n]
+        if cut:
+            truncated = truncated.copy()
+            truncated[-1] = True
+        reward = rows.reward[:L].reshape(L, -1, self._run.seats_of_copy)[:, n].sum(-1)
+        return PlayedRows(
+            tuple(self._shown(n, rows, slice(1, L + 1))), self._of_copy(n, chosen[:L]), reward, terminated, truncated
+        )
+
+    def _shown(self, n: int, rows: RowsOfLane, steps: slice) -> list[Array]:
+        """Copy n's observations of these steps, without the mask, and without what only the critic sees."""
+        return [self._of_copy(n, leaf[steps]) for leaf in rows.obs[: len(self._run.policy.observation)]]
 
     def _of_copy(self, n: int, columns: Array) -> Array:
-        """The part of an array [k · A, …] that belongs to copy n: an entry for each seat, or one entry without seats."""
+        """The part of an array [T, k · A, …] that belongs to copy n: an entry for each seat, or one entry without seats."""
         A = self._run.seats_of_copy
-        return columns[n * A : (n + 1) * A] if self._run.seats else columns[n]
+        return columns[:, n * A : (n + 1) * A] if self._run.seats else columns[:, n]
 
 
 class _PlayedActions:
-    """The actions of an evaluation. They are checked before an environment gets them, and only the newest are kept."""
+    """The actions of an evaluation. They are checked before an environment gets them."""
 
     def __init__(self, run: RunSpec, acting: Acting, rows: Rows, drawn: np.random.Generator, *, greedy: bool) -> None:
-        self.chosen: Array
-        """[k · A, *action] of the newest step"""
+        action = run.policy.action
+        self.chosen = np.empty((rows.steps, rows.of_lanes[0].lane.columns, *action.shape), action.stored_dtype)
+        """[T, k · A, *action] of these rows"""
         self._run = run
         self._acting = acting
         self._rows = rows
@@ -213,13 +231,14 @@ class _PlayedActions:
 
         The action of a copy whose episode has ended does not count.
         """
-        self.chosen = self._acting.choose(obs, state, self._drawn, greedy=self._greedy)
-        if self.chosen.dtype.kind == "f":
-            acted = np.zeros_like(self.chosen)
+        chosen = self._acting.choose(obs, state, self._drawn, greedy=self._greedy)
+        if chosen.dtype.kind == "f":
+            acted = np.zeros_like(chosen)
             playing = self._lane.playing.repeat(self._run.seats_of_copy)
-            acted[playing] = self.chosen[playing]
+            acted[playing] = chosen[playing]
             check_acted(None, "action", acted[None], obs, self._run.row_axes, self._rows.first_step + t)
-        return self.chosen[None].copy()
+        self.chosen[t] = chosen
+        return chosen[None].copy()
 
     def written(self, i: int) -> list[Array]:
         """No arrays: nobody learns from these rows."""
