@@ -9,7 +9,7 @@ policies. In a masked run, the last array of an observation is the mask of the a
 from __future__ import annotations
 
 import traceback
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -22,6 +22,9 @@ from millrace.protocol.policy.masks import forbid, masked_distribution
 from millrace.protocol.policy.policy import Policy
 from millrace.protocol.specs import RunSpec
 from millrace.workers.activity import ACTING, activity
+
+Stream = Callable[[], np.random.Generator]
+"""Gives a random generator, the same in each call. Seeding one takes as long as a step, and greedy actions need none."""
 
 
 class ActedRows(NamedTuple):
@@ -69,7 +72,7 @@ class Acting(Protocol):
         """Begin a rollout of the lanes that have these random generators."""
         ...
 
-    def choose(self, obs: Sequence[Array], state: Floats, generator: np.random.Generator, *, greedy: bool) -> Array:
+    def choose(self, obs: Sequence[Array], state: Floats, stream: Stream, *, greedy: bool) -> Array:
         """Actions [k, *action] in observations [1, k, *leaf]. Updates state [1, k, S]."""
         ...
 
@@ -121,11 +124,11 @@ class _BuiltInActing:
     def begin(self, generators: Sequence[np.random.Generator]) -> RolloutActions:
         return _BuiltInActions(self, generators)
 
-    def choose(self, obs: Sequence[Array], state: Floats, generator: np.random.Generator, *, greedy: bool) -> Array:
+    def choose(self, obs: Sequence[Array], state: Floats, stream: Stream, *, greedy: bool) -> Array:
         params = self.params(obs, state)
         if greedy:
             return self.distribution.mode(params)[0]  # type: ignore[no-any-return]
-        noise = self.distribution.noise(generator, params.shape[:2])
+        noise = self.distribution.noise(stream(), params.shape[:2])
         return self.distribution.sample(params, noise)[0]  # type: ignore[no-any-return]
 
 
@@ -178,8 +181,8 @@ class _OwnActing:
     def begin(self, generators: Sequence[np.random.Generator]) -> RolloutActions:
         return _OwnActions(self, generators)
 
-    def choose(self, obs: Sequence[Array], state: Floats, generator: np.random.Generator, *, greedy: bool) -> Array:
-        acted = self.act([leaf[0] for leaf in obs], state[0], generator, greedy=greedy)
+    def choose(self, obs: Sequence[Array], state: Floats, stream: Stream, *, greedy: bool) -> Array:
+        acted = self.act([leaf[0] for leaf in obs], state[0], stream(), greedy=greedy)
         state[0] = acted.state
         return acted.action
 

@@ -103,7 +103,8 @@ class OtherTeams:
             playing = np.repeat([match.opponent is opponent for match in self._matches], self._run.seats_of_copy)
             if (columns := np.flatnonzero(playing & theirs)).size:
                 state = self._state[None, columns, : opponent.state_size]
-                chosen = opponent.acting.choose([leaf[None, columns] for leaf in obs], state, self.generator, greedy=False)
+                seen = [leaf[None, columns] for leaf in obs]
+                chosen = opponent.acting.choose(seen, state, lambda: self.generator, greedy=False)
                 self._state[columns, : opponent.state_size] = state[0]
                 taken[columns] = opponent.to_env_action(chosen)
 

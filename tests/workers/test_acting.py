@@ -70,7 +70,7 @@ def acts(run: RunSpec, policy: Policy | CalledPolicy, steps: int = 3) -> None:
     actions = acting.begin(generators)
     for t in range(steps):
         actions.act(t, obs, state)
-    acting.choose(obs, state, generators[0], greedy=True)
+    acting.choose(obs, state, lambda: generators[0], greedy=True)
 
 
 def test_each_call_of_an_own_policy_is_named_and_counts_as_none_of_the_environment(page: Counting) -> None:

@@ -28,7 +28,7 @@ _NONE: Mapping[str, Any] = {}
 
 def unused_mask(infos: Iterable[Mapping[str, Any]], action: gymnasium.Space[Any]) -> str:
     """A line for the user if one of these infos of resets contains a mask that the run does not use."""
-    if not action_spec(action).choices or not any(isinstance(info, Mapping) and MASK in info for info in infos):
+    if not any(isinstance(info, Mapping) and MASK in info for info in infos) or not action_spec(action).choices:
         return ""
     return f"the environment's info has an {MASK}, which this run does not use; --action-masks info does"
 

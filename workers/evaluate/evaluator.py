@@ -11,6 +11,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from functools import cache, partial
 from time import perf_counter
 from types import MappingProxyType
 
@@ -24,7 +25,7 @@ from millrace.protocol.policy.called_policy import CalledPolicy
 from millrace.protocol.policy.policy import Policy
 from millrace.protocol.random_streams import Purpose, generator
 from millrace.protocol.specs import RunSpec
-from millrace.workers.acting import Acting, StepActions
+from millrace.workers.acting import Acting, StepActions, Stream
 from millrace.workers.copies.env_copies import EvaluationCopies, check_spaces
 from millrace.workers.copies.env_errors import environment_failed, environment_failures
 from millrace.workers.copies.env_loop import Pulse
@@ -110,7 +111,7 @@ class Evaluator:
         run = self._run
         k = len(order.seeds)
         copies = self._opened(k, "rgb_array" if order.send_frames else None, pulse)
-        drawn = generator(order.seeds[0], Purpose.PLAYED_ACTIONS)  # rule EVALUATE_SEEDS
+        stream = cache(partial(generator, order.seeds[0], Purpose.PLAYED_ACTIONS))  # rule EVALUATE_SEEDS
         lane = Lane(run, copies, k, number=None, most_steps=order.most_steps)
         lane.others = others
         lane.reset(order.seeds, pulse)
@@ -122,7 +123,7 @@ class Evaluator:
         for sender in senders:
             self._show_frame(sender, copies)
             sender.begin(self._shown(sender.episode, of_lane, slice(0, 1)))
-        actions = _PlayedActions(run, self._runner.acting, rows, drawn, greedy=order.greedy)  # rule GREEDY
+        actions = _PlayedActions(run, self._runner.acting, rows, stream, greedy=order.greedy)  # rule GREEDY
         ended_by_copy: dict[int, EndedEpisode] = {}
         while len(ended_by_copy) < k:
             self._fill(rows, actions, pulse)
@@ -130,7 +131,7 @@ class Evaluator:
                 ended_by_copy[each.copy] = each
             for sender in senders:
                 n = sender.episode
-                played = rows.filled - np.count_nonzero(of_lane.resets[: rows.filled, n])
+                played = rows.filled - int(np.count_nonzero(of_lane.resets[: rows.filled, n]))
                 if played:
                     self._show_frame(sender, copies)
                     sender.add(self._played(n, played, of_lane, actions.chosen, ended_by_copy.get(n)))
@@ -215,7 +216,7 @@ class Evaluator:
 class _PlayedActions:
     """The actions of an evaluation. They are checked before an environment gets them."""
 
-    def __init__(self, run: RunSpec, acting: Acting, rows: Rows, drawn: np.random.Generator, *, greedy: bool) -> None:
+    def __init__(self, run: RunSpec, acting: Acting, rows: Rows, stream: Stream, *, greedy: bool) -> None:
         action = run.policy.action
         self.chosen = np.empty((rows.steps, rows.of_lanes[0].lane.columns, *action.shape), action.stored_dtype)
         """[T, k · A, *action] of these rows"""
@@ -223,7 +224,7 @@ class _PlayedActions:
         self._acting = acting
         self._rows = rows
         self._lane = rows.of_lanes[0].lane
-        self._drawn = drawn
+        self._stream = stream
         self._greedy = greedy
 
     def act(self, t: int, obs: Sequence[Array], state: Floats) -> Array:
@@ -231,7 +232,7 @@ class _PlayedActions:
 
         The action of a copy whose episode has ended does not count.
         """
-        chosen = self._acting.choose(obs, state, self._drawn, greedy=self._greedy)
+        chosen = self._acting.choose(obs, state, self._stream, greedy=self._greedy)
         if chosen.dtype.kind == "f":
             acted = np.zeros_like(chosen)
             playing = self._lane.playing.repeat(self._run.seats_of_copy)

@@ -231,9 +231,12 @@ class RowsOfLane:
         else:
             over = self._count_seats(t, lane.seats)
         lane.episodes.add(self.reward[t].reshape(-1, self._seats), lane.playing)
-        lane.playing = ~over if lane.autoresets else lane.playing & ~over
-        for n in over.nonzero()[0].tolist():
+        for n in (ended := over.nonzero()[0].tolist()):
             self.ended.append(lane.episodes.ended(n, now_s, self._facts.get((t, n)), lane.others))
+        if lane.autoresets:
+            lane.playing = ~over
+        elif ended:
+            lane.playing = lane.playing & ~over
         if self._rows.first_step + t + 1 >= lane.episodes.most_steps:
             self._cut(t, now_s)
         self.resets[t + 1] = ~lane.playing
