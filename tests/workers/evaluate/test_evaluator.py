@@ -18,12 +18,14 @@ from millrace.protocol.errors import EnvironmentFailed, UsageError
 from millrace.protocol.messages import EpisodeRows, Evaluate, Evaluated
 from millrace.protocol.policy.policy import Policy
 from millrace.protocol.specs import PolicySpec, RunSpec
+from millrace.protocol.wire.codec import encode
 from millrace.workers.collect.collector import Collector
 from millrace.workers.conversation.held import Assignment
 from millrace.workers.evaluate import episode_rows
 from millrace.workers.evaluate.evaluator import ROWS_AT_ONCE, Evaluator
 from tests.support.conversation.example_messages import example
 from tests.support.in_process.collectors import no_pulse, random_policy, run_of
+from tests.workers.collect.test_seat_rows import FORMS, seated_run
 
 Array = np.ndarray[Any, Any]
 
@@ -335,6 +337,29 @@ def test_rows_are_cut_into_messages_and_are_whole(monkeypatch: pytest.MonkeyPatc
     env = gymnasium.make("CartPole-v1")
     first = env.reset(seed=1)[0]
     assert sent[0].obs[0][0].tolist() == first.tolist()
+
+
+@pytest.mark.parametrize("limit", [1, 200, 300, 10_000])
+@pytest.mark.parametrize("form", ["one agent", *FORMS])
+@pytest.mark.parametrize("most_steps", [ROWS_AT_ONCE, ROWS_AT_ONCE + 1, 50])
+def test_the_messages_do_not_depend_on_how_many_rows_are_played_at_once(
+    monkeypatch: pytest.MonkeyPatch, limit: int, form: str, most_steps: int
+) -> None:
+    monkeypatch.setattr(episode_rows, "CHUNK_BYTES", limit)
+    run = run_of("CartPole-v1") if form == "one agent" else seated_run(form, 4, 1)
+
+    def sent(at_once: int) -> dict[int, list[bytes]]:
+        monkeypatch.setattr("millrace.workers.evaluate.evaluator.ROWS_AT_ONCE", at_once)
+        found: dict[int, list[bytes]] = {0: [], 1: [], 2: []}
+
+        def keep(rows: EpisodeRows) -> None:
+            found[rows.episode].append(b"".join(bytes(frame) for frame in encode(rows)))
+
+        asked = order(1, 2, 7, greedy=False, most_steps=most_steps, rows=True)
+        Evaluator(run, random_policy(run.policy)).play(asked, keep, no_pulse)
+        return found
+
+    assert sent(ROWS_AT_ONCE) == sent(1)
 
 
 class Painted(Echo):
