@@ -20,7 +20,7 @@ CHUNK_BYTES = 8 * 2**20
 SendRows = Callable[[EpisodeRows], None]
 
 
-class PlayedRows(NamedTuple):
+class RowsOfEpisode(NamedTuple):
     """L consecutive rows of one episode. With seats, an observation and an action have an entry for each seat."""
 
     obs: tuple[Array, ...]
@@ -33,10 +33,10 @@ class PlayedRows(NamedTuple):
     truncated: Array
     """[L] bool each"""
 
-    def part(self, begin: int, end: int) -> PlayedRows:
+    def part(self, begin: int, end: int) -> RowsOfEpisode:
         """A copy of some of these rows."""
         obs = tuple(leaf[begin:end].copy() for leaf in self.obs)
-        return PlayedRows(obs, *(array[begin:end].copy() for array in self[1:]))
+        return RowsOfEpisode(obs, *(array[begin:end].copy() for array in self[1:]))
 
 
 class RowSender:
@@ -49,7 +49,7 @@ class RowSender:
         self._send = send
         self._first_step = 0
         self._before: tuple[Array, ...] = ()  # [1, *leaf] each: the observation before the first of these rows
-        self._rows: list[PlayedRows] = []
+        self._rows: list[RowsOfEpisode] = []
         self._frames: list[Array] = []
         self._frames_so_far = 0
         self._bytes = 0
@@ -74,7 +74,7 @@ class RowSender:
         self._before = tuple(leaf.copy() for leaf in obs)
         self._bytes += sum(leaf.nbytes for leaf in obs)
 
-    def add(self, rows: PlayedRows) -> None:
+    def add(self, rows: RowsOfEpisode) -> None:
         """Add rows, which are copied. While frames are wanted, there is one row at a time."""
         was_last_frame = bool(self._frames) and self._frames_so_far == MOST_FRAMES
         ends = was_last_frame or bool(rows.terminated[-1] or rows.truncated[-1])

@@ -32,7 +32,7 @@ from millrace.workers.copies.env_loop import Pulse
 from millrace.workers.copies.looped_kind import loop_over
 from millrace.workers.copies.value_checks import check_acted
 from millrace.workers.copy_slots import EnvMaker
-from millrace.workers.evaluate.episode_rows import PlayedRows, RowSender, SendRows, as_frame
+from millrace.workers.evaluate.episode_rows import RowSender, RowsOfEpisode, SendRows, as_frame
 from millrace.workers.lanes.lane import Lane
 from millrace.workers.lanes.rows import EpisodesLost, Rows, RowsOfLane
 from millrace.workers.lanes.runner import LaneRunner
@@ -182,7 +182,7 @@ class Evaluator:
         except ValueError as error:
             raise environment_failed(None, f"copy {n}, {error}") from error
 
-    def _played(self, n: int, L: int, rows: RowsOfLane, chosen: Array, ended: EndedEpisode | None) -> PlayedRows:
+    def _played(self, n: int, L: int, rows: RowsOfLane, chosen: Array, ended: EndedEpisode | None) -> RowsOfEpisode:
         """The first L of these rows, of the episode of copy n. `chosen` [T, k · A, *action]: the actions of all copies.
 
         `ended`: the episode, if it ended in the last of them.
@@ -199,7 +199,7 @@ class Evaluator:
             truncated = truncated.copy()
             truncated[-1] = True
         reward = rows.reward[:L].reshape(L, -1, self._run.seats_of_copy)[:, n].sum(-1)
-        return PlayedRows(
+        return RowsOfEpisode(
             tuple(self._shown(n, rows, slice(1, L + 1))), self._of_copy(n, chosen[:L]), reward, terminated, truncated
         )
 
