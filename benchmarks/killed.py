@@ -28,8 +28,7 @@ import psutil
 LOOK_EVERY_S = 0.05
 STOPPED_S, HANGS_S = 8.0, 30.0
 FAULTS, SAID = "faults.jsonl", "said.log"
-WORKER, SIMULATOR = r" -m millrace\.workers ", r"spawn_main|sumo|python"
-NOT_A_SIMULATOR = "resource_tracker"
+WORKER, NOT_A_SIMULATOR = " -m millrace.workers ", "resource_tracker"
 FIRST_STEPS, LAST_PART = 500, 0.97
 """faults come between this number of env steps and this part of the run"""
 
@@ -69,12 +68,12 @@ class Run:
 
     def workers(self) -> list[psutil.Process]:
         """Local workers that are alive."""
-        return [one for one in _children(self.learner) if re.search(WORKER, _line(one))]
+        return [one for one in _children(self.learner) if WORKER in _line(one)]
 
     def simulators(self) -> list[psutil.Process]:
         """Processes that workers have started, except Python's own helper."""
         found = [one for worker in self.workers() for one in _children(worker)]
-        return [one for one in found if re.search(SIMULATOR, _line(one)) and NOT_A_SIMULATOR not in _line(one)]
+        return [one for one in found if NOT_A_SIMULATOR not in _line(one)]
 
     def env_steps(self) -> int:
         """Those of the newest update."""
@@ -88,6 +87,10 @@ class Run:
     def saved(self) -> int:
         """Env steps of the newest checkpoint."""
         return max((int(path.stem) for path in self.folder.glob("*/checkpoints/*.pt")), default=0)
+
+
+Cause = Callable[[Run, random.Random], bool]
+"""Causes a fault. False if there is nothing yet that it could happen to."""
 
 
 def _children(process: psutil.Process) -> list[psutil.Process]:
@@ -108,7 +111,7 @@ def _line(process: psutil.Process) -> str:
     return ""
 
 
-def _to(processes: Callable[[Run], list[psutil.Process]], number: signal.Signals, stopped_s: float = 0.0) -> Callable:
+def _to(processes: Callable[[Run], list[psutil.Process]], number: signal.Signals, stopped_s: float = 0.0) -> Cause:
     """A fault that sends a signal to one of these processes; a stopped one continues after `stopped_s`."""
 
     def fault(run: Run, generator: random.Random) -> bool:
@@ -125,7 +128,7 @@ def _to(processes: Callable[[Run], list[psutil.Process]], number: signal.Signals
     return fault
 
 
-def _to_the_learner(number: signal.Signals) -> Callable[[Run, random.Random], bool]:
+def _to_the_learner(number: signal.Signals) -> Cause:
     """A fault that ends the learner. Not before the run has a checkpoint."""
 
     def fault(run: Run, generator: random.Random) -> bool:
@@ -138,7 +141,7 @@ def _to_the_learner(number: signal.Signals) -> Callable[[Run, random.Random], bo
     return fault
 
 
-KINDS: Mapping[str, Callable[[Run, random.Random], bool]] = {
+KINDS: Mapping[str, Cause] = {
     "worker: SIGKILL": _to(Run.workers, signal.SIGKILL),
     "worker: SIGTERM": _to(Run.workers, signal.SIGTERM),
     f"worker: SIGSTOP for {STOPPED_S:.0f} s": _to(Run.workers, signal.SIGSTOP, STOPPED_S),

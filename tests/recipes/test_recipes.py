@@ -33,7 +33,7 @@ PINNED = ROOT / ".venv-recipes/pinned/bin"
 WITHIN_S = 600.0
 SPAWNED, SERVERS, WORKERS = "spawn_main", "building.py", r"^\S*python\S* .*millrace.* --name w\d"
 RANKS = r"^\S*python\S* burgers\.py"
-AS_ROOT = ("OMPI_ALLOW_RUN_AS_ROOT", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM", "PRTE_ALLOW_RUN_AS_ROOT", "PRTE_ALLOW_RUN_AS_ROOT_CONFIRM")
+AS_ROOT = ("OMPI_ALLOW_RUN_AS_ROOT", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM")
 Settings = Mapping[str, object]
 
 
