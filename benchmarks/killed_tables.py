@@ -22,9 +22,9 @@ from millrace.learner.run_folder.metrics_log import read_rows
 
 CONTINUES = re.compile(r"continues at ([\d,]+) env steps")
 REPORTS = ("process_failed", "left", "environment_raised", "not_started")
-NOTHING = "nothing: another fault came first, or nothing was lost"
+NOTHING = "nothing before the next fault"
 SHORTER = (
-    (r"(?s)\n.*", ""), (r"; (this counts|\d).*", ""), (r", after update.*", ""), (r"^run \S+ continues", "the run continues"),
+    (r"(?s)\n.*", ""), (r"; (this counts|\d).*", ""), (r", after update.*", ""), (r"^run \S+ cont", "the run cont"),
     (r", at /\S+, in \w+", ""), (r" w\d( \(\S+\))?", ""), (r"lane \d, copy \d, step \d+: ", ""), (r"[\d,]+ env", "… env"),
 )  # fmt: skip
 """what makes reports of one kind differ, and what stands in its place"""
@@ -86,7 +86,7 @@ class Killed:
 ROWS = (
     "faults", "learner processes", "env steps of the run", "env steps made again after a checkpoint",
     "env steps replayed so that episodes continue", "env copies that began a new episode instead",
-    "greedy returns on the way", "greedy return at the end", "SHA-256 of `policy.safetensors`",
+    "greedy returns after 4,000, 8,000, 12,000 and 16,000 env steps", "greedy return at the end", "SHA-256 of `policy.safetensors`",
 )  # fmt: skip
 
 
@@ -121,7 +121,7 @@ def kinds(runs: Sequence[Killed]) -> str:
         often = [f"{count} × {report}" for report, count in reports[kind].most_common(2)]
         after = seconds[kind]
         rows.append((kind, f"{len(after)}", "; ".join(often), f"{statistics.median(after):.0f} s", f"{max(after):.0f} s"))
-    return table(("fault", "times", "what the log said most often", "an update later than before: median", "longest"), rows)
+    return table(("fault", "times", "what the log said most often", "until the next update: median", "longest"), rows)
 
 
 def main(folders: Sequence[str]) -> int:
