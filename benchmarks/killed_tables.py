@@ -86,7 +86,8 @@ class Killed:
 ROWS = (
     "faults", "learner processes", "env steps of the run", "env steps made again after a checkpoint",
     "env steps replayed so that episodes continue", "env copies that began a new episode instead",
-    "greedy returns after 4,000, 8,000, 12,000 and 16,000 env steps", "greedy return at the end", "SHA-256 of `policy.safetensors`",
+    "greedy returns after 4,000, 8,000, 12,000 and 16,000 env steps", "greedy return at the end",
+    "SHA-256 of `policy.safetensors`",
 )  # fmt: skip
 
 
