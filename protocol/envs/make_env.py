@@ -109,6 +109,11 @@ def _what_to_return(made: object) -> str:
         return instead_of_object(made)
     if hasattr(made, "num_envs"):
         return "it is a vector environment: return one copy; millrace makes as many as it needs"
+    if hasattr(made, "observation_spec") and hasattr(made, "action_spec"):
+        return (
+            "it has the interface of dm_env: `pip install shimmy`, and return shimmy.DmControlCompatibilityV0(env), or "
+            "shimmy.BSuiteCompatibilityV0(env) if it is bsuite's"
+        )
     return what_it_lacks(made)
 
 

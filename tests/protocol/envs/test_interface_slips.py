@@ -103,6 +103,14 @@ class ListsAgentsLater(RandomCrowd):
     possible_agents = ()
 
 
+class OfDmEnv:
+    """Has the interface of DeepMind's dm_env."""
+
+    def observation_spec(self) -> None: ...
+
+    def action_spec(self) -> None: ...
+
+
 class Nothing:
     """No environment at all."""
 
@@ -113,6 +121,7 @@ class Nothing:
         ("SpacesAreAttributes", "; it needs a method observation_space(agent), which returns the space of this agent"),
         ("ActionsAreAttributes", "; it needs a method action_space(agent), which returns the space of this agent"),
         ("KnowsAgentsLater", "; it needs possible_agents, a list of all agents that there may be, before its first reset"),
+        ("OfDmEnv", "return shimmy.DmControlCompatibilityV0(env), or shimmy.BSuiteCompatibilityV0(env) if it is bsuite's"),
         ("Nothing", ", got Nothing"),
     ],
 )
