@@ -28,7 +28,8 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from millrace.protocol.arrays import Array
-from millrace.protocol.policy.networks import FlatNetwork, RecurrentInput, network_of
+from millrace.protocol.policy.encoder import RecurrentInput
+from millrace.protocol.policy.networks import FlatNetwork, network_of
 
 UNIT = 2.0**-24
 ELEMENTWISE = 16  # roundings that an activation, a softmax or a log-probability adds
