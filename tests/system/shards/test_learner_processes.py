@@ -37,6 +37,13 @@ Audience.updated = fails
 from millrace.cli.main import main
 sys.exit(main(sys.argv[1:]))
 """
+CONNECTED = """
+import sys
+from torch import distributed
+distributed.init_process_group("gloo")
+from millrace.cli.main import main
+sys.exit(main(sys.argv[1:]))
+"""
 
 
 class Ranks(list[subprocess.Popen[str]]):
@@ -126,6 +133,13 @@ def test_a_rank_that_cannot_see_the_folder_learns_that_the_run_was_finished(tmp_
         (code, said), (other_code, other_said) = started.end()
     assert (code, other_code) == (0, 0), said + other_said
     assert "rank 1: the run was finished before" in other_said
+
+
+def test_processes_that_are_connected_already_use_their_group(tmp_path: Path, undisturbed: bytes) -> None:
+    with ranks(tmp_path, 2, program=dict.fromkeys((0, 1), ("-c", CONNECTED))) as started:
+        (code, said), (other_code, other_said) = started.end()
+    assert (code, other_code) == (0, 0), said + other_said
+    assert policy(tmp_path) == undisturbed
 
 
 def test_a_killed_rank_ends_all_and_a_run_that_is_resumed_with_fewer_is_the_same(tmp_path: Path, undisturbed: bytes) -> None:
