@@ -211,7 +211,8 @@ class TrainKeywords(RolloutKeywords, total=False):
     """Number of PyTorch threads in the learner. none: chosen when the run starts, and kept in its config.toml. The choice
     is 1; with images, an encoder or a layer of 512 x 512 weights it is one for each 34 million multiply-adds of a
     minibatch's forward pass, at most one for each core. If max_lag is above 0, each local worker then keeps one core,
-    unless this would leave half of the cores or less to the learner. Another number changes the last bits of results.
+    unless this would leave half of the cores or less to the learner. With shards it is 1. Another number changes the
+    last bits of results.
     """
     shards: int
     """Number of parts of a batch whose gradients are computed apart, for several learner processes (ppo, a2c, impala,

@@ -191,7 +191,7 @@ SURROGATE = "CartPole-v1\ud800"
     ("function", "given", "line"),
     [
         (millrace.train, {"env": SURROGATE}, r"train: env: expected text that can be encoded, got 'CartPole-v1\ud800'"),
-        (millrace.train, {"env": "CartPole-v1", "workers": False}, "train: workers: expected int, got False"),
+        (millrace.train, {"env": "CartPole-v1", "workers": False}, 'train: workers: expected int or "none", got False'),
         (millrace.train, {"env": "CartPole-v1", "workers": 0}, "train: workers: expected int >= 1, got 0"),
         (millrace.train, {"env": "CartPole-v1", "run_dir": 3}, "train: run_dir: expected text, got 3"),
         (millrace.train, {"env": "CartPole-v1", "info_keys": "x"}, "train: info_keys: expected a list, got 'x'"),

@@ -124,7 +124,7 @@ def test_what_type_checkers_refuse_is_refused_when_it_runs() -> None:
     """`mypy --strict`, which reads the tests, would call an `ignore` that hides no error an error."""
     with pytest.raises(millrace.UsageError, match=r"unknown setting worker; did you mean workers\?$"):
         millrace.train("CartPole-v1", worker=2)  # type: ignore[call-arg]
-    with pytest.raises(millrace.UsageError, match=r"^train: workers: expected int, got 'two'$"):
+    with pytest.raises(millrace.UsageError, match=r"""^train: workers: expected int or "none", got 'two'$"""):
         millrace.train("CartPole-v1", workers="two")  # type: ignore[arg-type]
     with pytest.raises(
         millrace.UsageError, match=r"^RolloutService: transport: expected one of inproc, ipc, tcp, got 'udp'$"
@@ -139,11 +139,19 @@ def test_what_type_checkers_refuse_is_refused_when_it_runs() -> None:
             )
 
 
-@pytest.mark.parametrize("function", [millrace.train, millrace.RolloutService, millrace.evaluate, millrace.record])
-def test_a_signature_shows_every_keyword(function: Callable[..., object]) -> None:
+@pytest.mark.parametrize(
+    ("function", "workers"),
+    [
+        (millrace.train, "int | None"),
+        (millrace.RolloutService, "int | None"),
+        (millrace.evaluate, "int"),
+        (millrace.record, "int"),
+    ],
+)
+def test_a_signature_shows_every_keyword(function: Callable[..., object], workers: str) -> None:
     parameters = inspect.signature(function).parameters
     assert not [name for name, each in parameters.items() if each.kind is inspect.Parameter.VAR_KEYWORD]
-    assert str(parameters["workers"]) == "workers: 'int' = ..."
+    assert str(parameters["workers"]) == f"workers: '{workers}' = ..."
 
 
 if __name__ == "__main__":

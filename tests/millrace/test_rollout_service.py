@@ -322,7 +322,7 @@ def test_calls_from_another_thread_and_after_the_end_are_refused() -> None:
         ({"worker": 2}, "unknown setting worker; did you mean workers"),
         ({"envs": 5}, "5 envs cannot be shared evenly among 2 lanes"),
         ({"rollout_steps": 0}, "rollout_steps: expected int >= 1, got 0"),
-        ({"workers": "two"}, "workers: expected int, got 'two'"),
+        ({"workers": "two"}, "workers: expected int or \"none\", got 'two'"),
         ({"policy": millrace.CNN()}, "expected an image"),
         ({"policy": millrace.MLP(0)}, "expected widths of hidden layers"),
         ({"policy": millrace.Recurrent(8, core_size=0)}, "policy: core_size: expected int >= 1, got 0"),

@@ -95,7 +95,7 @@ def asked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[Any]:
         (["status", "runs/a", "runs/b", "runs/c", "--json"], "status: expected one run, got 3; name one of them"),
         (["presets", "a"], "presets: unexpected argument a"),
         (["train", "CartPole-v1", "--workers", "0"], "--workers: expected int >= 1, got 0"),
-        (["train", "CartPole-v1", "--workers", "two"], "--workers: expected int, got two"),
+        (["train", "CartPole-v1", "--workers", "two"], '--workers: expected int or "none", got two'),
         (["train", "CartPole-v1", "--learning-rate", "x y"], "--learning-rate: expected float, got 'x y'"),
         (["train", "CartPole-v1", "--transport", "udp"], "--transport: expected one of inproc, ipc, tcp, got udp"),
         (["train", "CartPole-v1", "--core", "rnn"], "--core: expected one of lstm, gru, none, got rnn"),
