@@ -61,7 +61,7 @@ Learner.train = ReportingLearner.train_and_report  # at import, so that it appli
 
 def make(name: str, cfg: Any = None, env_config: Any = None, render_mode: Any = None) -> Any:
     """One copy."""
-    return gymnasium.make(name, render_mode=render_mode)
+    return gymnasium.make(name) if render_mode is None else gymnasium.make(name, render_mode=render_mode)
 
 
 def arguments(s: dict[str, Any], how: str) -> list[str]:
