@@ -139,7 +139,7 @@ def ranges_text(rows: Sequence[Row]) -> str:
 def page_part(curves: Sequence[Curve], rates: Sequence[Rate]) -> str:
     """What the page says of these curves and rates, as Markdown."""
     targets = {env: target for env in ENVS if (target := target_of(curves, env)) is not None}
-    if not targets:
+    if not targets or not rates:  # minutes need both
         return NOTHING
     parts = [_sources(curves, rates, targets)]
     for processor in sorted({rate.processor for rate in rates}) or [""]:

@@ -229,7 +229,7 @@ def test_groups_are_told_apart_however_late_the_setting_comes_that_differs(tmp_p
 
 
 def test_workers_that_came_from_elsewhere_are_not_a_number(tmp_path: Path) -> None:
-    here, elsewhere = a_run(tmp_path), a_run(tmp_path, seed=2)
+    here, elsewhere = a_run(tmp_path, workers=2), a_run(tmp_path, workers=2, seed=2)
     RunFolder.open(elsewhere).write_config(resolve("CartPole-v1", run_dir=str(tmp_path), seed=2), workers_elsewhere=True)
     assert "<dt>workers</dt><dd>2</dd>" in sections.settings(report_data(here))
     assert "<dt>workers</dt><dd>started elsewhere</dd>" in sections.settings(report_data(elsewhere))
