@@ -90,7 +90,11 @@ def main() -> None:
         s["steps"] = max(s["steps"], OWN_STEPS) if run.until_solved else s["steps"]
     torch.manual_seed(s["seed"])
     copies = OWN_COPIES if own else s["envs"]
-    in_processes: dict[str, Any] = {"backend": pufferlib.vector.Multiprocessing, "num_workers": s.get("processes")}
+    in_processes: dict[str, Any] = {
+        "backend": pufferlib.vector.Multiprocessing,
+        "num_workers": s.get("processes"),
+        "overwork": True,  # more processes than cores, which wait for their environments
+    }
     how = in_processes if run.how == "processes" else {"backend": pufferlib.vector.Serial}
     envs = pufferlib.vector.make(make, env_kwargs={"env": s["env"]}, num_envs=copies, seed=s["seed"], **how)
     policy: Any = pufferlib.models.Default(envs.driver_env, hidden_size=64) if own else Policy(envs.driver_env)
