@@ -151,7 +151,9 @@ class Minibatch(NamedTuple):
         index = units_in_order(used, generator, whole_columns=self.recurrent is not None)
         if not len(index):
             return
-        of_rows = torch.from_numpy(used).to(self.features.device)
+        of_rows = torch.from_numpy(used)
+        if self.recurrent is not None:  # only whole columns need it beside the rows
+            of_rows = of_rows.to(self.features.device)
         for chosen in index.to(self.features.device).tensor_split(min(count, len(index))):
             yield self.chosen(chosen, of_rows)
 
@@ -189,9 +191,19 @@ class WholeBatch(NamedTuple):
     ) -> Iterator[Iterable[Sequence[Minibatch]]]:
         """See `UpdateRows`."""
         rows = Minibatch.of(self.batch, self.observations, advantage, target)
-        single = tuple((part,) for part in rows.shuffled(used, 1, None)) if count == 1 else ()
-        while True:
-            yield single or ((part,) for part in rows.shuffled(used, count, generator))
+        return endless_epochs(lambda order: ((part,) for part in rows.shuffled(used, count, order)), count, generator)
+
+
+def endless_epochs(
+    minibatches: Callable[[torch.Generator | None], Iterable[Sequence[Minibatch]]], count: int, generator: torch.Generator
+) -> Iterator[Iterable[Sequence[Minibatch]]]:
+    """Epochs without end. `minibatches` makes those of one, shuffled by a generator, or without one in order.
+
+    A single minibatch per epoch is made once, with its rows in order.
+    """
+    single = tuple(minibatches(None)) if count == 1 else ()
+    while True:
+        yield single or minibatches(generator)
 
 
 class LossInput(NamedTuple):

@@ -20,6 +20,7 @@ from millrace.learner.algorithms.minibatches import (
     Minibatch,
     NetworkInput,
     WholeBatch,
+    endless_epochs,
     rows_of_columns,
     units_in_order,
 )
@@ -86,6 +87,7 @@ class ShardRows(NamedTuple):
         ]
         device = parts[0].observations.features.device
         used_in_shards = [torch.from_numpy(used[:, each]) for each in columns]
+        used_here = {shard: used_in_shards[shard].to(device) for shard in own}
         advantages = [torch.from_numpy(advantage[:, each]).flatten() for each in columns]
         has_core = parts[0].observations.recurrent is not None
 
@@ -100,15 +102,11 @@ class ShardRows(NamedTuple):
                     ]
                 )
                 yield tuple(
-                    rows.chosen(pieces[shard].to(device), used_in_shards[shard].to(device))._replace(
-                        standardized=scaled[shard].to(device)
-                    )
+                    rows.chosen(pieces[shard].to(device), used_here[shard])._replace(standardized=scaled[shard].to(device))
                     for shard, rows in zip(own, rows_of_shards, strict=True)
                 )
 
-        single = tuple(minibatches(None)) if count == 1 else ()
-        while True:
-            yield single or minibatches(generator)
+        return endless_epochs(minibatches, count, generator)
 
     def _standardized(self, advantages: Sequence[Tensor]) -> Sequence[Tensor]:
         """The advantages of all parts of a minibatch, with mean 0 and standard deviation 1 over all of them if wanted."""
