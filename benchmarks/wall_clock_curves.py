@@ -16,6 +16,7 @@ from benchmarks import kept_records, results
 from benchmarks.wall_clock_programs import OURS
 from benchmarks.writing import processor
 from millrace.learner.config.layers import config_of_run
+from millrace.learner.config.local_workers import local_workers
 from millrace.learner.run_folder.metrics_log import METRICS_FILE, read_rows
 from millrace.learner.run_folder.progress import ENV_STEPS_KEY
 from millrace.learner.run_folder.run_folder import RunFolder
@@ -80,7 +81,7 @@ def of_run(path: Path, made_on: str) -> Curve:
         points.append((summary.env_steps, summary.evaluation.return_mean))  # it is not in metrics.jsonl
     words = shlex.split(results.command(config))
     if "--workers" not in words:  # the command leaves it out where it has no effect, but a reader looks for it
-        words += ["--workers", str(config.workers)]
+        words += ["--workers", str(local_workers(config))]
     return Curve(
         env=config.env,
         system=OURS,
