@@ -7,6 +7,7 @@ again. torch.distributed checks nobody's identity, so it listens on loopback unl
 
 from __future__ import annotations
 
+import logging
 import math
 import os
 import socket
@@ -34,6 +35,9 @@ from millrace.learner.shards.place import Place
 from millrace.learner.shards.reports import Report
 from millrace.protocol.arrays import Array
 from millrace.protocol.errors import LearnerLost, UsageError, first_line
+from millrace.protocol.logs.notices import log_notice
+
+log = logging.getLogger("millrace.learner")
 
 POLL_S = 0.1
 TELL_EVERY_S = 30.0
@@ -145,10 +149,10 @@ class Learners:
 
 
 @contextmanager
-def connected(place: Place, shards: int, device: str, timeouts: Timeouts, poll: Callable[[str], None]) -> Iterator[Learners]:
+def connected(place: Place, shards: int, device: str, timeouts: Timeouts, poll: Callable[[], None]) -> Iterator[Learners]:
     """Connect the processes of a run, and disconnect them at the end.
 
-    `poll` is called now and then while this process waits for others, with a line that says for whom. Raises `UsageError` if
+    `poll` is called now and then while this process waits for others; the log says for whom. Raises `UsageError` if
     `shards` can't be divided among them, and `LearnerLost` if not all come in time.
     """
     division = place.division(shards)
@@ -201,7 +205,7 @@ def _told_of_the_end(learners: Learners) -> Iterator[Learners]:
         raise
 
 
-def _store(place: Place, timeouts: Timeouts, poll: Callable[[str], None]) -> Store:
+def _store(place: Place, timeouts: Timeouts, poll: Callable[[], None]) -> Store:
     """The key-value store in which the processes meet. torchrun has opened one; else rank 0 opens it."""
     patience = timedelta(seconds=PATIENCE_S)
     found: list[Store] = []
@@ -242,7 +246,7 @@ def listening(place: Place) -> socket.socket:
         ) from None
 
 
-def _wait(missing: Callable[[], list[int]], place: Place, seconds: float, poll: Callable[[str], None]) -> None:
+def _wait(missing: Callable[[], list[int]], place: Place, seconds: float, poll: Callable[[], None]) -> None:
     """Wait until no rank is missing. Raises `LearnerLost` after these seconds."""
     end_s = time.monotonic() + seconds
     tell_s = time.monotonic() + POLL_S * 10
@@ -254,11 +258,10 @@ def _wait(missing: Callable[[], list[int]], place: Place, seconds: float, poll: 
                 f"learner: rank {place.rank}: expected {who} at {place.host}:{place.port} within {seconds:.0f} s, got none; "
                 "start all of them"
             )
-        line = ""
         if now_s > tell_s:
             tell_s = now_s + TELL_EVERY_S
-            line = f"waits for {who}, which must come to {place.host}:{place.port}"
-        poll(line)
+            log_notice(log, f"rank {place.rank} waits for {who}, which must come to {place.host}:{place.port}")
+        poll()
         time.sleep(POLL_S)
 
 

@@ -49,9 +49,7 @@ def follow(config: Config, place: Place) -> Path:
     """
     interrupts = Interrupts()
 
-    def poll(line: str) -> None:
-        if line:
-            log_notice(log, f"rank {place.rank} {line}")
+    def poll() -> None:
         if interrupts.received:
             raise KeyboardInterrupt
 

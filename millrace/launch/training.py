@@ -33,7 +33,6 @@ from millrace.learner.shards.place import ALONE, Place, check_loopback
 from millrace.learner.torch_setup import one_thread, torch_device
 from millrace.learner.whole_run import train_to_the_end
 from millrace.protocol.env_spec import EnvSpec
-from millrace.protocol.logs.notices import log_notice
 from millrace.workers.machine_slots import LIMIT_VARIABLE, copies_per_machine
 from millrace.workers.supervise.supervisor import STOP_WITHIN_S
 
@@ -111,9 +110,7 @@ def _train(
             open_run,  # imports PyTorch, unless it was imported while a worker described the environment
         )
 
-        def poll(line: str) -> None:
-            if line:
-                log_notice(log, f"rank 0 {line}")
+        def poll() -> None:
             lobby.listen()
             if interrupts.received:
                 raise stopped(None if resume is None else resume.run)
@@ -129,17 +126,12 @@ def _train(
 
 def _tell_finished(config: Config, place: Place) -> None:
     """Tell the others, which can't know it, that there is nothing to do."""
-
-    def poll(line: str) -> None:
-        if line:
-            log_notice(log, f"rank 0 {line}")
-
-    with _learners(config, place, poll) as learners:
+    with _learners(config, place, lambda: None) as learners:
         if learners is not None:
             learners.end("the run was finished before")
 
 
-def _learners(config: Config, place: Place, poll: Callable[[str], None]) -> AbstractContextManager[Learners | None]:
+def _learners(config: Config, place: Place, poll: Callable[[], None]) -> AbstractContextManager[Learners | None]:
     """The processes that share the updates, while it is entered; None in a run without shards."""
     if config.shards == 1:
         return nullcontext()

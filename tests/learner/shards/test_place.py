@@ -77,7 +77,7 @@ def test_the_group_of_a_program_that_has_connected_the_processes_is_used(monkeyp
     monkeypatch.setattr(distributed, "is_initialized", lambda: True)
     for name in ("init_process_group", "destroy_process_group"):
         monkeypatch.delattr(distributed, name)
-    with connected(Place.of(VARIABLES), 2, "cpu", Timeouts(0.0, 0.0), lambda line: None) as learners:
+    with connected(Place.of(VARIABLES), 2, "cpu", Timeouts(0.0, 0.0), lambda: None) as learners:
         assert learners.division == Division(2, 2, 1)
 
 
