@@ -1,8 +1,8 @@
 """A Dict or Tuple of actions as one row of numbers, and the way back to its structure. Pure.
 
 Rule: a row has the choices of all Discrete and MultiDiscrete parts, then the bits of all MultiBinary parts, then the numbers
-of all Box parts. Each of the three has its parts in the order of the space. So a mixed action has at most three
-distributions, whatever its parts are, and only the code that converts it for the environment knows the parts.
+of all Box parts. Within each of these three groups, the parts are in the order of the space. So a mixed action has at most
+three distributions, whatever its parts are, and only the code that converts it for the environment knows the parts.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ Path = tuple[str | int, ...]
 
 
 class PlacedPart(NamedTuple):
-    """A part of an action, as an action by itself."""
+    """A part of a mixed action, described as an action of its own, and where it is in the mixed action."""
 
     path: Path
     spec: ActionSpec
@@ -30,7 +30,7 @@ class PlacedPart(NamedTuple):
 
 
 def mixed(parts: Sequence[tuple[Path, ActionSpec]]) -> ActionSpec:
-    """The action of these parts, in the order of the space. None of them is mixed."""
+    """The spec of the mixed action that has these parts, in the order of the space. No part may itself be mixed."""
     specs = [spec for _, spec in parts]
     return ActionSpec(
         "mixed",
@@ -79,15 +79,16 @@ Nest = Callable[[Sequence[Any]], Any]
 
 
 def make_nest(paths: Sequence[Path]) -> Nest:
-    """A function from values, in order, to the Dict or Tuple that has them at these paths.
+    """Return a function that takes one value per path, in order, and returns the dict or tuple that has them at these paths.
 
-    The path of a single value may be empty. Raises `ValueError` unless the paths describe a Dict or Tuple.
+    If there is only one path, it may be empty: the function then returns the value itself. Raises `ValueError` unless the
+    paths describe a Dict or Tuple.
     """
     return _nest(list(enumerate(paths)))
 
 
 def _nest(placed: Sequence[tuple[int, Path]]) -> Nest:
-    """Like `make_nest`, for some of the values, each with its number and the rest of its path."""
+    """Like `make_nest`, for some of the values. `placed` has the index of each of them, and the rest of its path."""
     number, path = placed[0]
     if not path and len(placed) == 1:
         return itemgetter(number)

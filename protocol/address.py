@@ -106,18 +106,20 @@ def check_worker_name(name: str) -> None:
 
 
 def worker_name(peer: bytes) -> bytes:
-    """The worker's name: its routing id up to the first zero byte. With keys, a zero byte and more follow the name."""
+    """The worker's name: the peer's routing id up to the first zero byte. At a learner with keys, a zero byte and the
+    peer's key follow the name.
+    """
     return peer.partition(b"\0")[0]
 
 
 def key_of_peer(peer: bytes) -> bytes:
-    """The key part of a peer of a learner with keys; empty without keys."""
+    """The key at the end of a peer's id, after the last zero byte; empty if the learner has no keys."""
     _, separator, key = peer.rpartition(b"\0")
     return key if separator else b""
 
 
 def name_for_people(peer: bytes) -> str:
-    """The worker's name as text without control characters, for logs and errors. A stranger's name may be any bytes."""
+    """The worker's name as text without control characters, for logs and errors. An unknown peer may send any bytes."""
     return one_line(worker_name(peer).decode(errors="replace"), MAX_NAME)
 
 

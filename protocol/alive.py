@@ -1,4 +1,4 @@
-"""What a supervisor says about its workers. This file imports neither numpy nor gymnasium: a supervisor needs neither."""
+"""A supervisor's reports about its workers. This file imports neither numpy nor gymnasium: a supervisor needs neither."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from millrace.protocol.call_timeouts import Doing
 from millrace.protocol.message_base import Message
 
 SHARED_VERSIONS = 4  # how many of the newest versions a supervisor keeps in shared memory for its workers
-NO_SLOT = (
-    "no slot is free"  # so begins the reason, which the learner compares, of a worker that comes back when there is room
-)
+# The reason of a worker that left because no slot was free begins with these words. The learner looks for them, because such
+# a worker comes back when there is a slot.
+NO_SLOT = "no slot is free"
 
 
 class WorkerActivity(msgspec.Struct, frozen=True, array_like=True):
@@ -25,7 +25,7 @@ class WorkerActivity(msgspec.Struct, frozen=True, array_like=True):
     process_nonce: Natural
     doing: Doing
     for_s: Seconds
-    """seconds since it started to do this"""
+    """seconds since it started this activity"""
     env_calls: Natural
     """calls of the environment (make, reset, step) that have returned since the worker started"""
 
@@ -38,11 +38,11 @@ class WorkerExit(msgspec.Struct, frozen=True, array_like=True):
     reason: Line
     """how it ended: an exit code, a signal, or the name of the timeout flag that its supervisor enforced"""
     failed: bool
-    """whether the environment, the policy, or the worker is to blame: it did not leave on purpose"""
+    """whether the environment, the policy, or the worker is to blame, rather than that it left on purpose"""
     of_policy: bool = False
-    """it failed in a call of a policy that the user wrote; no environment is to blame"""
+    """whether it failed in a call of a user-defined policy, so that no environment is to blame"""
     hung: bool = False
-    """its supervisor ended it, because a call took too long: its steps are not replayed"""
+    """whether its supervisor ended it because a call took too long; its steps are then not replayed"""
 
 
 @dataclass(frozen=True)
@@ -59,10 +59,11 @@ class StartFailed:
 
 
 class Alive(Message, frozen=True):
-    """A supervisor speaks for its workers.
+    """A supervisor reports which of its workers are running, and which have ended.
 
-    It is believed if it knows a worker's `process_nonce` and uses the same key. Once the run is over, the answer is `Drain`:
-    the supervisor then ends workers that don't leave by themselves.
+    The learner believes what it says about a worker if it gives the `process_nonce` of that worker and uses the same key.
+    Once the run is over, the learner answers with `Drain`, and the supervisor ends the workers that don't leave by
+    themselves.
     """
 
     running: Annotated[tuple[WorkerActivity, ...], Meta(max_length=MAX_WORKERS)]

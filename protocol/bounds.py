@@ -15,20 +15,20 @@ import msgspec
 from msgspec import Meta
 
 INVALID = (msgspec.MsgspecError, ValueError, RecursionError)
-"""What decoding raises: ValueError for bytes that are not UTF-8 and for too many digits, RecursionError for deeply nested
-lists. Code that decodes what another program wrote catches all of them.
+"""The errors that decoding can raise: ValueError for bytes that are not UTF-8 and for numbers with too many digits,
+RecursionError for deeply nested lists. Code that decodes what another program wrote catches all of them.
 """
 
 MAX_NAME = 200  # characters
 MAX_LINE = 1_000  # characters
 MAX_TEXT = 64_000  # characters
 LARGEST = 2**53  # every whole number up to here is exact as a float64 too
-MAX_TICKETS = 1 << 16  # in one message
+MAX_TICKETS = 1 << 16  # tickets in one message
 MAX_WORKERS = 1_024  # workers that one supervisor speaks for
-MAX_COPIES = 1 << 16  # in one lane
-MAX_SAVED_BYTES = 1 << 22  # state of one env copy that its environment has saved
-MAX_SEEDS = 1_024  # in one order to evaluate
-MAX_FACTS = 32  # of an episode
+MAX_COPIES = 1 << 16  # env copies in one lane
+MAX_SAVED_BYTES = 1 << 22  # bytes of the state of one env copy, as its environment saved it
+MAX_SEEDS = 1_024  # seeds in one order to evaluate
+MAX_FACTS = 32  # facts about one episode
 MOST_FRAMES = 1_500  # frames of one episode that are sent: a minute of video at 25 frames per second
 
 _NO_CONTROL = r"^[^\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]*\Z"
@@ -69,7 +69,7 @@ def one_line(text: str, most: int = MAX_LINE) -> str:
 
 
 def escaped(text: str) -> str:
-    """A text of several lines without control characters, safe to show."""
+    """A text of several lines in which control characters are escaped, so that it is safe to show."""
     return _CONTROL_EXCEPT_NEWLINE.sub(_escape, text)
 
 
@@ -84,7 +84,7 @@ def indented(text: str) -> str:
 
 
 def last_text(text: str) -> str:
-    """The text as a `Text`: if it is too long, only its end, where a traceback says what was raised."""
+    """The text as a `Text`: if it is too long, only its end, where a traceback names the exception."""
     return escaped(text)[-MAX_TEXT:]
 
 

@@ -16,10 +16,10 @@ Doing = Literal[
 ]  # fmt: skip
 """What a worker is doing, as its supervisor sees it. User code runs in all of these except `starting` and `waiting`.
 
-`making`: an env copy. `repeating`: a step of an episode that another worker has lost. `preparing`: a policy, with all that
-it imports. `acting`: a call of a policy that is the user's code.
+`making` is making an env copy. `repeating` is repeating a step of an episode that another worker has lost. `preparing` is
+making a policy, including its imports. `acting` is a call of a user-defined policy.
 """
-CLOSE_S = 10.0  # for one env copy; an environment that hangs in `close` has finished its work
+CLOSE_S = 10.0  # limit for closing one env copy; it is short, because the environment has already done its work
 OUR_CODE: frozenset[Doing] = frozenset({"starting", "waiting"})
 OF_POLICY: frozenset[Doing] = frozenset({"preparing", "acting"})
 CALLS: dict[Doing, str] = {
@@ -33,11 +33,11 @@ CALLS: dict[Doing, str] = {
     "evaluating": "a step of an evaluation",
     "closing": "close() of its environment",
 }
-"""The calls of user code, for the reasons why a worker ended."""
+"""The phrase that names each call of user code in the line that says why a worker was ended."""
 
 
 class CallTimeouts(msgspec.Struct, frozen=True):
-    """How many seconds one call of user code may take before the supervisor ends its worker. 0: no limit.
+    """How many seconds one call of user code may take before the supervisor ends its worker. 0 means no limit.
 
     The fields have the names of the flags.
     """

@@ -3,9 +3,9 @@
 Only this file may unpickle, and only in `PickledCallable.load`: a callable that the *learner* sent to a worker which allows
 `AllowedCode.CALLABLES`. Nothing that a worker sends is ever unpickled.
 
-Rule: things that other processes find by name are sent by name. Things that only this process has (a function, a class or a
-registered id of a script or notebook) are sent as a pickled callable, with the specs of the ids for which it may ask
-gymnasium.
+Rule: things that other processes can find by name are sent by name. Things that only this process has (a function, a class
+or a registered id of a script or notebook) are sent as a pickled callable, with the specs of the ids that this callable may
+request from gymnasium.
 """
 
 from __future__ import annotations
@@ -45,13 +45,15 @@ from millrace.protocol.envs.which_copy import filled
 from millrace.protocol.envs.wrappers import WrapperLike, not_named, wrap, wrapper_names
 from millrace.protocol.errors import UsageError, first_line, safe_repr
 
-# By namespace: the module that registers its environments. The id is then passed to gymnasium as `module:id`, so that
-# gymnasium imports the module.
+# The module that registers the environments of each namespace. An id in one of these namespaces is passed to gymnasium as
+# `module:id`, so that gymnasium imports the module.
 REGISTERING_MODULES = {"millrace": "millrace.extras.envs", "ALE": "ale_py"}
 MAX_CALLABLE_BYTES = 1 << 26
 Scalar = bool | int | float | str
 EnvLike = str | GymnasiumSpec | Callable[..., object]
-"""An id that `gymnasium.make` takes or a name, gymnasium's `EnvSpec`, or a callable that returns an environment."""
+"""An id that `gymnasium.make` accepts, the name of a function or class that returns an environment, gymnasium's `EnvSpec`,
+or a callable that returns an environment.
+"""
 _Made = TypeVar("_Made")
 
 
@@ -103,7 +105,7 @@ class PickledCallable:
 
         try:
             data = cloudpickle.dumps(made)
-        except Exception as error:  # what it refers to may be anything
+        except Exception as error:  # of any type: the callable may refer to any object
             raise UsageError(
                 f"{what}: its callable cannot be sent to workers: {type(error).__name__}: {first_line(error)}; let it make "
                 "what it needs when it is called"
@@ -116,7 +118,7 @@ class PickledCallable:
         return cls(data)
 
     def load(self) -> Callable[..., object]:
-        """The callable. For a worker that allows `AllowedCode.CALLABLES`."""
+        """Unpickle the callable. Only a worker that allows `AllowedCode.CALLABLES` may do so."""
         import cloudpickle
 
         factory: Callable[..., object] = cloudpickle.loads(self.data)
@@ -135,7 +137,8 @@ class PickledCallable:
 def check_arguments(arguments: Mapping[str, Any], of: str, makes: str = "gymnasium.make(ID, {name}={name})") -> None:
     """Raise `UsageError` for a keyword argument that no message can carry.
 
-    `of`: what takes it, for the error. `makes`: how a user-defined function makes it with another argument of this name.
+    `of` names, in the error, what the arguments are for. `makes` is the call that the error suggests for a value of another
+    type: the user puts it in a function of their own.
     """
     for name, value in arguments.items():
         try:
@@ -154,13 +157,13 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The environment: a gymnasium id, the name of a function that returns one, or a factory that the learner pickled."""
 
     id: str
-    """any id that `gymnasium.make` takes: `CartPole-v1`, `ALE/Pong-v5`, `my_package.envs:MyEnv-v0`; or a function or class,
-    `my_package.envs:MyEnv`, that returns an environment
+    """any id that `gymnasium.make` accepts: `CartPole-v1`, `ALE/Pong-v5`, `my_package.envs:MyEnv-v0`; or a function or
+    class, `my_package.envs:MyEnv`, that returns an environment
     """
     kwargs: dict[str, Scalar] = {}
-    """keyword arguments of `gymnasium.make`. In texts, braces around integers, `+ - * // %` and at least one of `number`,
-    `lane`, `copy` and `slot` (`millrace.EnvCopy`) are computed for each copy, as in `{5000 + slot}`. A worker that cannot
-    do so declines
+    """keyword arguments of `gymnasium.make`. A text may contain expressions in braces, such as `{5000 + slot}`, which are
+    computed for each copy: integers, `+ - * // %`, and at least one of `number`, `lane`, `copy` and `slot`
+    (`millrace.EnvCopy`). A worker that cannot compute them declines the run
     """
     factory: PickledCallable | None = None
     """a cloudpickled callable that returns one environment; `id` is then only its name"""
@@ -180,9 +183,9 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ) -> EnvSpec:
         """Make a spec from the user's argument: an id or a name, gymnasium's `EnvSpec`, or a callable that takes `kwargs`.
 
-        `wrappers`: each takes an environment and returns one, or is the name of such a callable. `eval_kwargs`: see the
-        field. Raises `UsageError` for names that can't be found, a callable that is too large to send, and arguments that no
-        message can carry.
+        Each of `wrappers` takes an environment and returns one, or is the name of such a callable. For `eval_kwargs`, see
+        the field. Raises `UsageError` for names that can't be found, a callable that is too large to send, and arguments
+        that no message can carry.
         """
         if isinstance(env, EnvSpec):
             return env
@@ -198,13 +201,13 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return EnvSpec(name, kwargs or {}, pickled, names, eval_kwargs or {})
 
     def for_evaluation(self) -> EnvSpec:
-        """The environment of copies that play evaluations."""
+        """The spec for env copies that play evaluations: `eval_kwargs` are merged into `kwargs`."""
         if not self.eval_kwargs:
             return self
         return msgspec.structs.replace(self, kwargs=self.kwargs | self.eval_kwargs, eval_kwargs={})
 
     def rejection_reason(self, code: AllowedCode) -> str:
-        """Why a worker that allows only this code cannot make it; empty if it can."""
+        """Why a worker that allows only this code cannot make the environment; empty if it can."""
         if self.factory is not None and code is not AllowedCode.CALLABLES:
             return (
                 f"environment {self.id} is a callable, which this worker does not unpickle; it may come over ipc, inproc or "
@@ -223,25 +226,28 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def called_code(self) -> str:
-        """What a worker has to call for the learner, in words: a factory, or a wrapper. Empty for only an id."""
+        """What a worker would have to call for the learner, in words: a factory, or a wrapper. Empty if there is only an
+        id.
+        """
         if self.factory is not None or names_a_function(self.id):
             return FACTORY
         return "a wrapper" if self.wrappers else ""
 
     def kwargs_of_copy(self) -> dict[str, Any]:
-        """The keyword arguments of the copy that is being made. Raises `UsageError`."""
+        """The keyword arguments for the copy that is being made. Raises `UsageError` if an expression can't be computed."""
         return filled(self.kwargs, self.id)
 
     def make(self, render_mode: str | None = None) -> gymnasium.Env[Any, Any]:
-        """Make one env copy, including its wrappers. Raises `UsageError`, with advice, if it or a package cannot be found.
+        """Make one env copy, including its wrappers.
 
-        A PettingZoo environment becomes one with seats. `detail` of the error is the traceback if a constructor raised.
+        A PettingZoo environment becomes one with seats. Raises `UsageError`, with advice, if the environment or a package
+        cannot be found. If a constructor raised, the error's `detail` is the traceback.
         """
         made = self.make_as_given(render_mode)
         return seated(made, self.id) if has_seats(made) else made
 
     def make_as_given(self, render_mode: str | None = None) -> Any:
-        """Like `make`, but a PettingZoo environment stays one."""
+        """Like `make`, but a PettingZoo environment is returned as it is."""
         kwargs = self.kwargs_of_copy() | ({} if render_mode is None else {"render_mode": render_mode})
         if self.factory is not None:
             return made_by_callable(self.id, self.factory.load(), kwargs)
@@ -257,7 +263,7 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return self._made(lambda env_id: gymnasium.make_vec(env_id, copies, own, **kwargs))
 
     def registered(self) -> gymnasium.envs.registration.EnvSpec:
-        """Gymnasium's registry entry of the id. Raises `UsageError`."""
+        """Gymnasium's registry entry for the id. Raises `UsageError` if there is none."""
 
         def look_up(env_id: str) -> gymnasium.envs.registration.EnvSpec:
             module, colon, name = env_id.partition(":")
@@ -268,7 +274,7 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return self._made(look_up)
 
     def _made(self, make: Callable[[str], _Made]) -> _Made:
-        """Call `make` with the id. Raises `UsageError`."""
+        """Call `make` with the id. Turns every exception into a `UsageError` that says why the environment can't be made."""
         registrar = REGISTERING_MODULES.get(self.id.partition("/")[0])
         plain = registrar is None and ":" not in self.id and not names_a_function(self.id)
         failed = load_plugins(self.id) if plain and not is_registered(self.id) else []
@@ -276,17 +282,17 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             return make(f"{registrar}:{self.id}" if registrar and find_spec(registrar) else self.id)
         except UsageError:
             raise
-        except (gymnasium.error.Error, ImportError, TypeError) as error:  # TypeError: keyword arguments it does not take
+        except (gymnasium.error.Error, ImportError, TypeError) as error:  # TypeError: wrong keyword arguments
             raise UsageError(why_not_made(self.id, error, failed, _why_not)) from error
-        except Exception as error:  # its constructor raised any exception
+        except Exception as error:  # the constructor of an environment can raise anything
             line = f"environment {self.id} cannot be made: {type(error).__name__}: {first_line(error)}"
             raise UsageError(line, traceback.format_exc()) from error
 
 
 def _why_not(env_id: str) -> str:
-    """Why a registered environment, which may be the one that was meant, can't be made; empty if it can.
+    """Why a registered environment, which may be the one that the user meant, can't be made; empty if it can.
 
-    Calls no function.
+    Doesn't look into ids with a module, and so calls no function that isn't registered.
     """
     if ":" in env_id:
         return ""
@@ -297,17 +303,16 @@ def _why_not(env_id: str) -> str:
         EnvSpec(env_id).make().close()
     except UsageError as error:
         return str(error)
-    except BaseException as error:  # its `close` may raise anything
+    except BaseException as error:  # the environment's `close` may raise anything
         return f"{type(error).__name__}: {first_line(error)}"
     return ""
 
 
-# -------------------------------------------------------------------------------------------- things that only this process
-# has
+# ------------------------------------------------------------------------------------- things that only this process has
 
 
 class _Factory:
-    """Makes an environment and wraps it."""
+    """A callable that makes an environment and wraps it; it is what gets pickled."""
 
     def __init__(
         self,
@@ -316,9 +321,9 @@ class _Factory:
         wrappers: tuple[WrapperLike, ...],
         specs: tuple[GymnasiumSpec, ...] = (),
     ) -> None:
-        """`env` returns the environment without wrappers; None: `name` is its id.
+        """`env` returns the environment without wrappers. If it is None, `name` is the id of the environment.
 
-        `specs`: specs of ids that a new process may not know, and for which the code may ask gymnasium.
+        `specs` are the specs of ids that a new process may not know, and that the user's code may request from gymnasium.
         """
         self._name = name
         self._env = env
@@ -340,10 +345,12 @@ class _Factory:
 
 
 class _UnpickledLater:
-    """A class or function that is unpickled when it is called, so that a process without calls doesn't need its modules."""
+    """A class or function that is unpickled when it is called, so that a process that never calls it doesn't need its
+    modules.
+    """
 
     def __init__(self, point: Callable[..., object]) -> None:
-        """Raises `UsageError` if it can't be sent."""
+        """Pickle `point`. Raises `UsageError` if it can't be sent."""
         self._point = PickledCallable.of(point, "environment")
 
     def __call__(self, **kwargs: Any) -> Any:
@@ -351,7 +358,7 @@ class _UnpickledLater:
 
 
 def _pickled(name: str, env: Callable[..., object] | None, wrappers: tuple[WrapperLike, ...]) -> PickledCallable:
-    """The factory as it is sent: without specs if they can't be pickled. Raises `UsageError`."""
+    """The factory, pickled, without the specs if those can't be pickled. Raises `UsageError` if it can't be sent."""
     try:
         specs = tuple(_perhaps_needed(spec) for spec in gymnasium.registry.values() if not _is_gymnasiums(spec))
         return PickledCallable.of(_Factory(name, env, wrappers, specs), f"environment {name}")
@@ -360,13 +367,13 @@ def _pickled(name: str, env: Callable[..., object] | None, wrappers: tuple[Wrapp
 
 
 def _perhaps_needed(spec: GymnasiumSpec) -> GymnasiumSpec:
-    """Like `_sent`, without the parts that only its environment needs."""
+    """Like `_sent`, for a spec that may never be used: its class or function is only unpickled when it is called."""
     sent = _sent(spec)
     return dataclasses.replace(sent, entry_point=_UnpickledLater(sent.entry_point)) if callable(sent.entry_point) else sent
 
 
 class _SpecFactory:
-    """Makes the environment of gymnasium's `EnvSpec`, which is not registered where it is made."""
+    """A callable that makes an environment from gymnasium's `EnvSpec`, in a process where this spec is not registered."""
 
     def __init__(self, spec: GymnasiumSpec) -> None:
         self._spec = _sent(spec)
@@ -376,9 +383,10 @@ class _SpecFactory:
 
 
 def _sent(spec: GymnasiumSpec) -> GymnasiumSpec:
-    """The spec in a form that another process can use: it contains a class of this script in place of its name.
+    """The spec in a form that another process can use.
 
-    Classes that gymnasium can import are named, so that only a process that makes this environment needs the module.
+    A class of this script is contained in the spec itself, because its name means nothing elsewhere. A class that gymnasium
+    can import is given by its name, so that only a process that makes this environment needs the module.
     """
     point = spec.entry_point
     name = point if isinstance(point, str) else name_of(point)
@@ -389,14 +397,14 @@ def _sent(spec: GymnasiumSpec) -> GymnasiumSpec:
 
 
 def remembered_name(env: EnvLike | EnvSpec) -> str:
-    """The name under which a run remembers an environment that was passed in Python, and finds it again if possible."""
+    """The name under which a run records an environment that was passed as a Python object, to find it again if possible."""
     return env.id if isinstance(env, EnvSpec) else _named(env)[0]
 
 
 def _given(env: EnvLike) -> tuple[str, Callable[..., object] | None]:
-    """The name of the user's argument, and a callable that makes it if workers can't find it by that name.
+    """The name of the user's argument, and a callable that makes the environment if workers can't find it by that name.
 
-    Raises `UsageError`.
+    Raises `UsageError` if it is only a name, and this process can't find it either.
     """
     name, factory = _named(env)
     if factory is None and not found_by_others(name):
@@ -423,7 +431,7 @@ def _named(env: EnvLike) -> tuple[str, Callable[..., object] | None]:
 
 
 def _registered_here(env_id: str, given: GymnasiumSpec | None = None) -> tuple[str, Callable[..., object] | None]:
-    """The name of an id, and a callable that makes it if it is registered in this process only."""
+    """The name to send for an id, and a callable that makes the environment if it is registered in this process only."""
     module, _, plain = env_id.rpartition(":")
     if module not in ("", MAIN):
         return env_id, None
@@ -438,12 +446,12 @@ def _registered_here(env_id: str, given: GymnasiumSpec | None = None) -> tuple[s
 
 
 def _is_of_everyone(spec: GymnasiumSpec) -> bool:
-    """Whether a new process knows this spec: it comes unchanged from gymnasium, millrace or a plugin."""
+    """Whether a new process knows this spec, because it comes unchanged from gymnasium, millrace or a plugin."""
     known = gymnasium.registry.get(spec.id)
     try:
         if known is None or spec != known:
             return False
-    except ValueError:  # arrays among the keyword arguments
+    except ValueError:  # arrays among the keyword arguments, which can't be compared with !=
         return False
     if _is_gymnasiums(spec) or spec.namespace in REGISTERING_MODULES:
         return True
@@ -451,7 +459,9 @@ def _is_of_everyone(spec: GymnasiumSpec) -> bool:
 
 
 def _is_gymnasiums(spec: GymnasiumSpec) -> bool:
-    """Whether gymnasium itself registers it. Anyone can register its classes under other ids."""
+    """Whether gymnasium itself registers this spec. The id must match too: anyone can register gymnasium's classes under
+    other ids.
+    """
     return spec.id in ids_of_gymnasium() and _module_of(spec).partition(".")[0] == "gymnasium"
 
 

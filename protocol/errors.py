@@ -1,23 +1,24 @@
-"""Every error millrace knows, in two families.
+"""All errors of millrace, in two families.
 
     MillraceError
-    ├── UserFacingError         raised: this side cannot continue; the command line prints its line, exits with `exit_code`
+    ├── UserFacingError         raised: this side cannot continue; the command line prints the line, exits with `exit_code`
     │   ├── UsageError            2   bad flag, unknown environment, unsupported space, folder that exists, …
     │   ├── Refused               2   the learner refused this worker
     │   ├── RunTakenOver          1   another process trains this run now; this one must write nothing more
     │   └── RunError              1   the run cannot continue
     │       ├── CheckpointError   1   a checkpoint is missing, broken or of another format
     │       ├── NoWorkers         1   no worker is left, or none ever joined
-    │       ├── WorkerLost        1   a worker is gone, and so are its env copies, although none may be lost
+    │       ├── WorkerLost        1   a worker is gone with its env copies, in a run that must not lose any
     │       ├── LearnerLost      75   another process of a run with shards is gone; start all of them again
     │       ├── Stalled           1   a deadline passed; the text says what was waited for
-    │       ├── PolicyFailed      1   a policy that the user wrote raised in a worker, hung, or returned something unusable
-    │       └── EnvironmentFailed 1   the environment raised too often; the text carries its traceback
+    │       ├── PolicyFailed      1   a user-defined policy raised in a worker, hung, or returned something unusable
+    │       └── EnvironmentFailed 1   the environment raised too often; `detail` is its traceback
     └── PeerError             counted and answered, never raised into the loop: a peer sent something wrong
         ├── BadMessage            not a valid message: shape, size, type or version
         └── BadRollout            a rollout that breaks the row format
 
-A message is one line: who, what, expected, got, what to do next. `WorkerTraceback` is in neither family: it is a cause.
+The message of an error is one line: who, what, expected, got, what to do next. `WorkerTraceback` is in neither family,
+because it is only the `__cause__` of other errors.
 """
 
 from __future__ import annotations
@@ -55,10 +56,10 @@ def safe_repr(value: object) -> str:
 
 
 def words_an_error(words: Callable[WordedFrom, str]) -> Callable[WordedFrom, str]:
-    """Makes a function that words an error, or advice, return an empty string instead of raising.
+    """Decorates a function that composes an error message or advice, so that it returns an empty string instead of raising.
 
-    It inspects objects of the user or of other packages, which may be anything, and the error itself matters more than
-    advice.
+    Such a function inspects arbitrary objects of the user or of other packages, and must not hide the original error by
+    failing itself.
     """
 
     @wraps(words)
@@ -72,7 +73,7 @@ def words_an_error(words: Callable[WordedFrom, str]) -> Callable[WordedFrom, str
 
 
 def joined(line: str, advice: str) -> str:
-    """A line with advice at its end, if any."""
+    """The line, followed by the advice if that isn't empty."""
     return f"{line}; {advice}" if advice else line
 
 
@@ -95,7 +96,7 @@ class MillraceError(Exception):
 
 
 class UserFacingError(MillraceError):
-    """One side cannot continue: the base of all errors that a user meets.
+    """The learner or a worker cannot continue: the base class of all errors that a user sees.
 
     The command line prints the line and exits with `exit_code`: 2 for a wrong request, 1 for a failure. `detail` is text to
     show below the line, such as a worker's traceback; often empty.
@@ -112,7 +113,7 @@ class UserFacingError(MillraceError):
     """exit code of the command line"""
 
     def __init__(self, line: str, detail: str = "") -> None:
-        """`line` is the whole message: quoted text is escaped, so it stays one line. `detail` is shown below it."""
+        """`line` is the whole message; its control characters are escaped, so that it stays one line. `detail` is shown below."""
         super().__init__(one_line(line))
         self.detail = detail
 
@@ -133,7 +134,7 @@ class UsageError(UserFacingError):
 
 
 def usage_error(error: OSError) -> UsageError | None:
-    """The line for an error of the system that is caused by the user's request; None for any other."""
+    """The `UsageError` for an operating system error that is caused by the user's request; None for any other error."""
     match error.errno:
         case errno.ENAMETOOLONG:
             return UsageError(f"path {one_line(str(error.filename), 500)}: {error.strerror}; choose a shorter one")
@@ -170,10 +171,10 @@ class RunError(UserFacingError):
 
 @contextmanager
 def refusals_of(package: str) -> Iterator[None]:
-    """Errors of another package become a `RunError`: one line with the package and its message.
+    """A context that turns errors of another package into a `RunError`: one line with the package and its message.
 
-    For packages that do a separate job for the user (log elsewhere, write a video, start machines). Errors of torch or numpy
-    are mostly mistakes in millrace, and stay unchanged.
+    Use it for packages that do a separate job for the user, such as logging elsewhere, writing a video or starting machines.
+    Don't use it for torch or numpy, whose errors mostly mean a mistake in millrace.
     """
     try:
         yield
@@ -184,7 +185,7 @@ def refusals_of(package: str) -> Iterator[None]:
 
 
 def _whole_message(error: Exception) -> str:
-    """All lines of its message in one, because the first one may only announce the rest."""
+    """The error's message with all its lines joined into one, because the first line may only introduce the rest."""
     try:
         return one_line(" ".join(str(error).split()), MAX_TEXT) or "no message"
     except Exception:  # its __str__ raised
@@ -209,9 +210,9 @@ class CheckpointError(RunError):
 class NoWorkers(RunError):
     """No worker is left, or none ever joined, for as long as `no_workers_timeout_s`. The line says how to start one.
 
-    If this program started the workers and no others can join, it is raised at once when none of them is left, with the
-    reason of the last one. A training run that had begun has written a checkpoint. A vector environment waits for its own
-    workers for a minute, and for those elsewhere for `timeout`.
+    If this program started the workers and no others can join, the error is raised as soon as none of them is left, and
+    gives the reason why the last one ended. A training run that had begun has written a checkpoint. A vector environment
+    waits a minute for workers that it starts itself, and `timeout` for those that join from elsewhere.
 
     >>> import millrace
     >>> try:
@@ -239,8 +240,8 @@ class LearnerLost(RunError):
 class WorkerLost(RunError):
     """A worker was lost, and its env copies with it: its process ended, or it did not answer in time.
 
-    Only a vector environment with `on_worker_loss="raise"` raises it; after `reset` it continues with new
-    copies. Training and `RolloutService` give the lanes of a lost worker to others.
+    Only a vector environment with `on_worker_loss="raise"` raises this; after `reset`, it continues with new copies.
+    Training and `RolloutService` give the lanes of a lost worker to other workers.
 
     >>> import gymnasium, millrace, os
     >>> class Dies(gymnasium.Wrapper):
@@ -260,8 +261,8 @@ class WorkerLost(RunError):
 class Stalled(RunError):
     """Workers have joined, but sent nothing for ten minutes, or for as long as one call of the environment may take.
 
-    The line says what was awaited: mostly an environment that hangs. `step_timeout_s` ends the worker of such an
-    environment.
+    The line says what the learner was waiting for. The usual cause is an environment that hangs: set `step_timeout_s`, so
+    that the worker of such an environment is ended.
 
     >>> import millrace
     >>> try:
@@ -272,18 +273,20 @@ class Stalled(RunError):
 
 
 class WorkerTraceback(Exception):
-    """The worker's traceback, shown in place of this process's own, which lacks these frames."""
+    """The traceback of an exception in a worker, shown as a cause, because this process's own traceback lacks its frames."""
 
     def __str__(self) -> str:
-        return f'\n"""\n{super().__str__()}\n"""'  # as the standard library shows a traceback of another process
+        return (
+            f'\n"""\n{super().__str__()}\n"""'  # the form that the standard library gives to a traceback of another process
+        )
 
 
 def worker_exception(traceback: str) -> Exception | None:
     """The exception for a traceback that a worker sent; None if it sent none.
 
-    Its cause is the `WorkerTraceback`. Nothing is unpickled or imported for it, and it is shown without control characters.
-    Only a built-in exception is rebuilt, by its name and with its message as the only argument; any other is a
-    `WorkerTraceback`.
+    A built-in exception is rebuilt from its name, with its message as the only argument; its cause is the `WorkerTraceback`.
+    For any other exception, the `WorkerTraceback` itself is returned. Nothing is unpickled or imported, and control
+    characters are escaped.
     """
     if not traceback:
         return None
@@ -298,16 +301,17 @@ def worker_exception(traceback: str) -> Exception | None:
         return text
     try:
         error = kind(message) if colon else kind()
-    except TypeError:  # it takes other arguments, like UnicodeDecodeError
+    except TypeError:  # an exception with other arguments, such as UnicodeDecodeError
         return text
     error.__cause__ = text
     return error
 
 
 class EnvironmentFailed(RunError):
-    """The environment raised; `detail` is the traceback where it happened. In a worker, `lane` is the lane of its copy.
+    """The environment raised too often. `detail` is the worker's traceback; in a worker, `lane` is the lane of the copy.
 
-    Its `__cause__` is the environment's exception if it is a built-in one; otherwise it shows the traceback.
+    `__cause__` is the environment's exception if that is a built-in one; otherwise, it is an exception that shows the
+    traceback.
 
     >>> import millrace
     >>> def broken():
@@ -326,10 +330,10 @@ class EnvironmentFailed(RunError):
 
 
 class PolicyFailed(RunError):
-    """A policy that the user wrote raised in a worker, did not return in time, or returned something unusable.
+    """A user-defined policy raised in a worker, did not return in time, or returned something unusable.
 
-    The line names the worker and the policy. `detail` is the traceback of the worker, if the policy raised, and `__cause__`
-    its exception, as in `EnvironmentFailed`.
+    The line names the worker and the policy. If the policy raised, `detail` is the worker's traceback, and `__cause__` is
+    the exception, as in `EnvironmentFailed`.
 
     >>> import millrace
     >>> class Policy:
@@ -364,13 +368,13 @@ class BadRollout(PeerError):
 
 
 def unexpected_arguments(words: Sequence[str], *, one_run: bool) -> str:
-    """The error of a command that got these words too many. `one_run`: it takes one run, and already has it."""
+    """The error message for a command that got these extra words. `one_run` says that it takes one run, and already has it."""
     if one_run:
         return f"expected one run, got {1 + len(words)}; name one of them"
     return f"unexpected argument {words[0]}"
 
 
 def check_at_least(name: str, value: int, least: int) -> None:
-    """Raise `UsageError` if a number that the user gave is less."""
+    """Raise `UsageError` if a number that the user gave, called `name`, is less than `least`."""
     if value < least:
         raise UsageError(f"{name}: expected int >= {least}, got {value}")

@@ -1,6 +1,6 @@
 """Paths that may begin with `~`, the home folder of this user, or `~NAME`, the home folder of another.
 
-Rule: an unknown home folder, of an unknown user or in a container without one, is an error of one line.
+Rule: if the home folder is unknown, because the user doesn't exist or the container has none, the error is one line.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from millrace.protocol.errors import UsageError
 
 
 def expanded(path: str | Path, what: str) -> Path:
-    """The path without `~`. `what` names it in the error: `UsageError` if the home folder is not known."""
+    """The path with `~` expanded. Raises `UsageError`, in which `what` names the path, if the home folder is not known."""
     try:
         return Path(path).expanduser()
     except RuntimeError as error:

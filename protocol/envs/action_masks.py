@@ -1,7 +1,7 @@
 """Where an environment's action masks are: under the key `action_mask` of a Dict observation, or of `info`.
 
-Rule: in a masked run, the key of an observation is a mask and not a feature. The learner and the workers both use this file,
-which decides only by the spaces.
+Rule: in a masked run, `action_mask` in an observation is a mask and not a feature. The learner and the workers both use this
+file, which looks only at the spaces, so they always agree.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from millrace.protocol.specs import Leaf
 
 
 def has_mask(observation: gymnasium.Space[Any], action: gymnasium.Space[Any]) -> bool:
-    """Whether an observation contains a mask of the allowed actions: at the key, with a bit for each choice."""
+    """Whether an observation contains a mask of the allowed actions: under `action_mask`, with one bit per choice."""
     if not (isinstance(observation, spaces.Dict) and MASK in observation.spaces and len(observation.spaces) > 1):
         return False
     try:
@@ -52,5 +52,5 @@ def without_mask(observation: gymnasium.Space[Any], action: gymnasium.Space[Any]
 def seen_space(
     observation: gymnasium.Space[Any], action: gymnasium.Space[Any], *, masked: bool, critic_keys: Sequence[str]
 ) -> gymnasium.Space[Any]:
-    """The observation space of rows: without the mask in a masked run, and with the critic's keys at its end."""
+    """The observation space of stored rows: in a masked run it has no mask, and the critic's keys come last."""
     return with_last(without_mask(observation, action) if masked else observation, critic_keys)

@@ -1,7 +1,7 @@
 """Reads what `reset` and `step` of an environment return. Anything but gymnasium's form is a `WrongAnswer`.
 
-Rule: None as the info means an empty info. Anything else but a dict means that the environment returned something else,
-perhaps an observation with as many elements, and none of it is used.
+Rule: None as the info means an empty info. If the info is anything else but a dict, the environment returned something other
+than gymnasium's tuple, perhaps an observation with the same number of elements, and none of it is used.
 """
 
 from __future__ import annotations
@@ -15,17 +15,20 @@ from millrace.protocol.bounds import one_line
 
 RESET = "observation, info"
 STEP = "observation, reward, terminated, truncated, info"
-"""What each method returns."""
+"""The values that each method returns."""
 OF_RESET = f"expected ({RESET})"
 OF_STEP = f"expected ({STEP})"
 
 
 class WrongAnswer(Exception):
-    """An environment returned what its interface does not allow. The text is the line of an error, without the copy."""
+    """An environment returned something that its interface does not allow.
+
+    The text is the line for the error message; whoever catches this adds which env copy it was.
+    """
 
 
 def reset_answer(answer: Any) -> tuple[Any, Mapping[str, Any]]:
-    """What `reset` returned: the observation and the info. Raises `WrongAnswer`."""
+    """The observation and the info that `reset` returned. Raises `WrongAnswer` if it returned anything else."""
     if type(answer) is tuple and len(answer) == 2 and type(answer[1]) is dict:  # fast path for nearly all environments
         return answer
     if isinstance(answer, tuple | list) and len(answer) == 2 and (answer[1] is None or isinstance(answer[1], Mapping)):
@@ -34,7 +37,7 @@ def reset_answer(answer: Any) -> tuple[Any, Mapping[str, Any]]:
 
 
 def wrong_step(answer: Any) -> WrongAnswer:
-    """The error if `step` did not return five values with a dict at the end."""
+    """The error for a `step` that did not return five values, the last of them a dict."""
     told = f"its step returned {in_words(answer)}; {OF_STEP}"
     if isinstance(answer, tuple | list) and len(answer) == 4:
         return WrongAnswer(f"{told}, not the old form with `done`: truncated is True if a time limit ends the episode")
@@ -42,7 +45,7 @@ def wrong_step(answer: Any) -> WrongAnswer:
 
 
 def in_words(answer: Any) -> str:
-    """The form of what was returned, in words."""
+    """The types and the number of the values that were returned, in words."""
     match answer:
         case tuple() | list():
             kinds = ", ".join(_kind(each) for each in answer[:6])

@@ -33,16 +33,16 @@ class DescribedEnv:
     observation_space: gymnasium.Space[Any]
     action_space: gymnasium.Space[Any]
     metadata: dict[str, Any] = field(default_factory=dict)
-    """`Env.metadata`, without what is not plain data"""
+    """the entries of `Env.metadata` that are plain data"""
     spec: GymnasiumSpec | None = None
-    """gymnasium's own specification; None if there is none, or JSON cannot hold it"""
+    """gymnasium's own spec; None if there is none, or JSON cannot represent it"""
     max_episode_steps: int | None = None
     """time limit of an episode in env steps; None if there is none"""
     render_mode: str | None = None
     wrappers: frozenset[str] = frozenset()
     """the classes of its wrappers, by `class_name`"""
     seats: tuple[str, ...] = ()
-    """the names of its agents, if it is an environment with seats; its spaces are those of each seat"""
+    """the names of its agents, if it is an environment with seats; the spaces above are then those of each seat"""
     takes_turns: bool = False
     """whether a seat may have to wait for others between two of its actions"""
 
@@ -50,7 +50,7 @@ class DescribedEnv:
 def describe_env(env: gymnasium.Env[Any, Any]) -> EnvDescription:
     """The description of an env copy. Raises `UsageError` if its spaces are not supported or too large to send.
 
-    Rule: `read_description` accepts every result.
+    Rule: `read_description` accepts everything that this returns.
     """
     try:
         observation = describe_space(env.observation_space, "observation space")
@@ -71,17 +71,17 @@ def describe_env(env: gymnasium.Env[Any, Any]) -> EnvDescription:
     )
     try:
         check_size(description)
-        read_description(description)  # if the learner would refuse it, refuse it here, where the environment is known
+        read_description(description)  # what the learner would refuse is refused here, where the environment is known
     except BadMessage as error:
         raise UsageError(str(error)) from error
     return description
 
 
 def read_description(description: EnvDescription) -> DescribedEnv:
-    """The properties that a description gives.
+    """The properties of the environment that a description describes.
 
-    Raises `BadMessage`, and no other error, if it doesn't describe an environment. It must have passed
-    `millrace.protocol.space_spec.check_size`, which decoding calls.
+    The description must have passed `millrace.protocol.space_spec.check_size`, which decoding calls. Raises `BadMessage`,
+    and no other error, if it doesn't describe an environment.
     """
     if description.metadata.nbytes > MAX_METADATA_BYTES or description.metadata.dtype != np.uint8:
         raise BadMessage(f"metadata: expected at most {MAX_METADATA_BYTES} bytes, got {description.metadata.nbytes}")
@@ -116,7 +116,10 @@ def _made_space(spec: SpaceSpec, name: str) -> gymnasium.Space[Any]:
 
 
 def agents_of(env: gymnasium.Env[Any, Any]) -> tuple[tuple[str, ...], bool]:
-    """The names of its agents for a description (none for a gymnasium environment), and whether they take turns."""
+    """The names of the environment's agents (none for a gymnasium environment), and whether they take turns.
+
+    Raises `UsageError` if there are too many agents.
+    """
     if not isinstance(env, SeatedEnv):
         return (), False
     if len(env.seats) > MAX_SEATS:
@@ -130,7 +133,7 @@ def agents_in_words(seats: Sequence[str], takes_turns: bool) -> str:
 
 
 def class_name(kind: type) -> str:
-    """The name of a class of wrappers in a description."""
+    """The name that a wrapper's class has in a description."""
     return one_line(f"{kind.__module__}:{kind.__qualname__}")
 
 
@@ -143,7 +146,7 @@ def _wrappers(env: gymnasium.Env[Any, Any]) -> tuple[str, ...]:
 
 
 def _metadata(metadata: object) -> Array:
-    """The entries that are plain data, packed, [bytes] uint8. Entries that would make it too long are left out."""
+    """The entries that are plain data, packed, [bytes] uint8. Entries that would make the result too long are left out."""
     kept: dict[str, Any] = {}
     packed = plain_values.pack(kept)
     for name, value in metadata.items() if isinstance(metadata, dict) else ():
@@ -162,7 +165,7 @@ def _spec_as_text(spec: GymnasiumSpec | None) -> str:
         text = "" if spec is None else spec.to_json()
         if text:
             GymnasiumSpec.from_json(text)
-    except Exception:  # an entry point or an argument that JSON cannot hold, or a user-defined specification
+    except Exception:  # an entry point or argument that JSON cannot represent, or a user-defined spec
         return ""
     return text if len(text) <= MAX_TEXT else ""
 
@@ -172,7 +175,7 @@ def _spec_from_text(text: str) -> GymnasiumSpec | None:
         return None
     try:
         return GymnasiumSpec.from_json(text)
-    except Exception as error:  # any type: the text may be anything
+    except Exception as error:  # of any type, because the text may be anything
         raise BadMessage(f"spec: expected gymnasium's as JSON: {one_line(first_line(error), 200)}") from error
 
 

@@ -1,7 +1,8 @@
-"""Converts actions between the form that the policy chooses and rollouts store, and the environment's form. Pure.
+"""Converts actions between the form that policies choose and rollouts store and the form that environments expect. Pure.
 
-Rule: the chosen action is stored; for the environment it is shifted by `start`, or scaled, and clipped to the Box.
-A mixed action is stored as a row; the environment gets its Dict or Tuple (`millrace.protocol.action_parts`).
+Rule: the chosen action is stored. What the environment gets is that action shifted by `start`, or, for a Box, scaled if the
+policy asks for it and clipped. A mixed action is stored as a row; the environment gets a Dict or Tuple
+(`millrace.protocol.action_parts`).
 """
 
 from __future__ import annotations
@@ -16,10 +17,10 @@ from millrace.protocol.specs import ActionSpec, PolicySpec
 
 
 def action_converter_of(policy: PolicySpec) -> Callable[[Array], Array]:
-    """A function from the stored actions [..., *action] of this policy to actions of the environment.
+    """Return a function that converts this policy's stored actions [..., *action] to actions for the environment.
 
-    Actions of a Dict or Tuple are an array [...] of objects. Actions in [-1, 1] are scaled to the bounds of the Box, in
-    float64, and then converted like all others.
+    For a Dict or Tuple space it returns an array [...] of objects. If the policy stores scaled actions, they are scaled from
+    [-1, 1] to the bounds of the Box, in float64, before they are converted like all others.
     """
     convert = make_action_converter(policy.action)
     spec = policy.action
@@ -32,9 +33,9 @@ def action_converter_of(policy: PolicySpec) -> Callable[[Array], Array]:
 
 
 def action_leaves_of(policy: PolicySpec) -> Callable[[Array], tuple[Array, ...]]:
-    """A function from the stored actions [..., *action] of this policy to arrays [..., *part] of the environment's numbers.
+    """Return a function that converts this policy's stored actions [..., *action] to the environment's arrays [..., *part].
 
-    There is one array for each part of a Dict or Tuple, in the order of the space, or one array for another space.
+    It returns one array for each part of a Dict or Tuple, in the order of the space; for any other space, one array.
     """
     if policy.action.parts:
         return _make_leaves(policy.action)
@@ -43,7 +44,7 @@ def action_leaves_of(policy: PolicySpec) -> Callable[[Array], tuple[Array, ...]]
 
 
 def _make_leaves(spec: ActionSpec) -> Callable[[Array], tuple[Array, ...]]:
-    """See the public function; for a mixed action."""
+    """`action_leaves_of` for a mixed action."""
     parts = parts_of(spec)
     converters = [make_action_converter(part.spec) for part in parts]
 
@@ -55,7 +56,7 @@ def _make_leaves(spec: ActionSpec) -> Callable[[Array], tuple[Array, ...]]:
 
 
 def _make_structures(spec: ActionSpec) -> Callable[[Array], Array]:
-    """A function from stored actions [..., D] to an array [...] of objects, each the Dict or Tuple of one."""
+    """Return a function that converts stored actions [..., D] to an array [...] of objects: a dict or tuple per action."""
     leaves = _make_leaves(spec)
     nest = make_nest([part.path for part in spec.parts])
 
@@ -71,10 +72,10 @@ def _make_structures(spec: ActionSpec) -> Callable[[Array], Array]:
 
 
 def make_action_converter(spec: ActionSpec) -> Callable[[Array], Array]:
-    """A function from stored actions [..., *action] to actions of the environment: shifted by `start`, or clipped (Box).
+    """Return a function that converts stored actions [..., *action] to actions for the environment.
 
-    A Box action is clipped in the dtype of the space, in which the bounds are exact: the float32 closest to a float64 bound
-    may lie outside.
+    It shifts actions by `start`, or clips them if the space is a Box. It clips in the dtype of the space, in which the
+    bounds are exact: the float32 closest to a float64 bound may lie outside.
     """
     if spec.parts:
         return _make_structures(spec)
@@ -89,9 +90,9 @@ def make_action_converter(spec: ActionSpec) -> Callable[[Array], Array]:
 
 
 def stored_actions_of(policy: PolicySpec) -> Callable[[Sequence[Array]], Array]:
-    """The inverse of `action_leaves_of`: a function from the environment's arrays [..., *part] to stored actions.
+    """The inverse of `action_leaves_of`: return a function that converts arrays [..., *part] to stored actions.
 
-    If the Box is scaled, actions outside of it are clipped to its bounds.
+    If the policy stores scaled actions, those outside the Box are clipped to its bounds.
     """
     spec = policy.action
     if spec.parts:
@@ -101,7 +102,7 @@ def stored_actions_of(policy: PolicySpec) -> Callable[[Sequence[Array]], Array]:
 
 
 def _make_rows(spec: ActionSpec) -> Callable[[Sequence[Array]], Array]:
-    """See the public function; for a mixed action."""
+    """`stored_actions_of` for a mixed action."""
     parts = parts_of(spec)
     converters = [_stored(PolicySpec((), part.spec)) for part in parts]
 
@@ -117,7 +118,7 @@ def _make_rows(spec: ActionSpec) -> Callable[[Sequence[Array]], Array]:
 
 
 def _stored(policy: PolicySpec) -> Callable[[Array], Array]:
-    """A function from the environment's arrays [..., *action] to stored actions, for a space that isn't mixed."""
+    """Return a function that converts the environment's actions [..., *action] to stored actions; not for mixed actions."""
     spec = policy.action
     if spec.kind != "box":
         start = np.reshape(np.asarray(spec.start or 0), spec.shape if spec.start else ())

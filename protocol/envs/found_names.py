@@ -1,7 +1,8 @@
-"""Names of user-defined functions and classes: whether another process finds them, and how a run remembers them.
+"""Names of user-defined functions and classes: whether another process can find them, and how a run records them.
 
 Rule: `module:qualname` can be imported in any process. `__main__:name` is an attribute of the program's own script or
-notebook, and only that program finds it. `<name>` can't be found anywhere: a lambda, a function in a function, an object.
+notebook, and only that program can find it. `<name>` can't be found anywhere: it stands for a lambda, a function that was
+defined in a function, or an object.
 """
 
 from __future__ import annotations
@@ -22,13 +23,13 @@ def name_of(made: object) -> str:
         return f"<{qualname.rpartition('.')[2].strip('<>')}>"
     if module == MAIN:
         spec = getattr(sys.modules[MAIN], "__spec__", None)
-        # `python -m mine`: others import it as mine. A script has no name that others import.
+        # In a program started by `python -m mine`, others import the module as `mine`. They can't import a script.
         return f"{MAIN}:{qualname}" if spec is None or spec.name.endswith(MAIN) else f"{spec.name}:{qualname}"
     return f"{module}:{qualname}" if importable(module) else f"<{qualname}>"
 
 
 def found_by_others(name: str) -> bool:
-    """Whether another process can find what has this name."""
+    """Whether another process can find an object by this name (see `name_of`)."""
     return not name.startswith((f"{MAIN}:", "<"))
 
 
@@ -39,13 +40,13 @@ def in_main(name: str) -> object:
 
 
 def moved(before: str, now: str) -> bool:
-    """Whether `now` may be a new name of `before`: it has a module where it had none, and the rest is the same."""
+    """Whether `now` may be a new name for what was called `before`: the same name, in a module where there was none."""
     without_module = not found_by_others(before) or ":" not in before
     return before == now or (without_module and last_part(before) == last_part(now))
 
 
 def last_part(name: str) -> str:
-    """The name without its module and outer classes: `Clip` of `mine:Outer.Clip(0.5)` and of `<Clip>`."""
+    """The name without its module, outer classes and arguments: `Clip` for `mine:Outer.Clip(0.5)` and for `<Clip>`."""
     name = name.strip("<>").partition("(")[0].rpartition(":")[2]
     return name if "/" in name else name.rpartition(".")[2]
 
@@ -56,7 +57,7 @@ def attribute(module: object, qualname: str) -> object:
     for part in qualname.split("."):
         try:
             value = getattr(value, part, None)
-        except Exception:  # of a module that imports its names lazily, such as supersuit, or of a property
+        except Exception:  # raised by a property, or by a module that imports its names lazily, such as supersuit
             return None
     return value
 
@@ -65,5 +66,5 @@ def importable(module: str) -> bool:
     """Whether another process with the same search path could import this module."""
     try:
         return importlib.util.find_spec(module) is not None
-    except Exception:  # this imports its parent package
+    except Exception:  # of any type: `find_spec` imports the parent package
         return False

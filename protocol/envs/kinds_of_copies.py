@@ -1,9 +1,9 @@
 """The kinds of env copies: how the N copies of a lane are stepped (`--vector`).
 
-Rule: a kind is named as `module:name`, and imported when a run asks for it. Built-in kinds are in `KINDS`. Other packages
-install theirs as entry points of the group `millrace.copies`, which are read only for a name that isn't built in. A learner
-also imports a kind, except `loop`, which can do everything: the module of a kind may import a simulator only inside
-functions.
+Rule: the name of a kind stands for an object `module:name`, which is imported when a run asks for the kind. Built-in kinds
+are in `KINDS`. Other packages install theirs as entry points of the group `millrace.copies`, which are read only for a name
+that isn't built in. The learner imports kinds too (all but `loop`, which has every ability), so the module of a kind must
+not import a simulator at its top level.
 """
 
 from __future__ import annotations
@@ -33,22 +33,22 @@ class CopiesKind(NamedTuple):
     """A way to step the env copies of a lane."""
 
     open: Callable[[RunSpec, EnvCopy, Callable[[], None]], Any]
-    """Makes the copies of a lane, as `millrace.workers.copies.env_copies.EnvCopies`. The `EnvCopy` identifies the first
-    copy; the last argument is called between two calls of the environment, and may raise. Raises `UsageError` if the
-    environment doesn't support such copies.
+    """Makes the copies of a lane, and returns them as a `millrace.workers.copies.env_copies.EnvCopies`. The `EnvCopy`
+    identifies the first copy. The last argument is called between every two calls of the environment, and may raise. Raises
+    `UsageError` if the environment doesn't support such copies.
     """
     spaces: Callable[[EnvSpec], tuple[gymnasium.Space[Any], gymnasium.Space[Any]]] | None = None
-    """Observation and action space of one copy: a worker refuses them if the environment itself has others. None: the spaces
-    of the environment. Raises `UsageError`, like `open`.
+    """Returns the observation and action space of one copy; a worker refuses the run if the spaces of the environment itself
+    differ from them. None means that copies have the spaces of the environment. Raises `UsageError`, like `open`.
     """
     has_masks: bool = True
-    """Whether its copies report masks of the allowed actions if the environment does."""
+    """Whether these copies report masks of the allowed actions if the environment does."""
     has_attributes: bool = True
-    """Whether attributes of its copies can be set."""
+    """Whether attributes of these copies can be set."""
 
 
 def copies_kind(name: str) -> CopiesKind:
-    """Import a kind. Raises `UsageError` if it is neither built in nor installed, or can't be imported."""
+    """Import and return a kind. Raises `UsageError` if it is neither built in nor installed, or can't be imported."""
     what = f"vector {name}"
     module, _, qualname = _place(name).partition(":")
     kind = attribute(import_own(module, what), qualname)
@@ -58,15 +58,12 @@ def copies_kind(name: str) -> CopiesKind:
 
 
 def has_masks(name: str) -> bool:
-    """Whether copies of this kind report masks of the allowed actions.
-
-    `loop` can do everything, and isn't imported for this.
-    """
+    """Whether copies of this kind report masks of the allowed actions. `loop` isn't imported for this: it always does."""
     return name == DEFAULT or copies_kind(name).has_masks
 
 
 def has_attributes(name: str) -> bool:
-    """Whether attributes of copies of this kind can be set. `loop` isn't imported for this, either."""
+    """Whether attributes of copies of this kind can be set. `loop` isn't imported for this: its copies' always can."""
     return name == DEFAULT or copies_kind(name).has_attributes
 
 
@@ -76,7 +73,7 @@ def check_kind(name: str) -> None:
 
 
 def _place(name: str) -> str:
-    """Where the kind is, as `module:name`. Raises `UsageError`."""
+    """Where the kind is, as `module:name`. Raises `UsageError` if it is neither built in nor installed."""
     if name in KINDS:
         return KINDS[name]
     from importlib import metadata

@@ -29,7 +29,8 @@ from millrace.protocol.errors import UsageError, first_line, joined, words_an_er
 def names_a_function(env_id: str) -> bool:
     """Whether this names a function or a class: `module:name`, where the name has no version.
 
-    Also `package.module_v1`, as PettingZoo names its environments: modules with a function `parallel_env` or `env`.
+    `package.module_v1` counts as well: PettingZoo's environments are modules with such names, and have a function
+    `parallel_env` or `env`.
     """
     _, colon, name = env_id.partition(":")
     return all(word.isidentifier() for word in name.split(".")) if colon else _names_a_module(env_id)
@@ -41,14 +42,14 @@ def _names_a_module(env_id: str) -> bool:
 
 @words_an_error
 def _newer_or_older(module: str) -> str:
-    """The end of a line: which module of the same package may have been meant; empty if none is similar."""
+    """The end of a line that suggests another version of a module in the same package; empty if no name is similar."""
     package, _, name = module.rpartition(".")
     beside = [each.name for each in pkgutil.iter_modules(getattr(sys.modules.get(package), "__path__", []))]
     return "".join(f"; did you mean {package}.{close}?" for close in difflib.get_close_matches(name, beside, 1, cutoff=0.75))
 
 
 def made_by_id(env_id: str, kwargs: dict[str, Any]) -> Any:
-    """Make the environment of an id, or call the function or class that a name names."""
+    """Make the environment with this id, or call the function or class with this name."""
     module_name, _, name = env_id.partition(":")
     if _names_a_module(env_id):
         module = importlib.import_module(env_id)
@@ -61,9 +62,10 @@ def made_by_id(env_id: str, kwargs: dict[str, Any]) -> Any:
 
 
 def made_without_checker(env: str | GymnasiumSpec, kwargs: dict[str, Any]) -> gymnasium.Env[Any, Any]:
-    """Made without gymnasium's checker: it costs a tenth of a CartPole step, and `rollout_checks.validate` checks rows.
+    """Make an environment without gymnasium's checker, which would add a tenth to the time of a CartPole step.
 
-    Its spec is the registered one, so that a dataset's environment equals the one that gymnasium makes.
+    `rollout_checks.validate` checks rows instead. The spec of the environment is set to the registered one, so that a
+    dataset's environment equals the one that gymnasium makes.
     """
     made = gymnasium.make(env, disable_env_checker=True, **kwargs)
     if (spec := made.spec) is not None:
@@ -73,9 +75,9 @@ def made_without_checker(env: str | GymnasiumSpec, kwargs: dict[str, Any]) -> gy
 
 
 def made_by_callable(name: str, factory: Callable[..., object], kwargs: dict[str, Any]) -> Any:
-    """What a user-defined callable returns: a `gymnasium.Env`, or a PettingZoo environment.
+    """Call a user-defined callable, and return the `gymnasium.Env` or PettingZoo environment that it returns.
 
-    Raises `UsageError` if it returns anything else, or asks for an unknown id.
+    Raises `UsageError` if it returns anything else, or requests an unknown id from gymnasium.
     """
     parameter = takes_copy(factory, kwargs)
     copy = [being_made() or FIRST_COPY] if parameter else []
@@ -120,7 +122,7 @@ def _what_to_return(made: object) -> str:
 def why_not_made(
     env_id: str, error: Exception, failed: Sequence[str] = (), why_not: Callable[[str], str] = lambda env_id: ""
 ) -> str:
-    """One line for an environment that cannot be made. Arguments: see `_why_not_made`."""
+    """One line that says why an environment cannot be made. For the arguments, see `_why_not_made`."""
     says = first_line(error)
     return _why_not_made(env_id, error, failed, why_not) or f"environment {env_id} cannot be made: {says}"
 
@@ -129,13 +131,14 @@ def why_not_made(
 def _why_not_made(env_id: str, error: Exception, failed: Sequence[str], why_not: Callable[[str], str]) -> str:
     """One line for an unknown environment, or one whose package is missing; empty for other errors.
 
-    `failed`: lines about installed packages that could not register their environments. `why_not`: see `what_to_write`.
+    `failed` has lines about installed packages that could not register their environments. For `why_not`, see
+    `what_to_write`.
     """
     if instead := module_of_file(env_id, "MyEnv"):
         return f"environment {env_id}: {instead}"
     module, colon, name = env_id.partition(":")
     while isinstance(error, ModuleNotFoundError) and isinstance(error.__cause__, ModuleNotFoundError):
-        error = error.__cause__  # gymnasium raises its own error, which names the module of the id whatever is missing
+        error = error.__cause__  # gymnasium's own error names the module of the id, whichever module is missing
     says = first_line(error)
     match error:
         case gymnasium.error.NamespaceNotFound() if env_id.startswith("ALE/"):
@@ -144,7 +147,7 @@ def _why_not_made(env_id: str, error: Exception, failed: Sequence[str], why_not:
             return f"environment {env_id}: {says}"
         case ModuleNotFoundError(name=str(missing)) if colon and f"{module}.".startswith(f"{missing}."):
             return f"environment {env_id}: no module named {module}; is it installed, or its folder on PYTHONPATH?"
-        case ModuleNotFoundError(name=missing) if missing == env_id:  # its package is there
+        case ModuleNotFoundError(name=missing) if missing == env_id:  # only the module is missing, not its package
             return f"environment {env_id}: {says}{_newer_or_older(env_id)}"
         case ModuleNotFoundError(name=missing):
             return f"environment {env_id}: a package it needs is missing ({says}); {what_to_install(missing)}"
@@ -155,7 +158,7 @@ def _why_not_made(env_id: str, error: Exception, failed: Sequence[str], why_not:
                 f"environment {env_id} has no vectorized form of its own (gymnasium's vector_entry_point); use --vector loop"
             )
         case gymnasium.error.UnregisteredEnv() if env_id.rpartition(":")[2] in gymnasium.registry:
-            return f"environment {env_id} cannot be made: {says}"  # it is registered, and makes another one that isn't
+            return f"environment {env_id} cannot be made: {says}"  # it is registered, but makes an environment that isn't
         case gymnasium.error.UnregisteredEnv() if ours := preprocessed(env_id):
             return f"environment {env_id} is not registered: write {ours}"
         case gymnasium.error.UnregisteredEnv() if not colon:

@@ -1,12 +1,12 @@
 """Environments with several agents: PettingZoo's parallel and AEC interfaces, as one environment with A seats.
 
 A seat is an agent's place in an env copy, in the order of `possible_agents`. Its agent may act at every step, have the move
-only now and then, leave before the others, or come later.
+only now and then, leave before the others, or join later.
 
-Rule: a row of a seat is the span from one of its actions to its next observation, in which it has the move again or which
-is its last. `SeatStep.complete` marks the step in which that observation comes. Until then the seat waits, and shows the
-observation in which it acted. Rewards belong to the row in which they occur; rewards outside of any row only count in the
-return. An agent whose part has ended is out until the reset, whatever `agents` says.
+Rule: a row of a seat spans the time from one of its actions to its next observation: the one in which it has the move
+again, or its last. `SeatStep.complete` marks the step that returns that observation. Until then the seat waits, and its
+entry repeats the observation in which it acted. Rewards belong to the row in which they occur; rewards outside of any row
+only count in the return. An agent whose part of the episode has ended is out until the reset, even if `agents` lists it.
 """
 
 from __future__ import annotations
@@ -27,27 +27,29 @@ from millrace.protocol.errors import UsageError, safe_repr
 
 SEAT = "seat"
 STATE = "state"
-"""Keys of an observation: the seat's number, with `--seat-id`; the environment's `state()`, with `--critic-keys state`."""
-MAX_AGENT_NAME = MAX_NAME - len("return_")  # characters, so that the name of an agent's return is not cut
+"""Keys of observations: `seat` is the seat's number (with `--seat-id`), `state` is the environment's `state()` (with
+`--critic-keys state`).
+"""
+MAX_AGENT_NAME = MAX_NAME - len("return_")  # characters; leaves room for the prefix of the agent's return
 _NO_INFO: Mapping[str, Any] = {}
 RETURNED_WRONGLY = AttributeError, KeyError, TypeError, ValueError, OverflowError
-"""Exceptions from reading dicts without an agent, or values that aren't dicts or numbers."""
+"""Exceptions raised while reading an environment's results if a dict lacks an agent, or values aren't dicts or numbers."""
 
 
 class SeatStep(NamedTuple):
-    """What one step of a copy means for each of its A seats. The lists are new each time."""
+    """The result of one step of a copy, for each of its A seats. The lists are new at each step."""
 
     observations: list[Any]
-    """the last observation of each seat; a value of the space before its first one"""
+    """the latest observation of each seat; before its first one, an arbitrary value of the space"""
     infos: list[Mapping[str, Any]]
     """infos of the seats that got an observation in this step; empty for the others"""
     reward: list[float]
-    """for complete rows, the sum since the seat acted; 0 for the others"""
+    """for complete rows, the sum of the rewards since the seat acted; 0 for the others"""
     terminated: list[bool]
     truncated: list[bool]
-    """for complete rows, whether the seat's part of the episode ends with it"""
+    """for complete rows, whether the seat's part of the episode ends with the row"""
     complete: list[bool]
-    """whether a row of the seat is complete"""
+    """whether this step completes a row of the seat"""
     acts: list[bool]
     """whether the next step takes the seat's action"""
     outside: list[float]
@@ -55,29 +57,28 @@ class SeatStep(NamedTuple):
 
 
 def side_by_side(copies: Iterable[SeatStep]) -> SeatStep:
-    """The result of a step for the seats of several copies, as one `SeatStep`."""
+    """Concatenate the `SeatStep` of several copies into one for all their seats."""
     return SeatStep(*([seat for of_copy in of_copies for seat in of_copy] for of_copies in zip(*copies, strict=True)))
 
 
 def columns_of(copies: Sequence[int], seats: int) -> Sequence[int]:
-    """The columns of these env copies, each with this many seats side by side."""
+    """The columns of these env copies in the rows of their lane, where each copy has this many adjacent columns."""
     return copies if seats == 1 else [n * seats + seat for n in copies for seat in range(seats)]
 
 
 class SeatedEnv(gymnasium.Env[SeatStep, Sequence[Any]]):
     """One env copy with A seats. `reset` and `step` return a `SeatStep` in place of the observation.
 
-    `step` takes an action for each seat; those of seats that don't act are ignored. It returns 0 as the reward, and
-    `terminated` when no agent is left.
+    `step` takes an action for each seat, and ignores those of seats that don't act. The reward that it returns is 0, and
+    `terminated` is True when no agent is left.
     """
 
     takes_turns: ClassVar[bool]
     """Whether a seat may have to wait for others between two of its actions."""
 
     def __init__(self, env: Any, name: str) -> None:
-        """`env`: a PettingZoo environment, called `name` in errors.
-
-        Raises `UsageError` unless all agents have the same spaces.
+        """Wrap a PettingZoo environment, which errors call `name`. Raises `UsageError` unless all agents have the same
+        spaces.
         """
         self.env = env
         self.metadata = getattr(env, "metadata", {})
@@ -105,7 +106,9 @@ class SeatedEnv(gymnasium.Env[SeatStep, Sequence[Any]]):
         ]
 
     def _seen(self, seat: int, observation: Any, state: Any = None) -> Any:
-        """A seat's observation, with its number if `seat_id` is set, and the environment's state if its critic gets it."""
+        """A seat's observation, with the seat's number if `seat_id` is used, and with the environment's state if `with_state`
+        is used.
+        """
         if not self._tells_seats and self._state_space is None:
             return observation
         named = dict(observation) if isinstance(observation, dict) else {"observation": observation}
@@ -116,14 +119,14 @@ class SeatedEnv(gymnasium.Env[SeatStep, Sequence[Any]]):
         return named
 
     def _nothing(self) -> SeatStep:
-        """An empty `SeatStep` to fill."""
+        """A `SeatStep` in which nothing has happened yet, to be filled."""
         A = len(self.seats)
         return SeatStep(
             list(self._before), [_NO_INFO] * A, [0.0] * A, [False] * A, [False] * A, [False] * A, [False] * A, [0.0] * A
         )
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[SeatStep, dict[str, Any]]:
-        """Begin an episode."""
+        """Begin an episode. Raises `WrongAnswer` if no agent acts after the reset."""
         step = self._nothing()
         self._gone.clear()
         self._begin(step, {"seed": seed} if options is None else {"seed": seed, "options": options})
@@ -146,7 +149,7 @@ class SeatedEnv(gymnasium.Env[SeatStep, Sequence[Any]]):
                 raise WrongAnswer(f"{what}: expected some of possible_agents, got {unknown[0]}")
 
     def pending(self) -> list[float]:
-        """[A] rewards of seats that wait for the move, which no step has returned yet."""
+        """[A] rewards that seats have earned while they wait for the move, and that no step has returned yet."""
         return [0.0] * len(self.seats)
 
     @abstractmethod
@@ -158,7 +161,7 @@ class SeatedEnv(gymnasium.Env[SeatStep, Sequence[Any]]):
         """Step the environment, and write the result into `step`. Returns whether the episode is over."""
 
     def owner(self, name: str) -> Any:
-        """The outermost of PettingZoo's wrappers that has this attribute itself; the environment if none has."""
+        """The outermost of PettingZoo's wrappers that has this attribute itself; the environment if no wrapper has it."""
         owner = self.env
         while name not in dir(owner) and hasattr(owner, "env"):
             owner = owner.env
@@ -169,12 +172,15 @@ class SeatedEnv(gymnasium.Env[SeatStep, Sequence[Any]]):
         return hasattr(self.owner(name), name) or hasattr(self, name)
 
     def get_wrapper_attr(self, name: str) -> Any:
-        """The attribute of PettingZoo's environment or of one of its wrappers; else of this object."""
+        """The attribute of PettingZoo's environment or of one of its wrappers; if they lack it, of this object."""
         owner = self.owner(name)
         return getattr(owner if hasattr(owner, name) else self, name)
 
     def set_wrapper_attr(self, name: str, value: Any, *, force: bool = True) -> bool:
-        """Set the attribute of PettingZoo's environment or of one of its wrappers; without `force`, only if it exists."""
+        """Set the attribute of PettingZoo's environment or of one of its wrappers; without `force`, only if it exists.
+
+        Returns whether it was set.
+        """
         if there := force or hasattr(self.owner(name), name):
             setattr(self.owner(name), name, value)
         return there
@@ -236,7 +242,7 @@ class ParallelSeats(SeatedEnv):
             told[seat] = info if type(info) is dict else _info(agent, info)
             terminates[seat] = bool(terminated[agent])
             truncates[seat] = bool(truncated[agent])
-            # The last observation of a task that has ended may be missing: nobody learns from it.
+            # If the agent is terminated, its last observation may be missing: nothing is learned from it.
             if not terminates[seat] or observations.get(agent) is not None:
                 seen[seat] = self._seen(seat, observations[agent])
             if terminates[seat] or truncates[seat]:
@@ -271,7 +277,9 @@ class ParallelSeats(SeatedEnv):
 
 
 class TurnSeats(SeatedEnv):
-    """One agent acts at a time (`pettingzoo.AECEnv`): a step is its action, and the departure of agents whose part ended."""
+    """One agent acts at a time (`pettingzoo.AECEnv`). A step is the action of one agent, after which agents whose part of
+    the episode has ended leave.
+    """
 
     takes_turns = True
 
@@ -309,9 +317,9 @@ class TurnSeats(SeatedEnv):
             except RETURNED_WRONGLY:
                 _check_numbers(agent, reward=reward, terminated=terminated, truncated=truncated)
                 raise
-            if observation is not None:  # copied, because the seat keeps it until it has the move again
+            if observation is not None:  # copied, because it is kept until the seat has the move again
                 step.observations[seat] = self._seen(seat, deepcopy(observation))
-            elif not terminated and (self._waits[seat] or not truncated):  # it acts on it, or learns from its value
+            elif not terminated and (self._waits[seat] or not truncated):  # needed to act, or to bootstrap
                 raise WrongAnswer(f"agent {agent}: expected an observation unless it is terminated, got None")
             self._waits[seat] = False
             step.infos[seat] = info if type(info) is dict else _info(agent, info)
@@ -334,14 +342,17 @@ class TurnSeats(SeatedEnv):
         )
 
     def pending(self) -> list[float]:
-        """[A] rewards since their last move of agents without the move, as far as PettingZoo's base class sums them."""
+        """[A] rewards that agents without the move have earned since their last one, as summed by PettingZoo's base class.
+
+        They are 0 if the environment doesn't use that sum.
+        """
         earned = getattr(self.env, "_cumulative_rewards", {})
         waits = set(self.env.agents) - self._gone - {self.env.agent_selection}
         return [float(earned.get(agent, 0.0)) if agent in waits else 0.0 for agent in self.agents]
 
 
 def _info(agent: Any, info: Any) -> Mapping[str, Any]:
-    """The info of an agent; an empty one if there is none."""
+    """The info of an agent; empty if there is none. Raises `WrongAnswer` if it isn't a dict."""
     if info is not None and not isinstance(info, Mapping):
         raise WrongAnswer(f"info of agent {agent}: expected a dict, got {type(info).__name__}")
     return info or _NO_INFO
@@ -363,7 +374,7 @@ def has_seats(made: object) -> bool:
 
 
 def seat_id(env: Any) -> Any:
-    """A wrapper of a PettingZoo environment: observations tell each seat its number, under the key `seat`.
+    """A wrapper for a PettingZoo environment that adds to each observation the number of its seat, under the key `seat`.
 
     It must be the outermost wrapper. Raises `UsageError` for an environment without seats.
     """
@@ -375,9 +386,9 @@ def seat_id(env: Any) -> Any:
 
 
 def with_state(env: Any) -> Any:
-    """A wrapper: observations of a PettingZoo environment contain its `state()`, under the key `state`.
+    """A wrapper for a PettingZoo environment that adds its `state()` to each observation, under the key `state`.
 
-    It must come after all PettingZoo wrappers. Gymnasium environments stay as they are.
+    It must be applied after all PettingZoo wrappers. A gymnasium environment is returned unchanged.
     """
     if has_seats(env):
         env.shows_state = True
@@ -406,7 +417,10 @@ def _state_space(env: Any, name: str) -> gymnasium.Space[Any]:
 
 
 def seated(made: Any, name: str) -> SeatedEnv:
-    """A PettingZoo environment as an environment with seats. Raises `UsageError`."""
+    """A PettingZoo environment as an environment with seats.
+
+    Raises `UsageError` if it has no agents, if two of them have the same name, or if their spaces differ.
+    """
     if not made.possible_agents:
         raise UsageError(
             f"environment {name}: expected at least one agent in its possible_agents, got none; it must list all agents "
@@ -426,7 +440,7 @@ def seated(made: Any, name: str) -> SeatedEnv:
 
 
 def _names(agents: Iterable[Any]) -> tuple[str, ...]:
-    """The names of agents for the learner, metrics and errors."""
+    """The names of the agents, as the learner, metrics and errors show them."""
     return tuple(one_line(str(agent), MAX_AGENT_NAME) for agent in agents)
 
 
@@ -448,7 +462,7 @@ def _parts(space: gymnasium.Space[Any]) -> dict[str, gymnasium.Space[Any]]:
 
 
 def _any_value(space: gymnasium.Space[Any] | None) -> Any:
-    """A value of the space, always the same."""
+    """An arbitrary value of the space; the same one at every call. None if there is no space."""
     match space:
         case None:
             return None

@@ -23,7 +23,7 @@ def generator_states(*given: gymnasium.Space[Any]) -> tuple[str, ...]:
 
 
 def restore_generators(states: Sequence[str], *given: gymnasium.Space[Any]) -> None:
-    """Give new spaces the generators of these states. Raises `BadMessage` unless there is one for each space."""
+    """Give new spaces generators with these states. Raises `BadMessage` unless there is a state for each space, or none."""
     every = [space for outer in given for space in _with_inner(outer)] if states else []
     if len(states) != len(every):
         raise BadMessage(f"generators: expected one for each of {len(every)} spaces, got {len(states)}")
@@ -40,9 +40,9 @@ def _with_inner(space: gymnasium.Space[Any]) -> Iterator[gymnasium.Space[Any]]:
 
 
 def _state(space: gymnasium.Space[Any]) -> str:
-    """As `millrace.protocol.space_spec.GeneratorState`.
+    """The state of this space's generator, as a `millrace.protocol.space_spec.GeneratorState`.
 
-    It isn't read from `space.np_random`, which would seed an unseeded space.
+    It isn't read from `space.np_random`, because that would seed an unseeded space.
     """
     generator: np.random.Generator | None = space._np_random
     if generator is None or not isinstance(generator.bit_generator, np.random.PCG64):

@@ -1,4 +1,4 @@
-"""gymnasium spaces <-> plain records, with exact bounds. Pure.
+"""Converts gymnasium spaces to plain records and back, with exact bounds. Pure.
 
 Rule: `make_space(describe_space(space))` equals `space`, with the same order of keys, the same dtypes and the same bounds
 bit for bit. A record that doesn't describe a space raises `BadMessage`, and nothing else.
@@ -35,12 +35,15 @@ MAX_DIMENSIONS = 8
 
 
 def describe_space(space: gymnasium.Space[Any], name: str = "space") -> SpaceSpec:
-    """The record of a space. Raises `UsageError`, which calls it `name`, for a space that is not supported."""
+    """The record of a space. Raises `UsageError` for a space that is not supported; `name` is the space's name in it."""
     return _describe(space, name, 0)
 
 
 def make_space(spec: SpaceSpec) -> gymnasium.Space[Any]:
-    """The space of a record that passed `space_spec.check_size`. Raises `BadMessage` if there is no such space."""
+    """The space that a record describes. The record must have passed `space_spec.check_size`.
+
+    Raises `BadMessage`, and no other error, if there is no such space.
+    """
     try:
         return _make(spec)
     except BadMessage:
@@ -93,7 +96,7 @@ def _dtype(space: gymnasium.Space[Any]) -> Dtype:
 
 
 def _compact(bound: Array) -> Array:
-    """The bounds as one array without dimensions if all have the same bits."""
+    """The bounds; if they are all the same, bit for bit, one of them as an array without dimensions."""
     flat = np.ascontiguousarray(bound).ravel()
     if flat.size and flat.tobytes() == flat[:1].tobytes() * flat.size:
         return flat[:1].reshape(())
@@ -130,7 +133,7 @@ def _make(spec: SpaceSpec) -> gymnasium.Space[Any]:
 
 
 def _bound(name: str, bound: Array, shape: tuple[int, ...], dtype: Dtype) -> Array:
-    """The bounds in full: [*shape]."""
+    """The bounds in full, [*shape]: the inverse of `_compact`."""
     if bound.dtype != np.dtype(dtype) or bound.shape not in ((), shape):
         raise BadMessage(f"Box space: {name}: expected {dtype}{shape} or one {dtype}, got {bound.dtype}{bound.shape}")
     if bound.dtype.kind == "f" and np.isnan(bound).any():

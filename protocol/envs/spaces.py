@@ -21,7 +21,7 @@ from millrace.protocol.specs import ActionSpec, Leaf
 
 OBSERVATIONS = "Box, Discrete, MultiBinary, MultiDiscrete, and Dict and Tuple of these"
 ACTIONS = "Discrete, MultiDiscrete, MultiBinary and Box (of floats), and Dict and Tuple of these"
-MOST_CHOICES = 2**24  # of a part of a mixed action: float32 can't represent more whole numbers
+MOST_CHOICES = 2**24  # choices of one part of a mixed action: a float32 can't represent larger whole numbers exactly
 STORED_KINDS = "biuf"  # bool, integers, floats: the dtypes that a message can carry
 
 
@@ -31,13 +31,16 @@ def observation_leaves(space: gymnasium.Space[Any]) -> tuple[Leaf, ...]:
 
 
 def leaves_with_own_dtype(space: gymnasium.Space[Any]) -> tuple[Leaf, ...]:
-    """Describe each array of an observation or action, with the dtype of its space. Raises `UsageError`."""
+    """Describe each array of an observation or action, with the dtype of its space.
+
+    Raises `UsageError` for a space that is not supported.
+    """
     leaves = zip(observation_leaves(space), _walk(space, ()), strict=True)
     return tuple(msgspec.structs.replace(leaf, dtype=np.dtype(inner.dtype).name) for leaf, (_, inner) in leaves)
 
 
 def make_unflatten(space: gymnasium.Space[Any]) -> Callable[[Sequence[Any]], Any]:
-    """The inverse of `make_flatten`: a function from leaves, in order, to an observation or an action."""
+    """The inverse of `make_flatten`: return a function that converts leaves, in order, to an observation or an action."""
     paths = [path for path, _ in _walk(space, ())]
     if paths == [()]:
         return lambda leaves: leaves[0]
@@ -55,9 +58,10 @@ def make_unflatten(space: gymnasium.Space[Any]) -> Callable[[Sequence[Any]], Any
 
 
 def make_batched(space: gymnasium.Space[Any]) -> Callable[[Array], Any]:
-    """A function from the actions of N copies, as `action_converter_of` gives them, to what a vector environment takes.
+    """Return a function that converts the actions of N copies to the batch that a vector environment expects.
 
-    Actions of a Dict or Tuple become a Dict or Tuple of arrays [N, *part].
+    Its argument has the form that `action_converter_of` describes. Actions of a Dict or Tuple space become one dict or tuple
+    of arrays [N, *part].
     """
     if not isinstance(space, spaces.Dict | spaces.Tuple):
         return lambda actions: actions
@@ -94,12 +98,14 @@ def _leaf(path: str, space: gymnasium.Space[Any]) -> Leaf:
 
 
 def _has_all_bytes(space: spaces.Box) -> bool:
-    """Whether values are bytes from 0 to 255. With other bounds, such as those of flags, a byte is an ordinary number."""
+    """Whether the values are bytes with bounds 0 and 255, which are taken to be brightnesses. With other bounds, such as
+    those of flags, a byte is an ordinary number.
+    """
     return space.dtype == np.uint8 and bool((space.low == 0).all() and (space.high == 255).all())
 
 
 def with_last(space: gymnasium.Space[Any], keys: Sequence[str]) -> gymnasium.Space[Any]:
-    """A Dict space with these keys at its end; any other space, or none of the keys, as it is."""
+    """A Dict space with these keys moved to its end. Any other space is returned as it is."""
     if not keys or not isinstance(space, spaces.Dict):
         return space
     return spaces.Dict([*((k, v) for k, v in space.spaces.items() if k not in keys), *((k, space.spaces[k]) for k in keys)])
@@ -118,7 +124,7 @@ def action_spec(space: gymnasium.Space[Any]) -> ActionSpec:
 
 
 def _has_nothing(space: gymnasium.Space[Any]) -> bool:
-    """Whether it is, or contains, a Dict or Tuple without a space."""
+    """Whether the space is, or contains, an empty Dict or Tuple."""
     match space:
         case spaces.Dict(spaces=inside):
             return not inside or any(map(_has_nothing, inside.values()))
@@ -129,7 +135,7 @@ def _has_nothing(space: gymnasium.Space[Any]) -> bool:
 
 
 def _single_action(space: gymnasium.Space[Any], path: str) -> ActionSpec:
-    """The action of a space that isn't a Dict or Tuple. `path`: its position, if inside one."""
+    """The spec of a space that isn't a Dict or Tuple. `path` is its position in the Dict or Tuple around it, if any."""
     where = f" at {path}" if path else ""
     if space.shape is not None and 0 in space.shape:
         expected = f"expected at least one number to choose, got shape {list(space.shape)}"
@@ -153,7 +159,7 @@ def _ints(array: Array) -> tuple[int, ...]:
 
 
 def make_flatten(space: gymnasium.Space[Any]) -> Callable[[Any], tuple[Any, ...]]:
-    """A function from one observation (or a vector environment's batch of them) to its leaves, in order."""
+    """Return a function that splits one observation (or a vector environment's batch of them) into its leaves, in order."""
     paths = [path for path, _ in _walk(space, ())]
     if paths == [()]:
         return lambda observation: (observation,)

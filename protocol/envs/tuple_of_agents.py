@@ -1,4 +1,4 @@
-"""`millrace:TupleOfAgents`, a wrapper for gymnasium environments of several agents, whose spaces are Tuples.
+"""`millrace:TupleOfAgents`, a wrapper for multi-agent gymnasium environments whose spaces are Tuples.
 
 Rule: element i of the observations, actions and rewards is agent i's, and an episode ends for all agents at once.
 """
@@ -18,18 +18,18 @@ from millrace.protocol.errors import UsageError, safe_repr
 
 
 def agents_in_tuples(observation: gymnasium.Space[Any], action: gymnasium.Space[Any]) -> int:
-    """How many agents these spaces may belong to: the number of elements, if both are Tuples of equal length; else 0."""
+    """The number of agents that these spaces suggest: their number of elements if both are Tuples of equal length, else 0."""
     count = len(_elements(action))
     return count if count == len(_elements(observation)) else 0
 
 
 def _elements(space: gymnasium.Space[Any]) -> tuple[gymnasium.Space[Any], ...]:
-    """The elements of a Tuple; empty for another space."""
+    """The elements of a Tuple; empty for any other space."""
     return space.spaces if isinstance(space, spaces.Tuple) else ()
 
 
 class TupleOfAgents:
-    """The agents of a gymnasium environment that takes and returns tuples with an element for each agent.
+    """Wraps a gymnasium environment that takes and returns tuples with an element for each agent.
 
     Environments such as those of rware, lbforaging and vmas have this form. The wrapper gives them PettingZoo's parallel
     interface, so that each element is trained as an agent: `--wrappers millrace:TupleOfAgents`. Without it, the Tuple is one
@@ -86,13 +86,13 @@ class TupleOfAgents:
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
-        """Begin an episode, with all agents. Returns observations and infos by agent."""
+        """Begin an episode with all agents. Returns two dicts, by agent: the observations, and the infos, which are empty."""
         observations, _ = reset_answer(self.env.reset(seed=seed, options=options))
         self.agents = list(self.possible_agents)
         return self._by_agent("observation", observations), {}
 
     def step(self, actions: dict[str, Any]) -> tuple[dict[str, Any], ...]:
-        """Step with the actions of all agents. Returns observations, rewards, terminated, truncated and infos by agent."""
+        """Step with the actions of all agents. Returns dicts by agent: observations, rewards, terminated, truncated, infos."""
         answer = self.env.step(tuple(actions[agent] for agent in self.possible_agents))
         try:
             observations, rewards, terminated, truncated, info = answer

@@ -1,8 +1,8 @@
 """Environment ids that gymnasium does not know: plugins that register them, and what to write if none does.
 
 Rule: a package is imported for an id only if it declares a plugin, an entry point `gymnasium.envs`. gymnasium 1 no longer
-loads these; each worker does, on its own machine. For other packages the user names the module: `module:Id`. An id is
-suggested only if it could be made.
+loads these; each worker does, on its own machine. For other packages, the user names the module: `module:Id`. An id is
+suggested only if its environment can be made, or could be once a package is installed.
 """
 
 from __future__ import annotations
@@ -40,7 +40,10 @@ class Plugin(NamedTuple):
 
 
 def load_plugins(env_id: str) -> list[str]:
-    """Let installed plugins register their environments until this id is known. Returns a line for each that failed."""
+    """Let installed plugins register their environments, one after the other, until this id is registered.
+
+    Returns one line for each plugin that failed.
+    """
     failed: list[str] = []
     for plugin, namespace in _plugins():
         if is_registered(env_id):
@@ -54,7 +57,7 @@ def load_plugins(env_id: str) -> list[str]:
 
 @contextlib.contextmanager
 def _quietly(module: str, failed: list[str]) -> Iterator[None]:
-    """While it is entered, another package's output is suppressed, and its errors become lines of `failed`."""
+    """A context in which another package's output is suppressed, and its error is appended to `failed` as a line."""
     try:
         with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
             warnings.simplefilter("ignore")
@@ -65,12 +68,12 @@ def _quietly(module: str, failed: list[str]) -> Iterator[None]:
 
 
 def plugin_modules() -> set[str]:
-    """The first parts of the names of the modules whose plugins `load_plugins` calls."""
+    """The top-level modules of the plugins that `load_plugins` calls."""
     return {plugin.entry_point.module.partition(".")[0] for plugin in _plugins()}
 
 
 def registered_by_plugins(env_id: str) -> bool:
-    """Whether a plugin registers this id, which is registered here, possibly by someone else."""
+    """Whether a plugin registers this id. The id is registered in this process, but perhaps by other code."""
     here = gymnasium.registry.pop(env_id)
     try:
         load_plugins(env_id)
@@ -80,7 +83,7 @@ def registered_by_plugins(env_id: str) -> bool:
 
 
 def _plugins() -> Iterator[Plugin]:
-    """The plugins. The namespace is the name of the entry point, or part of the name of its group."""
+    """All installed plugins. The namespace is the name of the entry point, or the part of its group's name after the dot."""
     entry_points = metadata.entry_points()
     for entry_point in (one for group in entry_points.groups for one in entry_points.select(group=group)):
         if (entry_point.group == GROUP or entry_point.group.startswith(f"{GROUP}.")) and _is_whole(entry_point):
@@ -89,7 +92,7 @@ def _plugins() -> Iterator[Plugin]:
 
 
 def _is_whole(entry_point: metadata.EntryPoint) -> bool:
-    """Whether it names a module, as it should."""
+    """Whether the entry point names a module, as it should."""
     try:
         return bool(entry_point.module)
     except AttributeError:
@@ -97,7 +100,7 @@ def _is_whole(entry_point: metadata.EntryPoint) -> bool:
 
 
 def is_registered(env_id: str) -> bool:
-    """Whether gymnasium makes this id: it is registered, or without a version and some version is."""
+    """Whether gymnasium can make this id: it is registered, or it has no version and some version of it is registered."""
     if env_id in gymnasium.registry:
         return True
     try:
@@ -111,7 +114,7 @@ def is_registered(env_id: str) -> bool:
 def ids_of_gymnasium() -> frozenset[str]:
     """The ids that gymnasium itself registers.
 
-    Its registry doesn't distinguish them from others' ids, but its module does.
+    They are read from gymnasium's source code, because its registry doesn't show who registered an id.
     """
     return frozenset(_REGISTERED.findall(Path(gymnasium.envs.__file__).read_text("utf-8")))
 
@@ -120,7 +123,7 @@ def ids_of_gymnasium() -> frozenset[str]:
 def what_to_write(env_id: str, why_not: Callable[[str], str]) -> str:
     """What to write instead of an id that is not registered, as the end of a line.
 
-    `why_not` makes an environment, and returns the line that says why it can't be made, or an empty string.
+    `why_not` tries to make the environment of an id, and returns a line that says why it can't, or an empty string.
     """
     return most_similar(env_id, (), why_not) or (
         f"write module:{env_id} with the module that registers it, as in minigrid:MiniGrid-Empty-5x5-v0; one of a client in "
@@ -129,9 +132,9 @@ def what_to_write(env_id: str, why_not: Callable[[str], str]) -> str:
 
 
 def most_similar(env_id: str, examples: Iterable[str], why_not: Callable[[str], str]) -> str | None:
-    """The end of a line: which registered id, or which of these `examples`, may have been meant; None if none is similar.
+    """The end of a line that suggests the most similar registered id, or one of `examples`; None if none is similar.
 
-    It can be made, or the line says what to install first.
+    Only an id that can be made is suggested, or one that lacks only a package, which the line then says how to install.
     """
     by_name = {one.rpartition(":")[2].lower(): one for one in [*gymnasium.registry, *examples]}
     for close in difflib.get_close_matches(env_id.lower(), by_name, cutoff=0.75):

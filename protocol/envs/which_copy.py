@@ -1,6 +1,7 @@
 """Which env copy is being made, and the arguments and factories that depend on it.
 
-Rule: everything but the slot is the same in every run, on every machine and after a resume, so results may depend on it.
+Rule: results may depend on every field of an `EnvCopy` except its slot, because all the others are the same in every run,
+on every machine and after a resume.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ _OPERATORS: dict[type[ast.operator], Callable[[int, int], int]] = {
 class EnvCopy:
     """One copy of the environment: its numbers in the run, and its slot on its machine.
 
-    A factory with one argument gets it, `millrace.env_copy()` returns it, and texts among the keyword arguments of the
+    A factory with one argument gets it, `millrace.env_copy()` returns it, and strings among the keyword arguments of the
     environment may use its integers, as in `{5000 + slot}`.
 
     >>> import gymnasium, millrace
@@ -39,23 +40,23 @@ class EnvCopy:
     """
 
     number: int = 0
-    """The copy's place among all copies of the run, from 0: `lane` times the copies of a lane, plus `copy`. A copy that
-    plays evaluations counts among `--eval-copies` instead, and a copy that is only described has 0.
+    """The copy's index among all copies of the run, from 0: `lane` times the copies per lane, plus `copy`. For a copy that
+    plays evaluations, its index among the `--eval-copies`; for a copy that is made only to be described, 0.
     """
     lane: int = 0
-    """The lane to which it belongs; 0 for a copy that plays evaluations."""
+    """The lane to which the copy belongs; 0 for a copy that plays evaluations."""
     copy: int = 0
-    """Its place within the lane, from 0; for a copy that plays evaluations its `number`."""
+    """The copy's index within the lane, from 0; for a copy that plays evaluations, its `number`."""
     evaluation: bool = False
-    """Whether it plays evaluations or recordings."""
+    """Whether the copy plays evaluations or recordings."""
     slot: int = 0
-    """The lowest number, from 0, that no other live copy on this machine has: for ports, folders and displays. It may differ
-    after a resume, and is free again when the copy is closed or its process has ended.
+    """The lowest number, from 0, that no other live copy on this machine has; use it for ports, folders and displays. It may
+    be another after a resume, and is free again when the copy is closed or its process has ended.
     """
 
 
 FIRST_COPY = EnvCopy()
-"""The first copy of a run, and the one that is described. Its slot is not taken."""
+"""Stands for the first copy of a run, and for the one that is made to be described. It holds no slot on the machine."""
 
 
 @dataclass
@@ -64,7 +65,7 @@ class Making:
 
     copy: EnvCopy
     asked: bool = False
-    """Whether its environment has asked which copy it is. If not, any other copy would be the same."""
+    """Whether the environment has asked which copy it is. If it hasn't, all copies are made in the same way."""
 
 
 _making: ContextVar[Making | None] = ContextVar("making", default=None)
@@ -72,7 +73,7 @@ _making: ContextVar[Making | None] = ContextVar("making", default=None)
 
 @contextmanager
 def making(copy: EnvCopy) -> Iterator[Making]:
-    """While it is entered, this thread makes this copy."""
+    """A context in which this thread makes this copy, so that `being_made` returns it."""
     under_way = Making(copy)
     token = _making.set(under_way)
     try:
@@ -82,7 +83,7 @@ def making(copy: EnvCopy) -> Iterator[Making]:
 
 
 def being_made() -> EnvCopy | None:
-    """The copy that this thread is making now, if any: its environment asks for it."""
+    """The copy that this thread is making now; None if it is making none. Marks the copy as `asked`."""
     under_way = _making.get()
     if under_way is None:
         return None
@@ -91,10 +92,11 @@ def being_made() -> EnvCopy | None:
 
 
 def filled(kwargs: Mapping[str, Any], env: str) -> dict[str, Any]:
-    """The keyword arguments for the copy that is being made: expressions in braces in texts are evaluated.
+    """The keyword arguments for the copy that is being made, with the expressions in braces evaluated.
 
-    A text that is one expression becomes an integer. Braces around anything but integers, `+ - * // %` and at least one of
-    the names stay as they are. `env` names the environment in the `UsageError` for a division by zero.
+    A string that consists of one expression becomes an integer. An expression contains only integers, `+ - * // %` and at
+    least one of the names; braces around anything else stay as they are. `env` names the environment in the `UsageError` for
+    a division by zero.
     """
 
     def in_braces(match: re.Match[str]) -> str:
@@ -122,7 +124,7 @@ def filled(kwargs: Mapping[str, Any], env: str) -> dict[str, Any]:
 
 
 def _value(node: ast.expr, names: Mapping[str, int]) -> int:
-    """The value of an expression. Raises `LookupError` if it contains anything else."""
+    """The value of an expression. Raises `LookupError` if it contains other names or operators than `filled` allows."""
     match node:
         case ast.Name(name):
             return names[name]
@@ -136,9 +138,8 @@ def _value(node: ast.expr, names: Mapping[str, int]) -> int:
 
 
 def takes_copy(factory: Callable[..., object], kwargs: Mapping[str, Any]) -> str:
-    """The parameter of a factory that gets the copy: its first one, if it is the only one still required.
-
-    Empty if there is none.
+    """The name of the factory's parameter that gets the copy: the first one, if it is required and `kwargs` has all others
+    that are. Empty if there is no such parameter.
     """
     try:
         parameters = list(inspect.signature(factory).parameters.values())

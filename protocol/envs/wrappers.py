@@ -1,7 +1,7 @@
 """Wrappers of an environment by name: `module:Class`, or `module:Class(key=value)` with plain values.
 
-Rule: the arguments are literals of Python (numbers, text, lists, dicts, None), which are read and never evaluated. Names are
-imported where the environment is made, that is in a worker.
+Rule: the arguments are Python literals (numbers, text, lists, dicts, None), which are parsed and never evaluated. Names are
+imported where the environment is made, that is, in a worker.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class NamedWrapper(NamedTuple):
 
 
 def read_wrapper(text: str) -> NamedWrapper:
-    """Read `module:Class` or `module:Class(key=value)`. Raises `UsageError`."""
+    """Parse `module:Class` or `module:Class(key=value)`. Raises `UsageError` for anything else."""
     module, colon, rest = text.partition(":")
     qualname, bracket, _ = rest.partition("(")
     words = [*module.split("."), *qualname.split(".")]
@@ -63,7 +63,7 @@ def read_wrapper(text: str) -> NamedWrapper:
 
 
 def wrapper_name(wrapper: WrapperLike) -> str:
-    """The name of a wrapper, as a run remembers it. Raises `UsageError` for text that isn't a name."""
+    """The name under which a run records a wrapper. Raises `UsageError` for a string that isn't a wrapper's name."""
     if isinstance(wrapper, str):
         if found_by_others(wrapper):
             read_wrapper(wrapper)
@@ -84,12 +84,15 @@ def wrapper_name(wrapper: WrapperLike) -> str:
 
 
 def wrapper_names(wrappers: Sequence[WrapperLike]) -> tuple[str, ...]:
-    """The name of each wrapper, as `wrapper_name`. Raises `UsageError`."""
+    """The `wrapper_name` of each wrapper. Raises `UsageError` if there is none for one of them."""
     return tuple(map(wrapper_name, wrappers))
 
 
 def not_named(wrapper: WrapperLike) -> Wrapper | None:
-    """The wrapper itself, if other processes can't find it by its name; else None. Raises `UsageError`."""
+    """The wrapper itself, if other processes can't find it by its name; else None.
+
+    Raises `UsageError` if only the name was given, and this process can't find the wrapper either.
+    """
     name = wrapper_name(wrapper)
     if found_by_others(name):
         return None
@@ -106,9 +109,10 @@ def not_named(wrapper: WrapperLike) -> Wrapper | None:
 
 
 def wrap(env: Any, wrapper: WrapperLike) -> Any:
-    """The environment in this wrapper: a gymnasium wrapper, or a PettingZoo wrapper for PettingZoo environments.
+    """Put this wrapper around the environment: a gymnasium wrapper, or, for a PettingZoo environment, a PettingZoo wrapper.
 
-    Raises `UsageError`; its `detail` is the traceback if the wrapper itself raised.
+    Raises `UsageError` if it can't be found, fails or returns something else than an environment. If the wrapper itself
+    raised, the error's `detail` is the traceback.
     """
     name = wrapper_name(wrapper)
     if has_seats(env) and name.startswith("gymnasium."):
@@ -137,7 +141,7 @@ def wrap(env: Any, wrapper: WrapperLike) -> Any:
 
 
 def _found(text: str) -> Wrapper:
-    """The wrapper of this name, imported, with its arguments. Raises `UsageError`."""
+    """Import the wrapper with this name, and bind its arguments. Raises `UsageError` if it can't be found."""
     read = read_wrapper(text)
     wrapper = own_callable(f"{read.module}:{read.qualname}", f"wrapper {text}", "gymnasium.wrappers:FlattenObservation")
     return lambda env: wrapper(env, *read.args, **read.kwargs)

@@ -1,7 +1,4 @@
-"""ALE's ids of Atari games, without preprocessing, and millrace's environment of these games, with the usual wrappers.
-
-Pure.
-"""
+"""Advice for ALE's ids of Atari games, which have no preprocessing: millrace's environment has the usual wrappers. Pure."""
 
 from __future__ import annotations
 
@@ -11,7 +8,7 @@ _ALE = re.compile(r"ALE/(\w+)-v5|(\w+)NoFrameskip-v[04]")
 
 
 def preprocessed(env_id: str) -> str:
-    """What to write in place of ALE's id of a game, for the usual wrappers (DeepMind's); empty for any other id."""
+    """What to write in place of ALE's id of a game to get the usual wrappers (DeepMind's); empty for any other id."""
     match = _ALE.fullmatch(env_id)
     return f"millrace/Atari-v0 --env-kwargs game {match[1] or match[2]}" if match else ""
 

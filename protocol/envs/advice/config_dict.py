@@ -1,6 +1,6 @@
-"""Environments whose constructor takes one dict, as RLlib passes it: how to pass it. Pure.
+"""Advice for environments whose constructor takes one dict, the way RLlib passes it. Pure.
 
-Rule: this only inspects the exception of such a constructor, after it was called without the dict.
+Rule: this only inspects the exception that such a constructor raised when it was called without the dict.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What to write in place of the path of a Python file, where a module is imported. Pure."""
+"""What to write if the path of a Python file was given where the name of a module is expected. Pure."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ _FILE = re.compile(r"(?P<folder>.*/)?(?P<module>[^\W\d]\w*)\.py(?::(?P<name>.*))
 
 
 def module_of_file(text: str, example: str) -> str:
-    """What to write instead of `mine.py` or `mine.py:Mine`, as the end of a line; empty if that names no file.
+    """What to write instead of `mine.py` or `mine.py:Mine`, as the end of a line; empty if `text` isn't such a path.
 
-    `example`: a name in the module, if `text` has none.
+    `example` is the name in the module that the line shows if `text` has none.
     """
     found = _FILE.fullmatch(text)
     if found is None:

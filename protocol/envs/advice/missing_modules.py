@@ -1,4 +1,4 @@
-"""What to install for a missing Python module if the package has another name or must not be the newest one. Pure."""
+"""What to install for a missing Python module whose package has another name, or must not be the newest. Pure."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ PACKAGES = {
     "cv2": "opencv-python-headless",
     "gym": "gym==0.26.2 shimmy",
     "mujoco": "'gymnasium[mujoco]'",
-    "pkg_resources": "'setuptools<81'",  # newer ones don't contain it any more
+    "pkg_resources": "'setuptools<81'",  # newer versions no longer contain it
     "pygame": "pygame-ce",
     "skimage": "scikit-image",
     "sklearn": "scikit-learn",
     "yaml": "pyyaml",
 }
-"""By the first part of the name of a module."""
+"""The arguments of `pip install`. The keys are top-level modules."""
 
 
 def what_to_install(module: str | None) -> str:

@@ -1,4 +1,4 @@
-"""Environments of the package gym, which gymnasium has replaced: how to convert them with the package shimmy.
+"""Advice for environments of the package gym, which gymnasium has replaced: the package shimmy converts them.
 
 Rule: gym is not imported here. If another module has imported it, its registry is used.
 """
@@ -19,7 +19,7 @@ INSTALL = "pip install gym==0.26.2 shimmy"
 
 
 def is_of_old_gym(made: object) -> bool:
-    """Whether this is an environment of gym: by its classes, or, if it doesn't use gym, by its methods and spaces."""
+    """Whether this is a gym environment: one of its classes is gym's, or its methods and spaces look like gym's."""
     if any(str(kind.__module__).partition(".")[0] == "gym" for kind in type(made).__mro__):
         return True
     space = attribute(made, "action_space")
@@ -37,7 +37,7 @@ def instead_of_object(made: object) -> str:
 
 @words_an_error
 def instead_of_id(env_id: str) -> str:
-    """What to write instead of an id that is registered in gym; empty if it is not."""
+    """What to write instead of an id that is registered in gym; empty if it isn't registered there."""
     registry = attribute(sys.modules.get("gym"), "envs.registration.registry")
     known = getattr(registry, "env_specs", registry)
     spec = known.get(env_id.rpartition(":")[2]) if isinstance(known, dict) else None
@@ -50,7 +50,7 @@ def instead_of_id(env_id: str) -> str:
 
 
 def _class_of(spec: object) -> object:
-    """The class or function that a specification names; None if it cannot be found. gym 0.9 has a private attribute."""
+    """The class or function that a gym spec names; None if it cannot be found. In gym 0.9 the attribute is private."""
     point = attribute(spec, "entry_point") or attribute(spec, "_entry_point")
     if not isinstance(point, str):
         return point
@@ -69,9 +69,9 @@ def _about_seed(of: object, version: str) -> str:
 
 
 def _version(of: object) -> str:
-    """Which of gym's two interfaces an environment, or its class, has, by shimmy's names.
+    """Which of gym's two interfaces an environment, or its class, has: shimmy calls them V21 and V26.
 
-    V26 if it has no `reset`, such as a function that makes the environment.
+    Returns V26 if `of` has no `reset`, for example because it is a function that makes the environment.
     """
     reset: Any = attribute(of, "reset")
     try:
