@@ -113,7 +113,9 @@ class UserFacingError(MillraceError):
     """exit code of the command line"""
 
     def __init__(self, line: str, detail: str = "") -> None:
-        """`line` is the whole message; its control characters are escaped, so that it stays one line. `detail` is shown below."""
+        """`line` is the whole message; control characters in it are escaped, so that it stays one line. `detail` is shown
+        below it.
+        """
         super().__init__(one_line(line))
         self.detail = detail
 
@@ -276,9 +278,7 @@ class WorkerTraceback(Exception):
     """The traceback of an exception in a worker, shown as a cause, because this process's own traceback lacks its frames."""
 
     def __str__(self) -> str:
-        return (
-            f'\n"""\n{super().__str__()}\n"""'  # the form that the standard library gives to a traceback of another process
-        )
+        return f'\n"""\n{super().__str__()}\n"""'  # as the standard library shows another process's traceback
 
 
 def worker_exception(traceback: str) -> Exception | None:
@@ -368,7 +368,7 @@ class BadRollout(PeerError):
 
 
 def unexpected_arguments(words: Sequence[str], *, one_run: bool) -> str:
-    """The error message for a command that got these extra words. `one_run` says that it takes one run, and already has it."""
+    """The error message for a command that got these extra words. `one_run`: it expects a single run, and already has it."""
     if one_run:
         return f"expected one run, got {1 + len(words)}; name one of them"
     return f"unexpected argument {words[0]}"

@@ -2,12 +2,14 @@
 
 Law: an episode is determined by how it began and by its actions. A copy is seeded once, when it starts. Each later episode
 begins with a reset without a seed, from the environment's random state at that time. So if you seed a new copy like the old
-one, set the random state from before its last reset, reset it and repeat the actions, you get the old copy again, if the
-environment repeats itself. A worker reports with each rollout which episodes began in it (`EpisodeBegin`). The learner
-accumulates the rollouts, and sends the result (`LanePast`) to the worker that continues the lane. The episodes of an
-environment that can save its state are not repeated: the state after the last row is in `LanePast.memory`.
+one, set the random state from before the old copy's last reset, reset it and repeat the actions, you get the old copy again,
+provided that the environment is deterministic. A worker reports with each rollout which episodes began in it
+(`EpisodeBegin`). The learner accumulates the rollouts, and sends the result (`LanePast`) to the worker that continues the
+lane. The episodes of an environment that can save its state are not repeated: the state after the last row is in
+`LanePast.memory`.
 
-The number of a start determines the seed, and rises when a copy starts anew because it failed or could not be continued.
+Each copy counts its starts. The number of a start determines the seed; it rises when a copy is replaced by a new one because
+it failed or could not be continued.
 """
 
 from __future__ import annotations
@@ -25,7 +27,7 @@ MAX_RANDOM_BYTES = 64
 
 RandomState = Annotated[bytes, Meta(max_length=MAX_RANDOM_BYTES)]
 """State of an environment's random generator (`workers/copies/random_state.py`), from which a reset without a seed begins an
-episode. Empty: the episode began with the seed of the copy's start.
+episode. It is empty if the episode began with the seed of the copy's start.
 """
 
 
@@ -37,7 +39,7 @@ class EpisodeBegin(msgspec.Struct, frozen=True, array_like=True):
     start: Natural
     """number of the copy's start"""
     random: RandomState | None
-    """None: the episode cannot be repeated"""
+    """None if the episode cannot be repeated"""
 
 
 class LastEpisode(msgspec.Struct, frozen=True, array_like=True):
@@ -46,13 +48,13 @@ class LastEpisode(msgspec.Struct, frozen=True, array_like=True):
     start: Natural
     """number of the copy's start"""
     random: RandomState | None
-    """None: the episode cannot be repeated, so the copy starts anew, with the next number, unless it is `saved`"""
+    """None if the episode cannot be repeated; unless `saved`, a new copy is then started, with the next start number"""
     first: Natural
-    """its first row in `LanePast.action`"""
+    """index of the episode's first row in `LanePast.action`"""
     over: bool
     """whether the episode before it is over, and the next step begins it"""
     saved: bool = False
-    """whether the state of the copy after the last row is in `LanePast.memory`: nothing is repeated"""
+    """whether `LanePast.memory` has the state of the copy after the last row, so that nothing needs to be repeated"""
 
     @property
     def goes_on(self) -> bool:
@@ -61,17 +63,17 @@ class LastEpisode(msgspec.Struct, frozen=True, array_like=True):
 
     @property
     def is_repeated(self) -> bool:
-        """Whether it is continued by repeating the actions of a running episode."""
+        """Whether the copy is continued by repeating the actions of a running episode."""
         return self.random is not None and not (self.saved or self.over)
 
 
 class AttributesFrom(msgspec.Struct, frozen=True, array_like=True):
-    """Attributes that the env copies had from a row on (`Weights.env_attributes`)."""
+    """Attributes that were set on the env copies, and the row from which on they had them (`Weights.env_attributes`)."""
 
     row: Natural
-    """in `LanePast.action`"""
+    """index of that row in `LanePast.action`"""
     packed: Array
-    """[bytes] uint8"""
+    """[bytes] uint8, as in `Weights.env_attributes`"""
 
 
 class LanePast(msgspec.Struct, frozen=True, array_like=True):
@@ -81,26 +83,26 @@ class LanePast(msgspec.Struct, frozen=True, array_like=True):
     copies: Annotated[tuple[LastEpisode, ...], Meta(max_length=MAX_COPIES)]
     """one for each env copy"""
     action: Array
-    """[K, N · A, *action], as in rollouts: of the rows since the earliest of these episodes began"""
+    """[K, N · A, *action], as in rollouts: the actions of the K rows since the earliest of these episodes began"""
     attributes: tuple[AttributesFrom, ...]
-    """by row; the rows before the first one had none"""
+    """ascending by row; no attributes were set before the first of these rows"""
     obs: tuple[Array, ...]
-    """[N · A, *leaf] for each leaf, then the mask if there are masks: the observations that follow the last row"""
+    """the observations after the last row: one array [N · A, *leaf] for each leaf, then the mask if there are masks"""
     memory: tuple[Array, ...]
     """`Rollout.memory` of the last rollout"""
 
     @classmethod
     def unknown(cls, lane: int, copies: int) -> LanePast:
-        """The past of a lane whose copies were started once and can't be continued."""
+        """The past of a lane whose copies were started once and can't be continued, so that all of them are replaced."""
         nothing = np.zeros(0, np.float32)
         return cls(lane, (LastEpisode(0, None, 0, False),) * copies, nothing, attributes=(), obs=(), memory=())
 
     @property
     def repeated_steps(self) -> int:
-        """Number of env steps that are repeated."""
+        """Number of env steps that must be repeated to continue the lane, summed over its copies."""
         return sum(len(self.action) - last.first for last in self.copies if last.is_repeated)
 
     @property
     def new_episodes(self) -> int:
-        """Number of copies that start anew."""
+        """Number of copies that can't be continued, and are replaced by new ones."""
         return sum(not last.goes_on for last in self.copies)

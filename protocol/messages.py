@@ -1,7 +1,7 @@
 """The messages, as small frozen records. `README.md` says who may send which message, and when.
 
-A session lasts from the `Welcome` of a worker until it leaves or is given up. A message of another session is counted and
-not used. Every field has a bound (`protocol/bounds.py`), which decoding checks.
+A session lasts from a worker's `Welcome` until the worker leaves, or the learner gives up on it. A message of another
+session is counted, but not used. Every field has a bound (`protocol/bounds.py`), which decoding checks.
 """
 
 from __future__ import annotations
@@ -39,10 +39,10 @@ from millrace.protocol.specs import RunSpec, StepSpec, WaitSpec
 
 PROTOCOL_VERSION = 14
 TOLD_TO_STOP = "told to stop"
-"""The reason in the Goodbye of a worker that got a signal. With any other reason it declines what it was asked for."""
+"""The reason in the Goodbye of a worker that got a signal. Any other reason declines what the worker was asked to do."""
 
 
-class Hello(Message, frozen=True, array_like=False):  # a map, as in every version, so that any two can part politely
+class Hello(Message, frozen=True, array_like=False):  # a map in every version, so that any two versions can decode it
     """May I join? Repeated with backoff until it is answered."""
 
     protocol: Natural
@@ -51,16 +51,16 @@ class Hello(Message, frozen=True, array_like=False):  # a map, as in every versi
     host: Line
     pid: Pid
     process_nonce: Natural
-    """drawn at random for each process, for pids repeat in containers; a secret of the worker, its supervisor and learner
-    (rule REAPPEARS)"""
+    """drawn at random for each process, because pids repeat in containers; a secret of the worker, its supervisor and its
+    learner (rule REAPPEARS)"""
     software: Line
     attempt: Natural
     """`process_nonce` + 1 when the process first joins, and one more each time that it starts to join again. A repeated
-    Hello keeps the number. So it also tells which process a Welcome answers (rules HELLO, HELLO_AGAIN)"""
+    Hello keeps the number. So it also shows which process a Welcome answers (rules HELLO, HELLO_AGAIN)"""
     evaluates: bool = False
     """true: the worker only plays evaluations, and gets no lane (rule EVALUATES)"""
     continues: bool = False
-    """true: the worker can continue a lane that another one had, from its past (rule PAST)"""
+    """true: the worker can continue a lane that another worker had, from the lane's past (rule PAST)"""
 
     @property
     def is_first_attempt(self) -> bool:
@@ -69,9 +69,9 @@ class Hello(Message, frozen=True, array_like=False):  # a map, as in every versi
 
 
 class Welcome(Message, frozen=True):
-    """You may join. It says what to do: collect rollouts, step env copies on order, or wait until that is known.
+    """You may join. The message says what to do: collect rollouts, step env copies on order, or wait until that is known.
 
-    A worker that waits is welcomed a second time, in the same session, by the run.
+    A worker that waits gets a second Welcome in the same session, when the run begins.
     """
 
     session: Natural
@@ -87,7 +87,7 @@ class Refuse(Message, frozen=True, array_like=False):  # a map, as Hello is
 
 
 class Rejoin(Message, frozen=True):
-    """I do not know this session, because I restarted or gave you up: say Hello again."""
+    """I do not know this session, because I restarted or gave up on you: say Hello again."""
 
     session: Natural
 
@@ -99,43 +99,45 @@ class Weights(Message, frozen=True):
     parameters: Array
     """[P] the parameters needed to act: float32, or rounded to bfloat16 (which is sent as uint16)"""
     buffers: Array
-    """[B] float32, observation mean and standard deviation if observations are normalized; then ε for action values, or the
-    scale of the noise (deterministic actions); last, for actions in [-1, 1], 1 while they are drawn uniformly, else 0"""
+    """[B] float32: first, the mean and standard deviation of observations, if these are normalized; then ε, if the policy
+    has action values, or the scale of the noise, if its actions are deterministic; last, for actions in [-1, 1], 1 while
+    they are drawn uniformly, else 0"""
     env_attributes: Array | None = None
-    """[bytes] uint8, `plain_values`: attributes by name, which the copies of a lane get before its next
-    rollout under these weights, new copies before their first reset. They keep them until other weights name them. Copies
-    that play evaluations get none (rule ATTRIBUTES)
+    """[bytes] uint8, `plain_values`: values of attributes by name, which are set on the copies of a lane before its next
+    rollout under these weights, and on new copies before their first reset. The copies keep them until other weights name
+    the same attributes. They are not set on copies that play evaluations (rule ATTRIBUTES)
     """
 
 
 def versions_of(version: int, opponents: Iterable[int | None]) -> set[int]:
-    """The versions of the weights that act, and of those opponents that are weights."""
+    """The versions of all weights that are needed: the weights that act, and those opponents that are weights."""
     return {version, *(number for number in opponents if number is not None and number >= 0)}
 
 
 class Permit(msgspec.Struct, frozen=True, array_like=True):
-    """A ticket as it travels: permission for one rollout, on this lane and incarnation."""
+    """A ticket as it is sent: permission for one rollout, on this lane and incarnation."""
 
     ticket: Natural
     lane: Natural
     incarnation: Natural
     sequence: Natural
-    """number of the rollout: they are collected in this order, from 0 in every incarnation"""
+    """number of the rollout: rollouts are collected in this order, from 0 in every incarnation"""
     round: Natural
-    """which update the rollout is for, counted since the run began: it decides the random numbers of the actions"""
+    """which update the rollout is for, counted since the run began; it determines the random numbers of the actions"""
     opponent: Whole | None = None
-    """who plays the other teams in the episodes that begin in it: the version of these weights, or −1 − k for
+    """who plays the other teams in the episodes that begin in this rollout: the version of some weights, or −1 − k for
     `RunSpec.scripted[k]` (rule OPPONENT)"""
     past: LanePast | None = None
-    """with sequence 0: what to continue. None: new episodes begin, as the first ones of the lane do (rule PAST)"""
+    """with sequence 0: the past from which to continue the lane; null: new episodes begin, as they do when a lane first
+    starts (rule PAST)"""
 
     def of_new_episodes(self, copies: int) -> Permit:
-        """The ticket, for a lane of this many copies that begin new episodes after their first ones."""
+        """The same ticket, for a lane whose copies are replaced: each of the new ones begins with an episode of its own."""
         return msgspec.structs.replace(self, past=LanePast.unknown(self.lane, copies))
 
 
 class Received(msgspec.Struct, frozen=True, array_like=True):
-    """The rollouts of this lane and incarnation that the learner has."""
+    """Which rollouts of this lane and incarnation the learner has received."""
 
     lane: Natural
     incarnation: Natural
@@ -159,7 +161,7 @@ class Collect(Message, frozen=True):
 
     @property
     def versions(self) -> set[int]:
-        """The versions of the weights that it names."""
+        """The versions of all weights that this order needs."""
         return versions_of(self.version, [permit.opponent for permit in self.permits])
 
 
@@ -168,7 +170,7 @@ class LaneIncarnation(msgspec.Struct, frozen=True, array_like=True):
 
     lane: Natural
     incarnation: Natural
-    """the lane is closed if its incarnation is this one or a lower one"""
+    """the lane is closed if its incarnation at the worker is this one or a lower one"""
 
 
 class Release(Message, frozen=True):
@@ -179,36 +181,40 @@ class Release(Message, frozen=True):
 
 
 class Heartbeat(Message, frozen=True):
-    """What the worker holds. The learner compares it with its own records and sends again what was lost."""
+    """The weights and tickets that the worker holds. The learner compares them with its own records, and sends again what
+    was lost.
+    """
 
     session: Natural
     replies: Natural
     """number of the last HeartbeatReply received; what the learner sent before that has arrived or is lost
     (rule HEARTBEAT_REPLIES)"""
     versions: Versions
-    """of the weights held, ascending (rule HEARTBEAT_VERSIONS)"""
+    """versions of the weights that the worker holds, ascending (rule HEARTBEAT_VERSIONS)"""
     tickets: Tickets
-    """tickets that are held and not finished: those that wait, and those of the work in progress
+    """tickets that the worker holds and has not finished: those that wait, and those of the work in progress
     (rule HEARTBEAT_TICKETS)"""
     steps: Natural
-    """env steps since the worker started, in all sessions: of rollouts and evaluations, best counted as they are made, and
-    with `StepSpec` those of each copy that a Step steps; a copy that it only resets may count too (rule HEARTBEAT_STEPS)
+    """env steps since the worker started, in all sessions. They include those of rollouts and evaluations, preferably
+    counted as they are made, and, with `StepSpec`, one for each copy that a Step steps; a copy that a Step only resets may
+    count too (rule HEARTBEAT_STEPS)
     """
     stages: Stages
     """seconds spent in each stage since the worker started"""
     resident_bytes: Natural
     """resident memory of the worker's process; 0 if it is not known"""
     late_actions: Natural = 0
-    """how often since the worker started a program that owns its loop chose its own action, because none had arrived"""
+    """how often, since the worker started, a program that runs its own loop has chosen an action itself, because none had
+    arrived in time"""
     note: Line = ""
-    """what the user should know about the environment, if the worker has noticed something; the learner logs it once"""
+    """something about the environment that the worker has noticed and the user should know; the learner logs it once"""
     waits: bool = False
-    """true: the worker knows of no run, because its `Welcome` brought a `WaitSpec`, and no second one has come
+    """true: the worker knows of no run, because its `Welcome` contained a `WaitSpec`, and no second one has arrived
     (rule HEARTBEAT_WAITS)"""
 
 
 class HeartbeatReply(Message, frozen=True):
-    """The learner is alive, and this is what it has received of each of your lanes."""
+    """I am alive, and these are the rollouts of each of your lanes that I have received."""
 
     session: Natural
     number: Natural
@@ -238,32 +244,32 @@ class Failure(Message, frozen=True):
     traceback: Text
     lane: Natural | None
     of_policy: bool = False
-    """true: a policy that the user wrote raised, or returned what no rollout can hold; no environment is to blame"""
+    """true: a user-defined policy raised, or returned what a rollout can't hold; no environment is to blame"""
 
 
 class Describe(Message, frozen=True):
-    """Make one copy of this environment, and say what it is. Answered by `Described`. Sent before there is a run."""
+    """Make one copy of this environment, and describe it. Answered by `Described`. Sent before there is a run."""
 
     session: Natural
     ticket: Natural
     env: EnvSpec
     vector: str = "loop"
-    """the kind of env copies that must have the same spaces as a single copy, which the worker checks"""
+    """the kind of env copies that the run will use; the worker checks that they have the same spaces as a single copy"""
     render_mode: str | None = None
-    """passed to the copy"""
+    """the render mode with which the copy is made"""
 
 
 class Described(Message, frozen=True):
-    """The environment of a `Describe`."""
+    """The description of the environment that a `Describe` named."""
 
     session: Natural
     ticket: Natural
-    """of the order"""
+    """ticket of the `Describe`"""
     description: EnvDescription
 
 
 class Evaluate(Message, frozen=True):
-    """Play one episode for each seed, on copies of their own, under weights of this version. Answered by `Evaluated`.
+    """Play one episode for each seed, each on a copy of its own, under weights of this version. Answered by `Evaluated`.
 
     (rule EVALUATE)
     """
@@ -272,16 +278,16 @@ class Evaluate(Message, frozen=True):
     ticket: Natural
     version: Natural
     seeds: Annotated[tuple[Natural, ...], Meta(min_length=1, max_length=MAX_SEEDS)]
-    """reset seed of each episode; all are stepped together, and those that ended stay in the batch, unused"""
+    """reset seed of each episode; all are stepped together as one batch, in which those that have ended stay, unused"""
     greedy: bool
-    """true: take the most probable actions; false: draw them, from random numbers that follow from the first seed and that
-    no environment with this seed draws (rule GREEDY)"""
+    """true: take the most probable actions; false: draw them, with random numbers that are derived from the first seed and
+    differ from those that an environment with this seed draws (rule GREEDY)"""
     most_steps: Count
-    """an episode that reaches this number of steps without an end is cut"""
+    """an episode that has not ended after this number of steps is cut"""
     send_rows: bool
     """also send every row, as `EpisodeRows`"""
     send_frames: bool
-    """also send what the environment renders, as `EpisodeRows`"""
+    """also send the rendered frames, as `EpisodeRows`"""
     opponents: Annotated[tuple[Whole, ...], Meta(max_length=MAX_SEEDS)] = ()
     """with `RunSpec.teams`: who plays the other teams, as in a `Permit`, one for each seed"""
     teams: Annotated[tuple[Natural, ...], Meta(max_length=MAX_SEEDS)] = ()
@@ -291,19 +297,19 @@ class Evaluate(Message, frozen=True):
 
     @property
     def versions(self) -> set[int]:
-        """The versions of the weights that it names."""
+        """The versions of all weights that this order needs."""
         return versions_of(self.version, self.opponents)
 
 
 class EpisodeRows(Message, frozen=True):
-    """Some consecutive rows of one episode of an `Evaluate`. L is their number. They come before their `Evaluated`."""
+    """L consecutive rows of one episode of an `Evaluate`. They are sent before the `Evaluated`."""
 
     session: Natural
     ticket: Natural
     episode: Natural
-    """index of its seed"""
+    """index of the episode's seed in the `Evaluate`"""
     first_step: Natural
-    """step of the episode at which the first row stands, from 0"""
+    """step of the episode, from 0, to which the first row belongs"""
     obs: tuple[Array, ...]
     """one array [L+1, *leaf] for each leaf of the observation (rule EPISODE_ROWS)"""
     action: Array
@@ -315,7 +321,7 @@ class EpisodeRows(Message, frozen=True):
     truncated: Array
     """[L] bool; also set in the last row of an episode that was cut (rule EPISODE_ROWS)"""
     frames: Array | None = None
-    """[L+1, H, W, 3] uint8, what the environment rendered"""
+    """[L+1, H, W, 3] uint8, the frames that the environment rendered"""
 
 
 class Evaluated(Message, frozen=True):
@@ -326,23 +332,23 @@ class Evaluated(Message, frozen=True):
     episodes: Annotated[tuple[Episode, ...], Meta(max_length=MAX_SEEDS)]
     """one for each seed"""
     cut: Annotated[tuple[bool, ...], Meta(max_length=MAX_SEEDS)]
-    """for each episode whether it was cut at `most_steps`; one that ends at this step was not (rule CUT)"""
+    """for each episode, whether it was cut at `most_steps`; an episode that ended at that step was not cut (rule CUT)"""
 
 
 class Reset(Message, frozen=True):
-    """Start episodes in these copies of the lane. Answered by `Stepped`. A new incarnation starts on new copies."""
+    """Begin episodes in these copies of the lane. Answered by `Stepped`. A new incarnation gets new copies."""
 
     session: Natural
     ticket: Natural
-    """rises with every order; an order is executed once, and answered again if it is repeated"""
+    """rises with every new order; a repeated order is answered again, but not executed again"""
     lane: Natural
     incarnation: Natural
     copies: tuple[Natural, ...]
     """which of the lane's copies, from 0"""
     seeds: tuple[int | None, ...]
-    """one seed for each of `copies`; null: go on with the random numbers that the copy has"""
+    """one seed for each of `copies`; null: reset without a seed, so that the copy's random generator goes on"""
     options: Array
-    """[bytes] uint8, `plain_values`: the options of `Env.reset`, or None; a list has those of each copy (rule OPTIONS)"""
+    """[bytes] uint8, `plain_values`: the options for `Env.reset`, or None; a list has one entry per copy (rule OPTIONS)"""
 
 
 class Step(Message, frozen=True):
@@ -357,7 +363,9 @@ class Step(Message, frozen=True):
 
 
 DESCRIPTION = "<description>"
-"""Name in a `Call` that asks what each copy is. A client that cannot say it answers as for an unknown name."""
+"""Name in a `Call` that requests the description of each copy. A client that cannot describe copies answers as for an
+unknown name.
+"""
 
 
 class Call(Message, frozen=True):
@@ -376,8 +384,8 @@ class Call(Message, frozen=True):
     assign: bool
     """true: set the attribute"""
     given: Array
-    """[bytes] uint8, `plain_values`: a pair of the arguments, a list or a tuple, and the keyword arguments, a
-    dict; with `assign`, a list of one value for each of `copies`
+    """[bytes] uint8, `plain_values`: a pair of the positional arguments (a list or tuple) and the keyword arguments (a
+    dict); with `assign`, a list of one value for each of `copies`
     """
 
 
@@ -399,8 +407,8 @@ class Stepped(Message, frozen=True):
     truncated: Array
     """[N] bool (rule STEPPED_ARRAYS)"""
     infos: Array
-    """[bytes] uint8: a list of pairs of copy and info, each pair a list or a tuple, packed by `plain_values`;
-    empty infos are left out (rule STEPPED_ARRAYS)
+    """[bytes] uint8, `plain_values`: a list of pairs (copy, info), each pair a list or a tuple; empty infos are left out
+    (rule STEPPED_ARRAYS)
     """
 
 
@@ -412,49 +420,49 @@ class Returned(Message, frozen=True):
     lane: Natural
     incarnation: Natural
     results: Array
-    """[bytes] uint8, `plain_values`: a list with one result for each of `copies`, an empty list with `assign`;
-    no bytes if the call raised
+    """[bytes] uint8, `plain_values`: a list with one result for each of `copies`; with `assign`, an empty list; no bytes if
+    the call raised
     """
     error: Line
     """type and message of the exception, in one line, if the call raised; else empty"""
     traceback: Text
-    """where it was raised, as text"""
+    """the traceback of that exception, as text"""
 
 
 class Inquire(Message, frozen=True):
-    """How is the run, or the vector environment? Anybody who may connect may ask, without being a worker."""
+    """How is the run, or the vector environment, doing? Any client that may connect can ask, without being a worker."""
 
 
 class WorkerStatus(msgspec.Struct, frozen=True):
     """A worker as the learner sees it."""
 
     worker: str
-    """its name"""
+    """the worker's name"""
     host: str
     pid: int
     state: str
     """active, spare (it has no lane), evaluating (it does only that), or draining"""
     lanes: tuple[int, ...]
     tickets: int
-    """tickets that were dealt to it and have not come back"""
+    """number of tickets that were dealt to the worker and are not finished"""
     steps: int
     """env steps since the worker started"""
     steps_per_s: float
-    """env steps per second between its last two heartbeats with more steps, until the next one is overdue"""
+    """env steps per second between the last two heartbeats with more steps than before, until the next one is overdue"""
     version: int
-    """version of the newest weights that it is known to hold; -1 before the first"""
+    """version of the newest weights that the worker is known to hold; -1 before the first"""
     silent_s: float
-    """seconds since its last message"""
+    """seconds since the worker's last message"""
     resident_bytes: int
-    """resident memory of its process; 0 if it is not known"""
+    """resident memory of the worker's process; 0 if it is not known"""
     strikes: int
-    """how many of its messages and rollouts could not be used"""
+    """how many of the worker's messages and rollouts could not be used"""
     doing: str = ""
-    """what it does, as its supervisor says; empty if it has none"""
+    """the worker's current activity, as its supervisor reports it; empty without a supervisor"""
     doing_s: float = 0.0
-    """for how many seconds it has done that"""
+    """for how many seconds the worker has been doing that"""
     late_actions: int = 0
-    """actions that came too late for a program that owns its loop, since the worker started"""
+    """actions that arrived too late for a program that runs its own loop, since the worker started"""
 
 
 class Status(Message, frozen=True):
@@ -462,11 +470,12 @@ class Status(Message, frozen=True):
 
     env: str
     progress: RunProgress
-    """how far the run, or the vector environment, is"""
+    """the progress of the run, or of the vector environment"""
     workers: tuple[WorkerStatus, ...]
-    """in the order in which they joined; of very many, the first"""
+    """the workers in the order in which they joined; if there are too many, only the first of them"""
     workers_wanted: int = 0
-    """number of workers with which each lane has its own, and none is spare; 0 while the environment is described"""
+    """the number of workers with which each lane has a worker of its own and no worker is spare; 0 while the environment is
+    being described"""
     workers_left_out: int = 0
     """number of workers that are not in `workers`, because the message would be too long"""
     version: int = -1

@@ -1,7 +1,7 @@
 """Imports the object that a setting names as `module:name`: an algorithm, a callback, a policy, an encoder, a wrapper.
 
-Rule: each error is one line that quotes the setting. If user code raised, its traceback is the detail; a missing package
-needs none.
+Rule: each error is one line that quotes the setting. If user code raised, the error's `detail` is the traceback; an error
+about a missing package needs none.
 """
 
 from __future__ import annotations
@@ -28,7 +28,11 @@ def is_name(text: str) -> bool:
 
 
 def own_callable(name: str, what: str, example: str) -> Callable[..., Any]:
-    """Import `module:name`, a function or class. `what` quotes the setting, as `callback mine:Stop`. Raises `UsageError`."""
+    """Import `module:name`, a function or class.
+
+    Raises `UsageError` if that fails. In it, `what` quotes the setting, for example `callback mine:Stop`, and `example` is a
+    valid name.
+    """
     if not is_name(name):
         raise UsageError(f"{what}: {module_of_file(name, 'NAME') or f'expected module:factory, as in {example}'}")
     module_name, _, qualname = name.partition(":")
@@ -36,7 +40,7 @@ def own_callable(name: str, what: str, example: str) -> Callable[..., Any]:
 
 
 def import_own(module: str, what: str) -> ModuleType:
-    """Import a module. `what`: see `own_callable`. Raises `UsageError`."""
+    """Import a module. Raises `UsageError` if that fails. For `what`, see `own_callable`."""
     try:
         return importlib.import_module(module)
     except ModuleNotFoundError as error:
@@ -49,10 +53,10 @@ def import_own(module: str, what: str) -> ModuleType:
 
 
 def refuse_modules_in(folder: Path, names: Iterable[str]) -> None:
-    """Raise `UsageError` if one of these names, as `module:name`, would be imported from this folder, a run folder.
+    """Raise `UsageError` if one of these names, `module:name`, would be imported from this run folder.
 
-    Such a folder may come from a stranger, and modules that it names are imported; so nothing is imported from the folder
-    itself.
+    A run folder may come from a stranger, and its files name modules that are imported. So a module is never imported from
+    the folder itself.
     """
     inside = folder.resolve()
     entries = [
@@ -76,7 +80,10 @@ def refuse_modules_in(folder: Path, names: Iterable[str]) -> None:
 
 
 def callable_of(module: ModuleType, qualname: str, what: str) -> Callable[..., Any]:
-    """The function or class that a module has under this name. `what`: see `own_callable`. Raises `UsageError`."""
+    """The function or class with this name in a module. Raises `UsageError` if there is none.
+
+    For `what`, see `own_callable`.
+    """
     named = attribute(module, qualname)
     if named is None:
         known = [name for name, value in vars(module).items() if callable(value) and not name.startswith("_")]
@@ -88,7 +95,7 @@ def callable_of(module: ModuleType, qualname: str, what: str) -> Callable[..., A
 
 
 def own_code_failed(what: str, error: BaseException) -> UsageError:
-    """The error for an exception of user code."""
+    """The error for an exception that user code raised; its `detail` is the traceback."""
     return UsageError(f"{what} failed: {_why(error)}", "".join(traceback.format_exception(error)))
 
 

@@ -106,8 +106,8 @@ class SeatedEnv(gymnasium.Env[SeatStep, Sequence[Any]]):
         ]
 
     def _seen(self, seat: int, observation: Any, state: Any = None) -> Any:
-        """A seat's observation, with the seat's number if `seat_id` is used, and with the environment's state if `with_state`
-        is used.
+        """A seat's observation, with the seat's number if the wrapper `seat_id` is used, and with the environment's state if
+        `with_state` is used.
         """
         if not self._tells_seats and self._state_space is None:
             return observation

@@ -18,7 +18,7 @@ from millrace.protocol.errors import UsageError, safe_repr
 
 
 def agents_in_tuples(observation: gymnasium.Space[Any], action: gymnasium.Space[Any]) -> int:
-    """The number of agents that these spaces suggest: their number of elements if both are Tuples of equal length, else 0."""
+    """The number of agents that these spaces suggest: the number of elements if both are Tuples of equal length, else 0."""
     count = len(_elements(action))
     return count if count == len(_elements(observation)) else 0
 
@@ -86,13 +86,13 @@ class TupleOfAgents:
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
-        """Begin an episode with all agents. Returns two dicts, by agent: the observations, and the infos, which are empty."""
+        """Begin an episode with all agents. Returns the observations by agent, and an empty dict of infos."""
         observations, _ = reset_answer(self.env.reset(seed=seed, options=options))
         self.agents = list(self.possible_agents)
         return self._by_agent("observation", observations), {}
 
     def step(self, actions: dict[str, Any]) -> tuple[dict[str, Any], ...]:
-        """Step with the actions of all agents. Returns dicts by agent: observations, rewards, terminated, truncated, infos."""
+        """Step with the actions of all agents. Returns observations, rewards, terminated, truncated and infos, by agent."""
         answer = self.env.step(tuple(actions[agent] for agent in self.possible_agents))
         try:
             observations, rewards, terminated, truncated, info = answer

@@ -1,17 +1,17 @@
 """The handshake: a worker proves that it holds its token's key (CURVE), and the learner looks the key up in its list (ZAP).
 
-A token is never sent. `handshake_failures.py` says why a handshake failed.
+A token is never sent. `handshake_failures.py` finds out why a handshake failed.
 
 Rule: fail closed. A CURVE server without a ZAP handler accepts every client that knows its public key, unless the server
 sets a domain *and* enforces it. We do both, and start the handler before the port is bound. The answer to a request is a
-pure function that cannot raise: it refuses what it does not understand. libzmq asks ZAP only at the handshake; the link
-checks for every message that its key is still allowed.
+pure function that cannot raise: it refuses what it does not understand. libzmq asks ZAP only at the handshake, so the link
+checks with every message that the sender's key is still allowed.
 
 The authenticator has its own thread, because the learner does not serve its sockets during an update or an evaluation, and
-a handshake that is not answered within two seconds fails. Without the thread, a worker that joins or reconnects would wait,
-and would not learn what is wrong. (pyzmq's own authenticator thread ends silently when a callback raises, does not notice
-that files change, and cannot report clients that do not speak CURVE.) If the thread ends, the link ends the run: no worker
-could join any more, and no revocation would be noticed.
+a handshake that is not answered within two seconds fails. Without the thread, a worker that joins or reconnects would have
+to wait, and would not be told what is wrong. (pyzmq's own authenticator thread ends silently when a callback raises, does
+not notice that files change, and cannot report clients that do not speak CURVE.) If the thread ends, the link ends the run,
+because no worker could join any more, and no revocation would be noticed.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ log = logging.getLogger("millrace.authenticator")
 
 DOMAIN = b"millrace"
 ZAP = "inproc://zeromq.zap.01"
-LIST_CHECK_INTERVAL_S = 1.0  # the list of clients is read again if its file has changed
-MAX_BATCH = 100  # requests, or events, handled before the other sockets get their turn
+LIST_CHECK_INTERVAL_S = 1.0  # at most this long after its file has changed, the list of clients is read again
+MAX_BATCH = 100  # requests, or events, that are handled before the other sockets get their turn
 
 Socket = zmq.Socket[bytes]
 
@@ -58,7 +58,7 @@ def connect_with(socket: Socket, token: Token) -> None:
 
 
 def answer(request: Sequence[bytes], keyring: Keyring) -> tuple[list[bytes], str]:
-    """The reply to a ZAP request (RFC 27, without the envelope), and the reason if it is a refusal, else ''."""
+    """The reply to a ZAP request (RFC 27, without the envelope), and the reason if the reply is a refusal, else ''."""
     number = request[1] if len(request) > 1 else b""
     refused = [b"1.0", number, b"400", b"refused", b"", b""]
     if len(request) != 7 or request[0] != b"1.0":
@@ -77,7 +77,7 @@ class AuthenticatorThread(threading.Thread):
     """Answers ZAP requests if there are keys; counts failed handshakes at a learner's tcp port and logs their reasons."""
 
     def __init__(self, socket: Socket, keyring: Keyring | None) -> None:
-        """`socket` must not be bound yet. Raises `UsageError` if the context has a ZAP handler already."""
+        """Start the thread. `socket` must not be bound yet. Raises `UsageError` if its context has a ZAP handler already."""
         super().__init__(name="millrace-authenticator", daemon=True)
         context = socket.context
         self.refused = 0
@@ -105,7 +105,7 @@ class AuthenticatorThread(threading.Thread):
         self.start()
 
     def run(self) -> None:
-        """Answer until `close`. An error with one client does not affect the next."""
+        """Answer requests until `close` is called. An error with one client does not affect the next."""
         try:
             poller = zmq.Poller()
             for one in filter(None, (self._zap, self._events, self._end_receiver)):
@@ -130,12 +130,12 @@ class AuthenticatorThread(threading.Thread):
         finally:
             if self._zap is not None:
                 with suppress(zmq.ZMQError):
-                    self._zap.unbind(ZAP)  # frees the name now; closing alone frees it later
+                    self._zap.unbind(ZAP)  # frees the name immediately; closing alone frees it some time later
                 self._zap.close()
 
     def close(self) -> None:
-        """Stop the thread. The socket's monitor must have been disabled: libzmq blocks while nobody reads its events."""
-        with suppress(zmq.ZMQError):  # closed already, or the thread has ended
+        """Stop the thread. Disable the socket's monitor first: libzmq blocks while nobody reads its events."""
+        with suppress(zmq.ZMQError):  # it is closed already, or the thread has ended
             self._end_sender.send(b"", zmq.NOBLOCK)
         self.join(5.0)
         self._events.close(linger=0)

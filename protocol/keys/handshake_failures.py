@@ -1,8 +1,8 @@
 """Explains failed handshakes, from the events of libzmq's monitor. Pure, except for `peer_host`.
 
-Rule: the learner knows what was wrong with a client. A worker learns from libzmq only whether its key was refused, the
-one problem that a retry cannot solve. It sees every other problem as a connection that was closed, so its log names the
-likely causes, and it tries again.
+Rule: the learner finds out what was wrong with a client. libzmq tells a worker only whether its key was refused, which is
+the one problem that a retry cannot solve. Every other problem looks to the worker like a closed connection, so it logs the
+likely causes, and tries again.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ class ConnectionProblem:
 
     line: str
     final: bool = False
-    """a retry cannot solve it: the learner has refused this key"""
+    """whether a retry is useless, because the learner has refused this key"""
 
 
 def connection_problem(event: int, value: int, address: str, token: Token | None) -> ConnectionProblem:
-    """The likely cause of a failed handshake, for a worker."""
+    """The likely cause of a failed handshake, as the worker logs it. `event` and `value` come from libzmq's monitor."""
     if event == zmq.EVENT_HANDSHAKE_FAILED_AUTH and value == NOT_ALLOWED:
         key = fingerprint(token.client.public) if token else "none"
         advice = (
@@ -61,7 +61,7 @@ def connection_problem(event: int, value: int, address: str, token: Token | None
 
 
 def handshake_failure(event: int, value: int, keys: bool) -> str:
-    """Why a client's handshake failed, for a learner with or without keys."""
+    """Why a client's handshake failed, as the learner logs it. `keys` says whether the learner has keys."""
     match event, value:
         case zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL, zmq.PROTOCOL_ERROR_ZMTP_CRYPTOGRAPHIC:
             return "its token is for another learner: it expects another server key"
@@ -86,8 +86,8 @@ NO_ZEROMQ = "it does not speak ZeroMQ, or left before it had said who it is"
 class PendingHandshakes:
     """Connections whose handshake is not finished. Finds out which client's handshake failed, for the log only.
 
-    libzmq gives a connection's descriptor when it is accepted and when it ends, but not in between. A failure is followed by
-    the end of the same connection. Which handshake succeeded is guessed from the addresses that ZAP approved.
+    libzmq reports a connection's descriptor when the connection is accepted and when it ends, but not in between. A failure
+    is followed by the end of the same connection. Which handshake succeeded is guessed from the addresses that ZAP approved.
     """
 
     def __init__(self, keys: bool, host_of: Callable[[int], str] | None = None) -> None:
@@ -98,13 +98,13 @@ class PendingHandshakes:
         self._approved: deque[str] = deque(maxlen=100)
 
     def add_approved(self, host: str) -> None:
-        """ZAP approved a client at this address: its handshake will succeed."""
+        """Record that ZAP approved a client at this address, so that its handshake will succeed."""
         self._approved.append(host)
 
     def handle_event(self, event: int, value: int) -> tuple[str, str] | None:
-        """Handle an event of the monitor. Returns the host and the reason of a failed handshake, once they are known.
+        """Handle an event of the monitor. Returns the host and the reason of a failed handshake once they are known.
 
-        For a refused key it returns None: the ZAP handler reports that.
+        For a refused key it always returns None, because the ZAP handler reports that.
         """
         match event:
             case zmq.EVENT_ACCEPTED:
@@ -129,7 +129,7 @@ class PendingHandshakes:
 
 
 def peer_host(descriptor: int) -> str:
-    """The address of the peer; empty if the connection has ended. The descriptor still belongs to libzmq afterwards."""
+    """The address of the peer of a connection; empty if it has ended. The descriptor isn't closed: it is libzmq's."""
     try:
         borrowed = socket.socket(fileno=descriptor)
     except OSError:

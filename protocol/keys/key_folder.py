@@ -1,8 +1,8 @@
 """The key folder, which only its owner can enter: the learner's key, the list of clients, and their tokens.
 
-    server.key      the secret half of the learner's key, hexadecimal
-    allowed.toml    the clients that may connect: public halves, names, dates
-    NAME.token      the join token of a client that was made here: secret
+    server.key      the secret half of the learner's key, in hexadecimal
+    allowed.toml    the clients that may connect: the public halves of their keys, their names, and dates
+    NAME.token      the join token of a client whose key was made here; it is secret
 
 Rule: a file is written completely, with mode 0600, under a temporary name and then renamed, so no reader sees a partial
 file or one that others can read. A secret that others can read is not used. If the list cannot be read, no new client can
@@ -33,13 +33,13 @@ OTHERS_MODE = 0o077  # permission bits of group and others
 
 
 def chosen_key_folder(flag: str) -> Path | None:
-    """The key folder from the flag, or else from the environment variable; None if neither is set."""
+    """The key folder that the flag names, or else the environment variable; None if neither is set."""
     named = flag or os.environ.get(FOLDER_VARIABLE, "")
     return expanded(named, "key folder") if named else None
 
 
 class KeyFolder:
-    """A key folder. It is created at the first write."""
+    """A key folder. It is created when something is first written into it."""
 
     def __init__(self, path: Path | None = None) -> None:
         self.path = path or expanded(DEFAULT_FOLDER, "key folder")
@@ -50,11 +50,11 @@ class KeyFolder:
         return self.path / "allowed.toml"
 
     def token_path(self, name: str) -> Path:
-        """Path of the token of the client of this name."""
+        """Path of the token of the client with this name."""
         return self.path / f"{check_name(name)}.token"
 
     def first_token(self, allowed: ClientList) -> Path | None:
-        """The path of the first token of these clients that is in this folder; None if there is none."""
+        """The path of the first token in this folder that belongs to one of these clients; None if there is none."""
         return next((path for path in map(self.token_path, allowed.names()) if path.is_file()), None)
 
     def server(self) -> Key:
@@ -85,7 +85,7 @@ class KeyFolder:
         return self._read_list()
 
     def new(self, name: str, now: datetime) -> Path:
-        """Create a key for a client and allow it. Returns the path of its token."""
+        """Create a key for a client, and allow it to connect. Returns the path of the client's token."""
         server = self.server()
         client = Key.new()
         with self._locked():
@@ -95,7 +95,10 @@ class KeyFolder:
         return self.token_path(name)
 
     def new_for_other_learner(self, name: str, server: bytes) -> tuple[Path, bytes]:
-        """Create a client key for a learner on another machine. Returns its token's path and its public key."""
+        """Create a client's key for a learner on another machine, whose public key is `server`.
+
+        Returns the path of the client's token, and the public half of the client's key.
+        """
         self._ensure_folder()
         client = Key.new()
         try:
@@ -105,7 +108,7 @@ class KeyFolder:
         return self.token_path(name), client.public
 
     def allow(self, name: str, public: bytes, now: datetime) -> None:
-        """Allow a client that created its own key."""
+        """Allow a client that created its own key, of which `public` is the public half, to connect."""
         self._ensure_folder()
         with self._locked():
             _replace(self.list_path, self.allowed().with_client(name, public, now).to_toml())
@@ -128,7 +131,7 @@ class KeyFolder:
         return ClientList.from_toml(text, f"list {self.list_path}")
 
     def _ensure_folder(self) -> None:
-        """Create the folder if there is none. Raises `UsageError` if others can enter it."""
+        """Create the folder if there is none. Raises `UsageError` if it can't be created, or others can enter it."""
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             with suppress(FileExistsError):
@@ -143,7 +146,7 @@ class KeyFolder:
 
     @contextmanager
     def _locked(self) -> Iterator[None]:
-        """Hold the folder's lock, so that two commands at the same time do not lose each other's entry."""
+        """Hold the folder's lock, so that two commands that run at the same time do not lose each other's entry."""
         folder = os.open(self.path, os.O_RDONLY)
         try:
             fcntl.flock(folder, fcntl.LOCK_EX)
@@ -156,13 +159,13 @@ class Keyring:
     """The learner's key and the current list of clients. Two threads read it; `refresh` replaces the list as one object."""
 
     def __init__(self, key: Key, allowed: ClientList, folder: KeyFolder | None = None) -> None:
-        """`folder`: where the list is read again; None: the list never changes."""
+        """`folder` is where the list is read again when it changes; if it is None, the list never changes."""
         self.key = key
         self.allowed = allowed
         self.folder = folder
         self.read_error = ""
-        """Why the list cannot be read now; empty if it can. If not, no client can join; connected clients stay."""
-        self._read_state: tuple[int, ...] = ()  # of the file that was read: `allowed` may be older than the file is now
+        """Why the list cannot be read now; empty if it can. While it can't, no client can join, but connected ones stay."""
+        self._read_state: tuple[int, ...] = ()  # `_file_state` when the list was last read
 
     def refresh(self) -> None:
         """Read the list again if its file has changed. Never raises."""
@@ -184,7 +187,7 @@ class Keyring:
         self.read_error = error_text
 
     def rejection_reason(self, public: bytes) -> str:
-        """Why a handshake with this key is refused; empty if it is not."""
+        """Why a handshake with this public key is refused; empty if it is accepted."""
         return self.allowed.rejection_reason(public) or (
             f"its key cannot be looked up: {self.read_error}" if self.read_error else ""
         )
@@ -201,7 +204,10 @@ class Keyring:
 
 
 def read_secret(path: Path, what: str) -> str:
-    """The text of a file that only its owner can read. A pipe, such as `<(pass show millrace)`, is accepted."""
+    """The text of a file that only its owner can read. A pipe, such as `<(pass show millrace)`, is accepted too.
+
+    Raises `UsageError`, in which `what` names the file, if others can read it or it can't be read.
+    """
     try:
         with path.open("rb") as file:
             mode = os.fstat(file.fileno()).st_mode
@@ -230,7 +236,7 @@ def _create(path: Path, text: str) -> None:
 
 
 def _replace(path: Path, text: str) -> None:
-    """Create a file, or replace it. Raises `UsageError` if it cannot be written; then no temporary file is left."""
+    """Create a file, or replace it. Raises `UsageError` if it cannot be written. No temporary file is left behind."""
     temporary = _write_temporary(path, text)
     try:
         os.replace(temporary, path)
@@ -240,7 +246,7 @@ def _replace(path: Path, text: str) -> None:
 
 
 def _write_temporary(path: Path, text: str) -> Path:
-    """Write the text to disk under a temporary name, with mode 0600 from the start. Returns that path."""
+    """Write the text to disk under a temporary name, with mode 0600 from the start. Returns the path of that file."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}.{os.urandom(4).hex()}")
     try:
         descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)

@@ -1,7 +1,7 @@
 """Keys, join tokens and the list of clients that may connect, as text and as records. Pure: no files, no sockets, no clock.
 
-Rule: damaged text is reported and never used in part. No repr and no error contains a secret half. A key that is not on
-the list, or was revoked, gives no access.
+Rule: damaged text is reported, and no part of it is used. No repr and no error contains the secret half of a key. A key that
+is not on the list, or was revoked, gives no access.
 """
 
 from __future__ import annotations
@@ -67,7 +67,9 @@ class Token:
 
     @staticmethod
     def from_text(text: str, where: str) -> Token:
-        """Parse a token. Raises `UsageError` that names `where` and never repeats the text, because half of it is secret."""
+        """Parse a token. Raises a `UsageError` that names `where` and doesn't quote the text, because half of
+        it is secret.
+        """
         text = text.strip()
         if not text:
             raise UsageError(f"{where} is empty: expected a join token, one line that begins with {TOKEN_PREFIX}")
@@ -97,7 +99,7 @@ def _check(body: bytes) -> bytes:
 
 
 class Client(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """One client: name, public key, and dates."""
+    """One client: its name, its public key, and the dates at which the key was made and revoked."""
 
     name: str
     public: str
@@ -122,7 +124,7 @@ class ClientList:
         return ""
 
     def name_of(self, public: bytes) -> str:
-        """The name of the client with this key, or its fingerprint."""
+        """The name of the client with this key, or the key's fingerprint if there is no such client."""
         client = self._known.get(public)
         return fingerprint(public) if client is None else client.name
 
@@ -132,7 +134,7 @@ class ClientList:
         return {bytes.fromhex(one.public): one for one in sorted(self.clients, key=lambda one: one.revoked is not None)}
 
     def valid(self, name: str) -> Client | None:
-        """The client of this name that may connect, or None."""
+        """The client with this name that may connect; None if there is none."""
         return next((client for client in self.clients if client.name == name and client.revoked is None), None)
 
     def names(self) -> list[str]:
@@ -151,7 +153,7 @@ class ClientList:
         return ClientList((*self.clients, Client(name, public.hex(), made)))
 
     def with_revoked(self, name: str, now: datetime) -> ClientList:
-        """The list with this client revoked. Raises `UsageError` if no client of this name may connect."""
+        """The list with this client revoked. Raises `UsageError` if no client with this name may connect."""
         victim = self.valid(name)
         if victim is None:
             before = any(client.name == name for client in self.clients)
@@ -162,12 +164,12 @@ class ClientList:
         return ClientList(tuple(gone if client is victim else client for client in self.clients))
 
     def to_toml(self) -> str:
-        """The list as TOML, which `from_toml` reads."""
+        """The list as TOML, in the form that `from_toml` parses."""
         return LIST_HEADER + "".join(f"\n{_toml_table(client)}" for client in self.clients)
 
     @staticmethod
     def from_toml(text: str, where: str) -> ClientList:
-        """Parse a list. Raises `UsageError` that names `where`: an invalid list allows nobody."""
+        """Parse a list. Raises a `UsageError` that names `where` if any part is invalid: then nobody may connect."""
         try:
             table: dict[str, Any] = tomllib.loads(text)
             clients = msgspec.convert(table.pop("client", []), tuple[Client, ...])
@@ -194,7 +196,7 @@ def _describe_allowed(allowed: ClientList) -> str:
 
 
 def check_name(name: str, where: str = "") -> str:
-    """Return the name if it is valid. It becomes part of a file name."""
+    """Return the name if it is valid, that is, if it can be part of a file name. Otherwise, raise `UsageError`."""
     if not NAME.fullmatch(name):
         raise UsageError(
             f"{where}name {name[:70]!r}: expected 1 to 64 letters, digits, '.', '_' or '-', beginning with one of the former"
@@ -203,7 +205,7 @@ def check_name(name: str, where: str = "") -> str:
 
 
 def public_key(text: str, where: str) -> bytes:
-    """Parse a public key from hexadecimal digits into 32 bytes. Raises `UsageError`."""
+    """Parse the hexadecimal digits of a public key. Returns its 32 bytes. Raises a `UsageError` that names `where`."""
     try:
         key = bytes.fromhex(text) if text.isascii() and not re.search(r"\s", text) else b""
     except ValueError:

@@ -19,8 +19,8 @@ TOKEN_VARIABLE = "MILLRACE_TOKEN"
 def read_token(flag: str) -> Token | None:
     """The token from the flag's file, or else from the environment variable; None if neither is set.
 
-    The environment variable holds a file name or the token itself. It is removed, so that processes
-    that an environment starts do not inherit it. Raises `UsageError`.
+    The environment variable holds a file name or the token itself. It is removed, so that processes that an environment
+    starts do not inherit it. Raises `UsageError` if the file can't be read or its text isn't a token.
     """
     given = os.environ.pop(TOKEN_VARIABLE, "").strip()
     if flag.startswith("millrace1."):
@@ -33,7 +33,7 @@ def read_token(flag: str) -> Token | None:
         return None
     text = (
         given
-        if given.startswith("millrace") and not os.path.exists(given)  # Path.exists raises for a name that is too long
+        if given.startswith("millrace") and not os.path.exists(given)  # Path.exists raises if a name is too long
         else read_secret(expanded(given, "token"), "token")
     )
     return Token.from_text(text, TOKEN_VARIABLE)

@@ -1,6 +1,6 @@
 """Limits what peers can write to the log: how often a line is repeated, and how much each source may log. Pure.
 
-Rule: a peer can't cause many log lines, unlimited long ones, or growth of these tables.
+Rule: a peer can neither flood the log with many or long lines, nor make the tables in this file grow without limit.
 """
 
 from __future__ import annotations
@@ -17,10 +17,13 @@ class LogRateLimiter:
         """Allow one line for each key in `every_s` seconds, for at most `most` keys in that time."""
         self.every_s = every_s
         self.most = most
-        self._last_lines: dict[str, tuple[float, int]] = {}  # time of the last line, and how many were suppressed since
+        self._last_lines: dict[str, tuple[float, int]] = {}  # per key: time of the last line, lines suppressed since
 
     def due(self, key: str, now: float) -> int | None:
-        """None: do not log this line. Else the number of lines of this key that were suppressed since the last one."""
+        """Ask whether to log a line with this key now.
+
+        Returns None if not; else the number of lines with this key that were suppressed since the last one.
+        """
         last = self._last_lines.get(key)
         if last is not None and now - last[0] < self.every_s:
             self._last_lines[key] = (last[0], last[1] + 1)
@@ -35,7 +38,7 @@ class LogRateLimiter:
 
 @dataclass(frozen=True)
 class Allowance:
-    """How much may be logged: at once, and then in each second."""
+    """How much one source may log: `lines` and `bytes` at once, and then so many per second."""
 
     lines: int
     lines_per_s: float
@@ -44,7 +47,7 @@ class Allowance:
 
 
 class LogBudget:
-    """What one source may still log: its lines and its bytes are limited."""
+    """What one source may still log, in lines and in bytes."""
 
     def __init__(self, allowance: Allowance) -> None:
         self._lines = TokenBucket(allowance.lines, allowance.lines_per_s)

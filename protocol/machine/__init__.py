@@ -1,1 +1,1 @@
-"""The resources that this machine, or the job or container on it, leaves to a process."""
+"""The cores and the memory that a process may use, given the limits of the machine and of its job or container."""

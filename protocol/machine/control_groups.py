@@ -1,9 +1,9 @@
-"""How much memory and CPU the control groups of this process leave it: those of a job (Slurm, systemd) or of a container.
+"""How much memory and CPU time this process may use under its control groups: those of a job (Slurm, systemd) or container.
 
-Rule: a group is also bound by the limits of every group above it, so the least of them counts. The kernel has two versions
-of control groups and may use both at once: version 2 has one tree of groups, version 1 one for each controller.
+Rule: a group is also bound by the limits of every group above it, so the lowest limit counts. The kernel has two versions
+of control groups, and may use both at once: version 2 has one tree of groups, version 1 has one for each controller.
 
-Pure: everything is read below a folder that stands for `/`.
+Pure: the functions read everything below a folder that stands for `/`, so a test can pass another.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
-ALL = ""  # the controller of version 2: its one tree has all of them
+ALL = ""  # stands for all controllers: version 2 has one tree for all of them, and doesn't name them
 
 
 class _Tree(NamedTuple):
@@ -22,7 +22,8 @@ class _Tree(NamedTuple):
 
     controllers: Sequence[str]
     root: PurePosixPath
-    """the group that is at the mount point: a container without a namespace for groups sees only its own part of the tree"""
+    """the group whose folder is the mount point; a container without a cgroup namespace sees only its own part of the tree
+    """
     mount_point: Path
 
 
@@ -30,7 +31,7 @@ class _MemoryFiles(NamedTuple):
     limits: Sequence[str]
     usage: str
     cache: str
-    """the field of memory.stat with the file cache that the kernel gives up first"""
+    """the field of memory.stat that counts the file cache which the kernel reclaims first"""
 
 
 MEMORY_FILES = (
@@ -40,7 +41,7 @@ MEMORY_FILES = (
 
 
 def free_bytes(system: Path) -> int | None:
-    """Bytes that this process can still allocate within the limits of its groups; None if they have none."""
+    """Bytes that this process can still allocate within the limits of its groups; None if they have no limit."""
     found = [_free_bytes(group, files) for group in _groups(system, "memory") for files in MEMORY_FILES]
     return min((free for free in found if free is not None), default=None)
 
@@ -51,7 +52,7 @@ def cpu_quota(system: Path) -> float:
 
 
 def table(path: Path) -> dict[str, int]:
-    """A file whose lines are a name and a number; empty if it cannot be read."""
+    """Parse a file in which each line has a name and a number; empty if it cannot be read."""
     lines = [line.split() for line in _text(path).splitlines()]
     return {line[0]: int(line[1]) for line in lines if len(line) > 1 and line[1].isdecimal()}
 
@@ -69,7 +70,7 @@ def _free_bytes(group: Path, files: _MemoryFiles) -> int | None:
 
 
 def _cpu_quota(group: Path) -> float:
-    """In cores; infinite if the group has none, which is "max" in version 2 and -1 in version 1."""
+    """The group's CPU quota in cores; infinite if it has none, which the kernel writes as "max" (version 2) or -1 (1)."""
     of_version_2 = _text(group / "cpu.max").split()
     of_version_1 = [_text(group / "cpu.cfs_quota_us"), _text(group / "cpu.cfs_period_us")]
     match [_number(text) for text in of_version_2 or of_version_1]:
@@ -79,7 +80,7 @@ def _cpu_quota(group: Path) -> float:
 
 
 def _number(text: str) -> int | None:
-    """A whole number, or None for anything else: a file that is not there, or a word for "no limit"."""
+    """Parse a whole number; None for anything else, such as the text of a missing file, or a word for "no limit"."""
     return int(text) if text.strip().isdecimal() else None
 
 
@@ -95,7 +96,9 @@ def _text(path: Path) -> str:
 
 
 def _groups(system: Path, controller: str) -> Iterator[Path]:
-    """The folders of this process's groups that can limit this, in all trees: its own group and those above it."""
+    """The folders of all groups that can limit what this controller controls: in each tree, this process's group and those
+    above it.
+    """
     paths = _paths(system)
     for tree in _trees(system):
         for name in {controller, ALL} & set(tree.controllers) & set(paths):
@@ -111,10 +114,10 @@ def _below(path: PurePosixPath, root: PurePosixPath) -> PurePosixPath:
 
 
 def _paths(system: Path) -> dict[str, PurePosixPath]:
-    """By controller: the path of this process's group in the tree of that controller."""
+    """For each controller, the path of this process's group in that controller's tree."""
     paths: dict[str, PurePosixPath] = {}
     for line in _text(system / "proc/self/cgroup").splitlines():
-        match line.split(":", 2):  # as 4:cpu,cpuacct:/job_7, and in version 2 as 0::/job_7
+        match line.split(":", 2):  # for example 4:cpu,cpuacct:/job_7, or, in version 2, 0::/job_7
             case [_, controllers, path]:
                 paths |= dict.fromkeys(controllers.split(","), PurePosixPath(path))
     return paths
@@ -122,7 +125,8 @@ def _paths(system: Path) -> dict[str, PurePosixPath]:
 
 def _trees(system: Path) -> Iterator[_Tree]:
     for line in _text(system / "proc/self/mountinfo").splitlines():
-        # as 31 23 0:28 ROOT MOUNT_POINT rw,relatime shared:9 - cgroup2 cgroup2 rw; in version 1, the last names controllers
+        # For example: 31 23 0:28 ROOT MOUNT_POINT rw,relatime shared:9 - cgroup2 cgroup2 rw
+        # In version 1, the last field names the controllers.
         match [mount.split(" ") for mount in line.split(" - ", 1)]:
             case [[_, _, _, root, mount_point, *_], [("cgroup" | "cgroup2") as kind, _, options, *_]]:
                 controllers = [ALL] if kind == "cgroup2" else options.split(",")
@@ -130,5 +134,5 @@ def _trees(system: Path) -> Iterator[_Tree]:
 
 
 def _unescaped(path: str) -> str:
-    r"""A path of mountinfo: a space in it is written \040."""
+    r"""Decode a path in mountinfo, where a space is written as \040."""
     return re.sub(r"\\([0-7]{3})", lambda code: chr(int(code[1], 8)), path)

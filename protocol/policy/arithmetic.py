@@ -1,7 +1,7 @@
-"""The work of a policy: multiply-adds of a forward pass of one row.
+"""The computational cost of a policy: the multiply-adds of a forward pass of one row.
 
 Each weight counts once for each place where it is used. Activations, normalizations and additions cost little in comparison,
-and a backward pass costs twice as much as a forward pass, so this number alone describes the work of a pass.
+and a backward pass costs twice as much as a forward pass, so this number alone describes the cost of a pass.
 """
 
 from __future__ import annotations
@@ -13,7 +13,10 @@ from millrace.protocol.specs import PolicySpec
 
 
 def multiply_adds(spec: PolicySpec) -> int:
-    """Multiply-adds of a pass of one row through all networks of a policy. Makes the encoder, if there is one."""
+    """Multiply-adds of a forward pass of one row through all networks of a policy.
+
+    If the policy has a user-defined encoder, it is constructed in order to count its multiply-adds.
+    """
     total = 0
     places = _places(spec)
     for field in (field for part in parameter_layout(spec) for field in part):
@@ -27,7 +30,7 @@ def multiply_adds(spec: PolicySpec) -> int:
 
 
 def _places(spec: PolicySpec) -> dict[str, int]:
-    """At how many places of its image the weight of a convolution is used."""
+    """The number of places in its input at which each weight of a convolution is used, by the name of the field."""
     places: dict[str, int] = {}
     if not spec.convolves:
         return places

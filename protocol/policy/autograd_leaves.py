@@ -10,7 +10,7 @@ from millrace.protocol.policy.layout import Field, named_views
 
 
 def trainable(values: Tensor, gradient: Tensor | None) -> Tensor:
-    """A leaf of autograd's graph in the memory of `values`, which are changed in place, and of their gradient."""
+    """A leaf of autograd's graph that shares the memory of `values`, and whose gradient is `gradient`."""
     leaf = values.detach().requires_grad_()
     leaf.grad = gradient
     return leaf

@@ -1,16 +1,16 @@
-"""A policy that the user wrote, acting in a worker: made, called and checked here. Imports no torch.
+"""A user-defined policy that acts in a worker: it is made, called and checked here. Imports no torch.
 
-The callable `factory(**kwargs)` returns an object with
+The callable `factory(**kwargs)` returns an object with two methods, of which the second acts for N env copies:
 
     load(arrays)             {name: float32 array} as declared; called for each version of the weights
     act(obs, state, rng)     -> action, state, extras
 
-for N env copies. It may change all arrays. `obs` is an array [N, *shape]; for a Dict or Tuple observation it is a
-dict of such arrays, by path. `state` [N, S] float32 is zeros when an episode begins. `rng` is the numpy `Generator` of
-these copies. `action` [N, *action] is stored as it is returned: whole numbers that count from 0, or float32 before clipping.
-`extras` has one array [N, *shape] for each name that was declared. If there is `act_greedy(obs, state, rng)`, evaluations
-call it in place of `act`. In a run with action masks, both are called with `mask=` [N, choices] bool: which actions are
-allowed.
+Both may change the arrays that they get. `obs` is an array [N, *shape]; for a Dict or Tuple observation, it is a dict of
+such arrays, by path. `state` [N, S] float32 is zeros when an episode begins. `rng` is the numpy `Generator` of these copies.
+`action` [N, *action] is stored as it is returned: whole numbers that count from 0, or float32 before clipping. `extras` has
+one array [N, *shape] for each name that was declared. If there is a method `act_greedy(obs, state, rng)`, evaluations call
+it in place of `act`. In a run with action masks, both are called with `mask=` [N, choices] bool, which is True where a
+choice is allowed.
 
 Rule: `act` is called once for each lane and step, with exactly the copies of that lane. So if `state` is all that it keeps
 between calls, a rollout has the same bits whatever else the worker does.
@@ -37,21 +37,24 @@ LOG_PROB = ExtraArray("log_prob", (), "float32")
 
 
 class Acted(NamedTuple):
-    """What a policy returned for the N copies of a lane, as arrays of the run."""
+    """What a policy returned for the N copies of a lane, checked and converted to the run's shapes and dtypes."""
 
     action: Array
     """[N, *action]"""
     state: Floats
     """[N, S]"""
     extras: tuple[Array, ...]
-    """in the order in which they were declared; last the log-probabilities, if the policy has them"""
+    """one array [N, *shape] for each declared extra, in order; then the log-probabilities, if the policy returns them"""
 
 
 class CalledPolicy:
     """A user-defined policy. All its errors are raised as `PolicyFailed`."""
 
     def __init__(self, spec: PolicySpec, extras: tuple[ExtraArray, ...], called: str = "policy") -> None:
-        """Make it. `extras`: the extras of the run. `called`: how errors refer to it."""
+        """Make the policy. `extras` are those of the run; `called` is the word for the policy in errors.
+
+        Raises `PolicyFailed` if it can't be made, or lacks a method.
+        """
         assert spec.own is not None
         self._called = called
         self._spec = spec
@@ -68,7 +71,7 @@ class CalledPolicy:
                 raise self._wrong(f"{expected}, got {type(self._made).__name__} without {name}")
 
     def load(self, parameters: Floats, buffers: Floats) -> None:
-        """Load these weights, if it has any."""
+        """Load these weights. Call it only if the policy has arrays."""
         self._guarded("load", lambda: self._made.load(named_views(parameters.copy(), self._fields)))
 
     def act(
@@ -80,9 +83,9 @@ class CalledPolicy:
         mask: Bools | None = None,
         greedy: bool = False,
     ) -> Acted:
-        """Act for the copies of a lane: leaves [N, *leaf], state [N, S]. `greedy`: as in an evaluation.
+        """Act for the N copies of a lane, given observations `leaves` [N, *leaf] and `state` [N, S].
 
-        `mask`: [N, choices] which actions are allowed, in a masked run.
+        In a masked run, `mask` [N, choices] says which choices are allowed. If `greedy`, act as in an evaluation.
         """
         name = "act_greedy" if greedy and hasattr(self._made, "act_greedy") else "act"
         own = [leaf.copy() for leaf in leaves]
@@ -117,7 +120,10 @@ class CalledPolicy:
         return Acted(stored, state, tuple(arrays))
 
     def _array(self, value: Any, shape: tuple[int, ...], dtype: str, what: str) -> Array:
-        """The value as an array of this shape and dtype. Raises `PolicyFailed` for another shape or kind of number."""
+        """The value as an array of this shape and dtype.
+
+        Raises `PolicyFailed` if its shape or kind of number is another, or it contains an invalid number.
+        """
         array: npt.NDArray[Any] = self._guarded(what, lambda: np.asarray(value))
         if array.shape != shape or not np.can_cast(array.dtype, dtype, "same_kind"):
             raise self._wrong(f"{what}: expected {dtype}{list(shape)}, got {array.dtype}{list(array.shape)}")
@@ -127,7 +133,7 @@ class CalledPolicy:
         return array
 
     def _guarded(self, what: str, call: Callable[[], Any]) -> Any:
-        """Call the user's code."""
+        """Call the user's code. Raises `PolicyFailed` in place of the exceptions that it raises."""
         try:
             return call()
         except PolicyFailed:
@@ -141,7 +147,7 @@ class CalledPolicy:
 
 
 def _factory(own: OwnPolicySpec, called: str) -> Callable[..., object]:
-    """The callable that makes the policy."""
+    """The callable that makes the policy. Raises `PolicyFailed` if it can't be imported."""
     if own.code is not None:
         return own.code.load()
     try:

@@ -6,15 +6,15 @@ and a comparison. The log-probabilities of a whole rollout are computed in one c
     Categorical   P = Σ sizes   logits; action = argmax(logits + Gumbel noise)               (Gumbel-max trick)
     Bernoulli     P = K         logits; action = logits + logistic noise > 0
     Gaussian      P = 2 D       mean, log standard deviation; action = mean + exp(log_std) · normal noise, not clipped
-    Product       their sum     independent factors, whose params, noise and actions are concatenated
+    Product       P = Σ factors independent factors, whose params, noise and actions are concatenated
 
 A mixed action has at most three factors, because a stored row has the choices of all its parts, then all bits, then all
 numbers (`millrace.protocol.action_parts`).
 
-The distributions of DQN, SAC and TD3, which explore by numbers that the learner sends, are in `exploration.py`.
+The distributions of DQN, SAC and TD3, whose exploration depends on numbers that the learner sends, are in `exploration.py`.
 
-`millrace.protocol.policy.torch_distributions` computes the same log-probabilities in torch, and entropies; a test compares
-them.
+`millrace.protocol.policy.torch_distributions` computes entropies and the same log-probabilities in torch; a test compares
+the two.
 """
 
 from __future__ import annotations
@@ -31,17 +31,20 @@ from millrace.protocol.specs import PolicySpec
 
 
 class Distribution(Protocol):
-    """Params are [..., P] float32, noise [..., noise_size] float32, actions [..., *action]."""
+    """The interface of all distributions.
+
+    Params are [..., P] float32, noise is [..., noise_size] float32, and actions are [..., *action].
+    """
 
     params_size: int
     """P"""
 
     def noise(self, generator: np.random.Generator, shape: tuple[int, ...]) -> Floats:
-        """Noise [*shape, noise_size] for `sample`."""
+        """Draw noise [*shape, noise_size] for `sample`."""
         ...
 
     def sample(self, params: Floats, noise: Floats) -> Array:
-        """A sample: a deterministic function of `params` and `noise`."""
+        """Sample an action. The result is a deterministic function of `params` and `noise`."""
         ...
 
     def mode(self, params: Floats) -> Array:
@@ -68,7 +71,7 @@ class Categorical:
         return -np.log(np.maximum(exponential, TINY))
 
     def sample(self, params: Floats, noise: Floats) -> Array:
-        """A sample, int64 from 0."""
+        """Sampled choices, int64, counting from 0."""
         return self.mode(params + noise)
 
     def mode(self, params: Floats) -> Array:
@@ -147,7 +150,7 @@ class Gaussian:
 
 
 class Factor(NamedTuple):
-    """A factor of a product, and its part of the last axis of params, noise and actions."""
+    """A factor of a product, and the slice of the last axis of params, noise and actions that belongs to it."""
 
     distribution: Categorical | Bernoulli | Gaussian
     params: slice
@@ -156,10 +159,10 @@ class Factor(NamedTuple):
 
 
 class Product:
-    """Independent distributions, whose actions [k] together form one row [D] float32 (Dict, Tuple)."""
+    """A product of independent distributions, whose actions are concatenated to one row [D] float32 (Dict, Tuple)."""
 
     def __init__(self, factors: Sequence[tuple[Categorical | Bernoulli | Gaussian, int]]) -> None:
-        """`factors`: each with k, the size of its actions."""
+        """`factors` has pairs of a distribution and the size of its actions."""
         self._factors: list[Factor] = []
         self.params_size = noise_size = size = 0
         for factor, count in factors:
@@ -172,17 +175,17 @@ class Product:
             size = action.stop
 
     def noise(self, generator: np.random.Generator, shape: tuple[int, ...]) -> Floats:
-        """The noise [*shape, …] of each factor."""
+        """The noise of all factors, concatenated: [*shape, noise_size]."""
         return np.concatenate([factor.distribution.noise(generator, shape) for factor in self._factors], -1)
 
     def sample(self, params: Floats, noise: Floats) -> Array:
-        """A sample of each factor, float32."""
+        """A sample of each factor, concatenated: [..., D] float32."""
         return self._row(
             each.distribution.sample(params[..., each.params], noise[..., each.noise]) for each in self._factors
         )
 
     def mode(self, params: Floats) -> Array:
-        """The most probable action of each factor."""
+        """The most probable action of each factor, concatenated: [..., D] float32."""
         return self._row(each.distribution.mode(params[..., each.params]) for each in self._factors)
 
     def log_prob(self, params: Floats, action: Array, noise: Floats | None = None) -> Floats:

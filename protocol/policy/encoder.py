@@ -20,12 +20,12 @@ from millrace.protocol.specs import PolicySpec
 
 
 class RecurrentInput(NamedTuple):
-    """What a recurrent core needs in addition to the features of T steps of C env copies, in time order [T · C, …]."""
+    """What a recurrent core needs besides the features of T steps of C env copies, which are [T · C, …] in time order."""
 
     initial_state: Tensor  # [C, S] float32, before the first step
     keep_state: Tensor  # [T, C] float32: 0 where an episode begins and the state is reset, else 1
     output_rows: Tensor | None = None  # [B] int64, the rows of T · C to return; None: all
-    advances: Tensor | None = None  # [T, C] bool: False where the row leaves the state as it was; None: it never does
+    advances: Tensor | None = None  # [T, C] bool: False where the row leaves the state as it was; None: True everywhere
 
     def part(self, steps: int, columns: Tensor | slice, output_rows: Tensor | None = None) -> RecurrentInput:
         """The input for the first steps of some columns."""
@@ -37,9 +37,9 @@ class Convolutions(NamedTuple):
     """The convolutions of one image, and the linear layer after them."""
 
     channels_last: bool
-    parameters: list[tuple[Tensor, Tensor]]  # weight and bias of each convolution, then of the layer
+    parameters: list[tuple[Tensor, Tensor]]  # weight and bias of each convolution, then of the linear layer
     strides: list[int]
-    divisor: int  # of the values of the image
+    divisor: int  # the values of the image are divided by it
     bfloat16: bool = False  # parameters are bfloat16, and the first weight is divided by `divisor`
 
     def in_bfloat16(self) -> Convolutions:
@@ -54,7 +54,7 @@ class Convolutions(NamedTuple):
         *convs, (weight, bias) = self.parameters
         h = image.permute(0, 3, 1, 2) if self.channels_last else image
         if torch.is_grad_enabled() and weight.requires_grad and image.device.type == "cpu":
-            # On CPUs the backward pass then takes two thirds of the time; a forward pass alone is not faster.
+            # On a CPU, channels-last reduces the time of the backward pass to two thirds; a forward pass alone isn't faster.
             h = h.contiguous(memory_format=torch.channels_last)
             convs = [(w.contiguous(memory_format=torch.channels_last), b) for w, b in convs]
         h = h.to(weight.dtype, copy=True)
@@ -68,7 +68,9 @@ class Encoder:
     """The layers before the MLPs: the convolutions of each image or the user-defined module, then the recurrent core."""
 
     def __init__(self, spec: PolicySpec, parameters: dict[str, Tensor], device: str | torch.device, *, seed: int) -> None:
-        """`parameters`: leaves of the graph, by name. The user-defined module's parameters replace them."""
+        """`parameters` has leaves of autograd's graph, by name. Those of a user-defined module are replaced by the module's
+        own parameters, which get the same memory.
+        """
         self._spec = spec
         self._parameters = parameters
         self._module = None if spec.encoder is None else self._adopt(make_encoder(spec, seed).to(device))
@@ -86,8 +88,9 @@ class Encoder:
 
         With a user-defined module, the input of the MLPs is the module's output [B, K].
 
-        With a core, it is the core's output [B, H], for x and images of [T · C, …]. `recurrent` says where episodes begin
-        and which B rows to return. None: each observation is the first of its episode.
+        With a recurrent core, x and images are [T · C, …], and the input of the MLPs is the core's output [B, H].
+        `recurrent` says where episodes begin and which B rows to return; if it is None, each observation is the first of its
+        episode.
         """
         if self._spec.core is None:
             return self._seen(x, images)
@@ -99,7 +102,9 @@ class Encoder:
         return self.core(self._seen(x, images), recurrent)
 
     def act(self, x: Tensor, images: Sequence[Tensor], state: Tensor) -> tuple[Tensor, Tensor]:
-        """The input of the MLPs at one step of B copies, and the core's state after it [B, S]: `state` without a core."""
+        """The input of the MLPs for one step of B copies, and the core's state [B, S] after it. Without a core, the latter
+        is `state`.
+        """
         if self._spec.core is None:
             return self._seen(x, images), state
         return self.advance(x, images, RecurrentInput(state, x.new_ones(1, len(x))))
@@ -140,7 +145,7 @@ class Encoder:
             self._images = [image.in_bfloat16() for image in self._convolutions()]
 
     def _adopt(self, module: torch.nn.Module) -> torch.nn.Module:
-        """Move the module's parameters into the flat tensor; they keep their initial values."""
+        """Move the module's parameters into the memory of the flat tensor; they keep their initial values."""
         for name, parameter in module.named_parameters():
             view = self._parameters[f"encoder.{name}"]
             with torch.no_grad():

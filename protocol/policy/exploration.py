@@ -1,7 +1,8 @@
 """How DQN, SAC and TD3 explore: ε-greedy actions, a squashed normal distribution, normal noise. Pure: noise is an argument.
 
-As in `distributions.py`, a network's output is `params` [..., P]. Here its last numbers come from the learner, with the
-weights, and are the same for every observation. So the learner decides how much is explored, and workers know no schedule.
+As in `distributions.py`, a distribution has parameters `params` [..., P]. Here the last of them aren't outputs of the
+network: the learner sends them with the weights, and they are the same for every observation. So the learner controls how
+much workers explore, and workers know no schedule.
 
     EpsilonGreedy       P = n + 1     action values, ε
                                       action = uniform at random where noise₀ < ε, else argmax
@@ -24,14 +25,14 @@ from millrace.protocol.arrays import Array, Floats
 
 LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
 TINY = np.float32(1e-30)
-"""lower bound of arguments of a logarithm"""
+"""lower bound for the argument of a logarithm"""
 
 
 class ActionValues(NamedTuple):
     """The parameters of `EpsilonGreedy`."""
 
     values: Floats
-    """[..., n] of the actions; `FORBIDDEN` where a mask forbids one"""
+    """[..., n] value of each action; `FORBIDDEN` where a mask forbids the action"""
     epsilon: Floats
     """[...] ε"""
 
@@ -45,9 +46,9 @@ class GreedyNoise(NamedTuple):
     """The noise of `EpsilonGreedy`: uniform numbers in [0, 1)."""
 
     whether: Floats
-    """[...] explores where it is less than ε"""
+    """[...] a random action is chosen where this is less than ε"""
     which: Floats
-    """[...] says which action is drawn"""
+    """[...] selects the random action"""
 
     @staticmethod
     def of(noise: Floats) -> GreedyNoise:
@@ -56,38 +57,38 @@ class GreedyNoise(NamedTuple):
 
 
 class BoundedParams(NamedTuple):
-    """The parameters of a kind of actions in [-1, 1]."""
+    """The parameters of `SquashedGaussian` or `NoisyDeterministic`."""
 
     center: Floats
     """[..., D] the action without noise, before tanh"""
     spread: Floats
     """[..., D] log standard deviation of `SquashedGaussian`, or [..., 1] noise scale of `NoisyDeterministic`"""
     warm_up: Floats
-    """[..., 1] above 0 while it lasts"""
+    """[..., 1] above 0 during the warm-up"""
 
 
 class BoundedNoise(NamedTuple):
-    """The noise of a kind of actions in [-1, 1]."""
+    """The noise of `SquashedGaussian` or `NoisyDeterministic`."""
 
     normal: Floats
-    """[..., D]"""
+    """[..., D] standard normal"""
     uniform: Floats
-    """[..., D] in [-1, 1]: the actions of the warm-up"""
+    """[..., D] uniform in [-1, 1]: the actions during the warm-up"""
 
 
 class EpsilonGreedy:
-    """The action with the highest value, or with probability ε an action drawn uniformly (Discrete)."""
+    """The action with the highest value, or, with probability ε, one drawn uniformly from all actions (Discrete)."""
 
     def __init__(self, actions: int) -> None:
         self.params_size = actions + 1
         self._actions = actions
 
     def noise(self, generator: np.random.Generator, shape: tuple[int, ...]) -> Floats:
-        """Uniform(0, 1) noise [*shape, 2]: whether to explore, and which action."""
+        """Uniform(0, 1) noise [*shape, 2]: see `GreedyNoise`."""
         return generator.random((*shape, 2), dtype=np.float32)
 
     def sample(self, params: Floats, noise: Floats) -> Array:
-        """A sample, int64 from 0."""
+        """Sampled actions, int64, counting from 0."""
         whether, which = GreedyNoise.of(noise)
         uniform = (which * self._actions).astype(np.int64)  # below n: float32 noise is at most 1 - 2**-24
         return np.where(whether < ActionValues.of(params).epsilon, uniform, self.mode(params))
@@ -104,7 +105,9 @@ class EpsilonGreedy:
 
 
 class _Bounded:
-    """What the two kinds of actions in [-1, 1] share. Noise [*shape, 2 D]: normal numbers, then uniform ones in [-1, 1]."""
+    """Base of the two distributions of actions in [-1, 1]. Noise is [..., 2 D]: normal numbers, then uniform ones in [-1,
+    1].
+    """
 
     def __init__(self, shape: tuple[int, ...]) -> None:
         self._size = math.prod(shape)
@@ -130,7 +133,7 @@ class _Bounded:
         return BoundedNoise(noise[..., : self._size], noise[..., self._size :])
 
     def _uniform_in_warm_up(self, warm_up: Floats, uniform: Floats, action: Floats) -> Array:
-        """The action [..., D] in its shape; the uniform one [..., D] where the warm-up [..., 1] lasts."""
+        """The action [..., D], or the uniform one where `warm_up` [..., 1] is above 0, in the shape of the space."""
         chosen = np.where(warm_up > 0, uniform, action)
         return chosen.reshape(*action.shape[:-1], *self._shape)
 
@@ -149,10 +152,11 @@ class SquashedGaussian(_Bounded):
         return self._uniform_in_warm_up(warm_up, uniform, np.tanh(mean + np.exp(log_std) * normal))
 
     def log_prob(self, params: Floats, action: Array, noise: Floats | None = None) -> Floats:
-        """Log-density [...] in [-1, 1]^D: of the normal distribution, minus log(1 − tanh²), summed; −D log 2 in the warm-up.
+        """Log-density [...] of the action in [-1, 1]^D.
 
-        It is computed from the noise: an action near ±1 doesn't determine where in the normal distribution it came from.
-        Raises ValueError without noise.
+        This is the log-density of the normal distribution minus log(1 − tanh²), summed over dimensions; during the warm-up,
+        it is −D log 2. It is computed from the noise, because an action near ±1 doesn't determine the normal sample from
+        which it was computed. Raises `ValueError` if there is no noise.
         """
         if noise is None:
             raise ValueError("log_prob of a squashed action: expected the noise that it was sampled with, got none")
@@ -165,7 +169,7 @@ class SquashedGaussian(_Bounded):
 
 
 class NoisyDeterministic(_Bounded):
-    """One action for each observation, with normal noise while it explores (bounded Box). Actions are in [-1, 1]."""
+    """One action for each observation, plus normal noise for exploration (bounded Box). Actions are in [-1, 1]."""
 
     def __init__(self, shape: tuple[int, ...]) -> None:
         super().__init__(shape)
@@ -183,5 +187,5 @@ class NoisyDeterministic(_Bounded):
 
 
 def log_tanh_derivative(x: Floats) -> Floats:
-    """Log(1 − tanh²(x)) = 2 (log 2 − x − softplus(−2x)), which is exact for every x."""
+    """Log(1 − tanh²(x)), computed as 2 (log 2 − x − softplus(−2x)), which is numerically stable for every x."""
     return np.asarray(2 * (np.float32(math.log(2)) - x - np.logaddexp(np.float32(0), -2 * x)))

@@ -1,4 +1,4 @@
-"""From observations to features, the numbers that a network takes as input. Pure; imports no torch.
+"""Converts observations to features, the numbers that a network gets as input. Pure; imports no torch.
 
 The learner and the workers both use this file, so that a network gets the same input everywhere.
 """
@@ -16,7 +16,7 @@ from millrace.protocol.specs import Leaf, PolicySpec
 
 
 def feature_size(spec: PolicySpec) -> int:
-    """D, the number of features of all leaves that are not images."""
+    """D, the total number of features of all leaves that are not images."""
     return sum(_feature_count(leaf) for leaf in spec.observation if not leaf.is_image)
 
 
@@ -32,9 +32,9 @@ def _feature_count(leaf: Leaf) -> int:
 def features(spec: PolicySpec, leaves: Sequence[Array]) -> Array:
     """Features [..., D] of leaves [..., *leaf], not yet normalized. Images are left out.
 
-    Arrays are flattened and divided by `Leaf.divisor`; discrete values become one-hot vectors. The dtype is float32, or
-    float64 if the policy normalizes and float32 would lose digits of an array (`Leaf.is_wide`): `normalize` then returns
-    float32. The result may be a view of a leaf.
+    Arrays are flattened and divided by `Leaf.divisor`; discrete values become one-hot vectors. The dtype is float32. It is
+    float64 if the policy normalizes and float32 would lose digits of an array (`Leaf.is_wide`); `normalize` then converts
+    the result to float32. The result may be a view of a leaf.
     """
     plain = [(leaf, array) for leaf, array in zip(spec.observation, leaves, strict=True) if not leaf.is_image]
     parts = [_features_of_leaf(leaf, array, spec.normalize_observations) for leaf, array in plain]
@@ -61,10 +61,10 @@ def _features_of_leaf(leaf: Leaf, array: Array, keep_float64: bool) -> Array:
 
 @lru_cache(maxsize=64)
 def _one_hot_values(leaf: Leaf) -> Array:
-    """[features] the value that each feature of this leaf stands for."""
+    """[features] the discrete value that each one-hot feature of this leaf stands for."""
     return np.concatenate([np.arange(start, start + n) for start, n in zip(leaf.start, leaf.sizes, strict=True)])
 
 
 def leaf_of_features(spec: PolicySpec) -> list[Leaf]:
-    """The leaf that each of the D features belongs to. Only features of a Box are normalized."""
+    """For each of the D features, the leaf to which it belongs. Only features of Box leaves are normalized."""
     return [leaf for leaf in spec.observation if not leaf.is_image for _ in range(_feature_count(leaf))]

@@ -1,6 +1,6 @@
 """Advice for observations that look like images but are flattened: how to pass them to the convolutions. Pure.
 
-Rule: only `Leaf.is_image` decides what an image is. This file only recognizes arrays that the user may have meant as one.
+Rule: only `Leaf.is_image` decides what an image is. This file only recognizes arrays that the user may have meant as images.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from collections.abc import Iterator
 
 from millrace.protocol.specs import Leaf, PolicySpec
 
-LEAST_SIDE = 36  # pixels from which on an image goes through three convolutions
+LEAST_SIDE = 36  # the smallest side, in pixels, of an image that goes through three convolutions
 COLORS = (1, 3, 4)
 GRAY = "gymnasium.wrappers:GrayscaleObservation"
 STACKED = '"gymnasium.wrappers:FrameStackObservation(stack_size=4)"'

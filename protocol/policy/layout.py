@@ -1,8 +1,8 @@
 """The position of each parameter in the flat buffer. Pure; imports no torch.
 
 All parameters of a policy are in one flat float32 buffer. The parameters that are needed to act come first. So publishing
-copies the first part of the buffer, and loading makes views of the received frame. Only `parameter_layout` defines the
-positions. The parameters of the networks in `millrace.protocol.policy.networks` are views with the same layout.
+weights copies the first part of the buffer, and loading them makes views of the received frame. Only `parameter_layout`
+defines the positions. The parameters of the networks in `millrace.protocol.policy.networks` are views with the same layout.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from millrace.protocol.policy.recurrent import core_shapes
 from millrace.protocol.specs import Leaf, PolicySpec
 
 FlatT = TypeVar("FlatT", bound=Any)
-"""a numpy array, or a torch tensor where torch is imported anyway"""
-IMAGE_FEATURES = 128  # width of the layer between the convolutions of one image and the rest
+"""a numpy array, or, where torch is imported anyway, a torch tensor"""
+IMAGE_FEATURES = 128  # width of the linear layer after the convolutions of one image
 
 
 class Field(NamedTuple):
@@ -29,23 +29,25 @@ class Field(NamedTuple):
     name: str
     shape: tuple[int, ...]
     gain: float
-    """gain of the orthogonal initialization; 0: starts at zero (biases, log standard deviations), or the user's own"""
+    """gain of the orthogonal initialization; 0 if the array starts at zero (biases, log standard deviations), or is
+    initialized by user code
+    """
 
 
 class Conv(NamedTuple):
-    """One convolution: channels out, kernel size, stride."""
+    """One convolution: its output channels, kernel size and stride."""
 
     channels: int
     kernel: int
     stride: int
 
     def output_side(self, side: int) -> int:
-        """The height or width of its output, from that of its input."""
+        """The height or width of the output, from that of the input."""
         return (side - self.kernel) // self.stride + 1
 
 
-CRITICS = ("critic0", "critic1")  # of a squashed or deterministic head; each takes the features and the action
-LOG_STD_BOUNDS = (-20.0, 2.0)  # of a squashed Gaussian (Haarnoja et al. 2018)
+CRITICS = ("critic0", "critic1")  # the critics of SAC and TD3; the input of each is the features and the action
+LOG_STD_BOUNDS = (-20.0, 2.0)  # bounds for the log standard deviation of a squashed Gaussian (Haarnoja et al. 2018)
 NATURE = (Conv(32, 8, 4), Conv(64, 4, 2), Conv(64, 3, 1))  # Mnih et al. 2015
 SMALL = (Conv(16, 3, 1), Conv(32, 3, 2))
 
@@ -53,8 +55,8 @@ SMALL = (Conv(16, 3, 1), Conv(32, 3, 2))
 def convolutions(leaf: Leaf) -> tuple[tuple[Conv, ...], tuple[int, int, int], int]:
     """For an image: its convolutions, its shape as (channels, height, width), and the size of the flattened output.
 
-    The last dimension holds the channels, unless it is larger than the first. If both sides of the image have at least 36
-    pixels, it gets the convolutions of Mnih et al. (2015), otherwise two 3 x 3 convolutions.
+    The channels are the last dimension, unless it is larger than the first. If both sides of the image have at least 36
+    pixels, the convolutions are those of Mnih et al. (2015); otherwise, they are two 3 x 3 convolutions.
     """
     chw = (leaf.shape[2], *leaf.shape[:2]) if leaf.has_channels_last else leaf.shape
     stack = NATURE if min(chw[1:]) >= 36 else SMALL
@@ -66,10 +68,10 @@ def convolutions(leaf: Leaf) -> tuple[tuple[Conv, ...], tuple[int, int, int], in
 
 
 def parameter_layout(spec: PolicySpec) -> tuple[tuple[Field, ...], tuple[Field, ...]]:
-    """The fields that are needed to act, and then those of the critic. Linear weights are [out, in].
+    """The fields that are needed to act, and the fields of the critics. Linear weights are [out, in].
 
-    For actions in [-1, 1], the encoder is last among the acting ones, next to the critics, because only their losses train
-    it.
+    For actions in [-1, 1], the encoder comes last among the acting fields, right before the critics, because only the losses
+    of the critics train it.
     """
     if spec.own is not None:
         return tuple(Field(array.name, array.shape, 0) for array in spec.own.arrays), ()
@@ -101,9 +103,9 @@ def parameter_layout(spec: PolicySpec) -> tuple[tuple[Field, ...], tuple[Field, 
 
 
 def encoder_layout(spec: PolicySpec) -> tuple[list[Field], int]:
-    """The fields before the hidden layers, and the number of features that they output.
+    """The fields of the layers before the hidden layers, and the number of features that these layers output.
 
-    These are, for each image, its convolutions, or the user-defined module; then the recurrent core, if there is one.
+    These layers are the convolutions of each image, or the user-defined module; then the recurrent core, if there is one.
     """
     fields: list[Field] = []
     width = feature_size(spec)
@@ -131,17 +133,17 @@ def encoder_layout(spec: PolicySpec) -> tuple[list[Field], int]:
 
 
 def _trunk(spec: PolicySpec) -> str:
-    """Name prefix of the hidden layers that are needed to act."""
+    """The name prefix of the hidden layers that are needed to act."""
     return "q" if spec.head == "q" else "shared" if spec.shared_net else "actor"
 
 
 def hidden_names(spec: PolicySpec, name: str = "") -> list[str]:
-    """Names of the hidden layers that are needed to act, or of those of `name` (`critic`)."""
+    """The names of the hidden layers that are needed to act, or of those with another prefix `name`, such as `critic`."""
     return [f"{name or _trunk(spec)}.{i}" for i in range(len(spec.net))]
 
 
 def _hidden(name: str, width: int, sizes: Sequence[int]) -> tuple[list[Field], int]:
-    """The fields of the hidden layers, and the width of the last one."""
+    """The fields of hidden layers of these sizes, and the width of the last one. `width` is the size of their input."""
     fields: list[Field] = []
     for i, size in enumerate(sizes):
         fields += _linear(f"{name}.{i}", width, size, math.sqrt(2))
@@ -175,10 +177,10 @@ def named_views(flat: FlatT, fields: Sequence[Field]) -> dict[str, FlatT]:
 
 
 def buffer_layout(spec: PolicySpec) -> tuple[Field, ...]:
-    """The fields of `Weights.buffers`: the statistics of observations if they are normalized, and what exploration needs.
+    """The fields of `Weights.buffers`: statistics of observations, if these are normalized, and parameters of exploration.
 
-    For Q-values that is ε. For actions in [-1, 1] it is the scale of the noise (deterministic), and then 1 while actions are
-    uniform (warm-up), else 0.
+    With Q-values, the latter is ε. With actions in [-1, 1], they are the scale of the noise (only if actions are
+    deterministic), and a number that is 1 during the warm-up, while actions are uniform, and then 0.
     """
     fields: list[Field] = []
     if spec.normalize_observations:
@@ -196,7 +198,7 @@ EXPLORATION = ("epsilon", "noise_scale", "warm_up")
 
 
 def appended_params(spec: PolicySpec, buffers: Mapping[str, Array]) -> Array | None:
-    """The numbers [K] that follow a network's output in the distribution params; None if there are none."""
+    """The exploration parameters [K] that follow a network's output in the distribution params; None if there are none."""
     appended = [buffers[field.name] for field in buffer_layout(spec) if field.name in EXPLORATION]
     return np.concatenate(appended) if appended else None
 

@@ -1,10 +1,11 @@
-"""Action masks: which choices of an action are allowed: of a Discrete, a MultiDiscrete, or such parts of others. Pure numpy.
+"""Action masks say which choices of Discrete and MultiDiscrete actions, or of such parts of an action, are allowed. Pure.
 
-Rule: a choice that is not allowed gets the logit, or the value, FORBIDDEN. This is a finite number, so nothing becomes NaN;
-and its probability exp(FORBIDDEN − max) is exactly 0, so it adds nothing to an entropy, and its gradient is exactly 0.
+Rule: the logit, or the value, of a choice that is not allowed is replaced by FORBIDDEN. This is a finite number, so nothing
+becomes NaN. The probability exp(FORBIDDEN − max) of such a choice is exactly 0, so it adds nothing to an entropy, and its
+gradient is exactly 0.
 
-A mask is [..., choices] bool. The choices of the entries of an action stand one after another. Their logits come before all
-other parameters, and a stored row of a mixed action begins with what was chosen.
+A mask is [..., choices] bool: the choices of all entries of an action, one entry after another. The logits of the choices
+come before all other distribution params, and a stored row of a mixed action begins with the choices that were made.
 """
 
 from __future__ import annotations
@@ -16,19 +17,19 @@ from millrace.protocol.policy.distributions import Distribution, distribution
 from millrace.protocol.policy.exploration import ActionValues, EpsilonGreedy, GreedyNoise
 from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec, RunSpec
 
-MASK = "action_mask"  # the key in `info`, or in a Dict observation
+MASK = "action_mask"  # key of the mask in `info`, or in a Dict observation
 FORBIDDEN = -1e30
 _TINY = np.float32(1e-30)
 
 
 def stored_leaves(run: RunSpec) -> tuple[Leaf, ...]:
-    """The arrays of an observation as workers store them: in a masked run the mask is one more, the last."""
+    """The arrays of an observation as workers store them. In a masked run, the mask is an additional array, the last one."""
     leaves = run.policy.seen
     return (*leaves, Leaf(MASK, "multibinary", (run.policy.action.choices,), "bool")) if run.masked else leaves
 
 
 def forbid(params: Floats, mask: Bools) -> Floats:
-    """A copy of distribution parameters [..., P], or action values, in which the choices without True are FORBIDDEN.
+    """A copy of distribution params [..., P], in which the logits or values of choices that are not allowed are FORBIDDEN.
 
     ε, which follows the action values, stays as it is.
     """
@@ -38,23 +39,23 @@ def forbid(params: Floats, mask: Bools) -> Floats:
 
 
 def masked_distribution(spec: PolicySpec) -> Distribution:
-    """The action distribution for parameters that `forbid` made."""
+    """The action distribution for params to which `forbid` was applied."""
     return MaskedEpsilonGreedy(spec.action.sizes[0]) if spec.head == "q" else distribution(spec)
 
 
 class MaskedEpsilonGreedy(EpsilonGreedy):
-    """The allowed action with the highest value, or with probability ε an allowed action drawn uniformly."""
+    """The allowed action with the highest value, or, with probability ε, one drawn uniformly from all allowed actions."""
 
     def sample(self, params: Floats, noise: Floats) -> Array:
-        """A sample, int64 from 0."""
+        """Sampled actions, int64, counting from 0."""
         allowed = _allowed(params)
         whether, which = GreedyNoise.of(noise)
-        number = (which * allowed.sum(-1)).astype(np.int64)  # among those that are allowed
+        number = (which * allowed.sum(-1)).astype(np.int64)  # index among the allowed actions
         uniform = (allowed.cumsum(-1) > number[..., None]).argmax(-1)
         return np.where(whether < ActionValues.of(params).epsilon, uniform, self.mode(params))
 
     def log_prob(self, params: Floats, action: Array, noise: Floats | None = None) -> Floats:
-        """log(ε / m + (1 − ε) [action is the best]) [...] with m allowed actions, at least −69."""
+        """log(ε / m + (1 − ε) [action is the best]) [...], where m is the number of allowed actions; at least −69."""
         epsilon = ActionValues.of(params).epsilon
         count = _allowed(params).sum(-1).astype(np.float32)
         chance = epsilon / count + (1 - epsilon) * (action == self.mode(params))

@@ -39,17 +39,17 @@ from millrace.protocol.random_streams import Purpose, torch_seed
 from millrace.protocol.specs import PolicySpec
 
 DTYPE = torch.float32
-"""of all parameters, whatever PyTorch's default is"""
+"""dtype of all parameters, whatever PyTorch's default dtype is"""
 
 
 @contextmanager
 def defaults_of_thread() -> Iterator[None]:
-    """PyTorch's own values of its thread-local defaults: gradients, no autocast, tensors on the CPU."""
+    """A context with PyTorch's original thread-local defaults: gradients are on, autocast is off, tensors are on the CPU."""
     with ExitStack() as stack:
         stack.enter_context(torch.inference_mode(False))
         stack.enter_context(torch.enable_grad())
         if torch.get_default_device().type != "cpu":
-            stack.enter_context(torch.device("cpu"))  # otherwise not entered, because it slows every call of torch
+            stack.enter_context(torch.device("cpu"))  # entered only if needed, because it slows every call of torch
         for device in ("cpu", "cuda"):
             if torch.is_autocast_enabled(device):
                 stack.enter_context(torch.autocast(device, enabled=False))
@@ -63,7 +63,7 @@ def refuse_second_derivatives() -> None:
 
 
 class MLPNode(torch.autograd.Function):
-    """Hidden layers and a linear head as one node of autograd's graph: with many nodes, small networks are slow.
+    """Hidden layers and a linear head as one node of autograd's graph. With one node per operation, small networks are slow.
 
     Forward: h₀ = x [B, D];  hᵢ = φ(hᵢ₋₁ Wᵢᵀ + bᵢ);  output = h Wᵀ + b [B, O].
     Backward: with g = ∂L/∂(pre-activation), ∂L/∂W = gᵀ h, ∂L/∂b = Σ g, ∂L/∂h = g W; φ' is 1 − h² (tanh) or h > 0 (ReLU).
@@ -83,7 +83,7 @@ class MLPNode(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *outputs: Tensor) -> tuple[Tensor | None, ...]:
-        """Gradients of x (if wanted) and of each layer's weight and bias."""
+        """Gradients with respect to x (if needed), and to each layer's weight and bias."""
         refuse_second_derivatives()
         (g,) = outputs
         half = len(ctx.saved_tensors) // 2
@@ -102,11 +102,11 @@ class MLPNode(torch.autograd.Function):
 
 
 class StackedMLP(torch.autograd.Function):
-    """K networks of one shape on the same input, as one node: `MLPNode` in batched products, [B, D] -> [K, B, O]."""
+    """K networks of the same shape on the same input, as one node: `MLPNode` in batched products, [B, D] -> [K, B, O]."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, relu: bool, flat: Tensor, layers_of: Callable[[Tensor], list[Tensor]]) -> Tensor:
-        """`layers_of`: the layers as views of a tensor like `flat`, weight [K, out, in] and bias [K, out] in turns."""
+        """`layers_of` returns the layers as views of a tensor like `flat`: weight [K, out, in] and bias [K, out] in turn."""
         *hidden, weight, bias = layers = layers_of(flat)
         x = x.expand(len(weight), *x.shape)
         inputs = [x]
@@ -121,7 +121,7 @@ class StackedMLP(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *outputs: Tensor) -> tuple[Tensor | None, ...]:
-        """Gradients of x and of `flat`, where wanted."""
+        """Gradients with respect to x and to `flat`, as far as they are needed."""
         refuse_second_derivatives()
         (g,) = outputs
         half = len(ctx.saved_tensors) // 2
@@ -144,7 +144,7 @@ class StackedMLP(torch.autograd.Function):
 
 
 class FlatNetwork(ABC):
-    """Named parameters that are views of one flat tensor, and the layers before the heads."""
+    """Base of all networks: named parameters that are views of one flat tensor, and the layers before the heads."""
 
     def __init__(self, spec: PolicySpec, device: str | torch.device = "cpu", *, seed: int = 0) -> None:
         """Initialize each field orthogonally with its gain, or with zeros if the gain is 0. The values depend on `seed`."""
@@ -155,7 +155,7 @@ class FlatNetwork(ABC):
         self.acting_fields = len(acting)
         generator = torch.Generator().manual_seed(torch_seed(seed, Purpose.WEIGHTS))
         self.flat = initial_fields(self.fields, generator).to(device)
-        """[P] float32: give this to the optimizer"""
+        """[P] float32: pass this to the optimizer"""
         self.flat_grad = torch.zeros_like(self.flat)  # [P] float32: zero it before each backward pass
         self.flat.grad = self.flat_grad
         self.parameters = named_leaves(self.flat, self.flat_grad, self.fields)
@@ -165,16 +165,16 @@ class FlatNetwork(ABC):
             keep_freed_memory()
 
     def layers(self, names: Sequence[str]) -> list[Tensor]:
-        """Weight and bias of each layer, one after another, as `MLPNode` takes them."""
+        """Weight and bias of each layer, one after another, in the form that `MLPNode` expects."""
         return [self.parameters[f"{name}.{kind}"] for name in names for kind in ("weight", "bias")]
 
     def mlp(self, x: Tensor, layers: Sequence[Tensor]) -> Tensor:
-        """Hidden layers with the activation between them, the last one linear."""
+        """Apply these layers to x, with the activation after each but the last, which is linear."""
         out: Tensor = MLPNode.apply(x, self._relu, *layers)  # type: ignore[no-untyped-call]
         return out
 
     def hidden(self, x: Tensor, layers: Sequence[Tensor]) -> Tensor:
-        """Hidden layers, each with its activation."""
+        """Apply these layers to x, with the activation after each."""
         if not layers:
             return x
         out = self.mlp(x, layers)
@@ -182,16 +182,16 @@ class FlatNetwork(ABC):
 
     @abstractmethod
     def head(self, h: Tensor) -> Tensor:
-        """Distribution params [B, P] of the encoder's outputs h [B, H]."""
+        """Distribution params [B, P] for the encoder's outputs h [B, H]."""
 
     def act(self, x: Tensor, images: Sequence[Tensor], state: Tensor) -> tuple[Tensor, Tensor]:
-        """Distribution params [B, P] of one step of B copies, and the core's state after it [B, S]."""
+        """Distribution params [B, P] for one step of B copies, and the core's state [B, S] after it."""
         h, state = self.encode.act(x, images, state)
         return self.head(h), state
 
 
 class ActorCriticNetwork(FlatNetwork):
-    """An actor and a critic: each has its own MLPNode, or they share one. If there is a recurrent core, they share it."""
+    """An actor and a critic, with separate or shared hidden layers. An encoder and a recurrent core are always shared."""
 
     def __init__(self, spec: PolicySpec, device: str | torch.device = "cpu", *, seed: int = 0) -> None:
         super().__init__(spec, device, seed=seed)
@@ -210,7 +210,7 @@ class ActorCriticNetwork(FlatNetwork):
         return self.hidden(self.encode(x[:, : self._acting_features], images, recurrent), self._trunk)
 
     def _value(self, h: Tensor, x: Tensor, recurrent: RecurrentInput | None) -> Tensor:
-        """V [B] of the actor's input `h`, and of the critic's extra features in `x`."""
+        """V [B] for the actor's input `h` and the features in `x` that only the critic sees."""
         if self.spec.critic:
             more = x[:, self._acting_features :]
             rows = None if recurrent is None else recurrent.output_rows
@@ -222,19 +222,18 @@ class ActorCriticNetwork(FlatNetwork):
     ) -> tuple[Tensor, Tensor]:
         """Features [B, D] float32 and images [B, *leaf] uint8 -> distribution params [B, P], value [B].
 
-        The D features are followed by those that only the critic sees, if any.
-
-        With a core, x and images are [T · C, …], and `recurrent` says where episodes begin and which B rows to return.
+        In x, the D features are followed by those that only the critic sees, if any. With a recurrent core, x and images are
+        [T · C, …], and `recurrent` says where episodes begin and which B rows to return.
         """
         h = self._common(x, images, recurrent)
         return self._params(h), self._value(h, x, recurrent)
 
     def params(self, x: Tensor, images: Sequence[Tensor] = (), recurrent: RecurrentInput | None = None) -> Tensor:
-        """Distribution params [B, P] alone."""
+        """Only the distribution params [B, P] of `forward`."""
         return self._params(self._common(x, images, recurrent))
 
     def value(self, x: Tensor, images: Sequence[Tensor] = (), recurrent: RecurrentInput | None = None) -> Tensor:
-        """Value [B] alone."""
+        """Only the value [B] of `forward`."""
         return self._value(self._common(x, images, recurrent), x, recurrent)
 
     def evaluate(
@@ -245,19 +244,19 @@ class ActorCriticNetwork(FlatNetwork):
         action: Tensor,
         mask: Tensor | None = None,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Log π(action), the entropy of π, and V, [B] each. `mask` [B, choices]: which actions are allowed.
+        """Log π(action), the entropy of π, and V, [B] each.
 
-        The probability and the gradient of an action that is not allowed are exactly 0. For the other arguments, see
-        `forward`.
+        `mask` [B, choices] says which choices are allowed. The probability and the gradient of one that is not allowed are
+        exactly 0. For the other arguments, see `forward`.
         """
         params, value = self.forward(x, images, recurrent)
         if mask is not None:
-            others = params.shape[-1] - mask.shape[-1]  # params of bits and numbers, which follow the choices
+            others = params.shape[-1] - mask.shape[-1]  # params of bits and numbers, which follow those of choices
             params = params.masked_fill(F.pad(~mask, (0, others)), FORBIDDEN)
         return *log_prob_and_entropy(self.spec.action, params, action), value
 
     def head(self, h: Tensor) -> Tensor:
-        """See `FlatNetwork`."""
+        """Distribution params [B, P] for the encoder's outputs h [B, H]."""
         return self._params(self.hidden(h, self._trunk))
 
 
@@ -270,32 +269,32 @@ class QNetwork(FlatNetwork):
         self._hidden = self.layers(hidden_names(spec))
 
     def params(self, x: Tensor, images: Sequence[Tensor] = ()) -> Tensor:
-        """Action values [B, n] of features [B, D] float32 and images [B, *leaf] uint8."""
+        """Action values [B, n] for features [B, D] float32 and images [B, *leaf] uint8."""
         return self.head(self.encode(x, images))
 
     def head(self, h: Tensor) -> Tensor:
-        """Action values [B, n] of the encoder's outputs h [B, H]."""
+        """Action values [B, n] for the encoder's outputs h [B, H]."""
         if not self.spec.dueling:
             return self.mlp(h, self._without_dueling)
         h = self.hidden(h, self._hidden)
         return self.action_values(self.mlp(h, self.layers(["q.out"])), self.mlp(h, self.layers(["q.value"])))
 
     def acting_parameters(self) -> Floats:
-        """A copy of the parameters [P] that workers act with: all of them."""
+        """A copy of the parameters [P] with which workers act, that is, of all parameters."""
         return self.flat.cpu().numpy().copy()
 
     @staticmethod
     def action_values(advantage: Tensor, value: Tensor | None = None) -> Tensor:
-        """The action values [B, n] of the network's outputs; with the dueling architecture Q = V + A − mean A."""
+        """The action values [B, n] from the network's outputs. With the dueling architecture, Q = V + A − mean A."""
         return advantage if value is None else value + advantage - advantage.mean(-1, keepdim=True)
 
 
 class ActorAndCritics(FlatNetwork):
-    """An actor of actions in [-1, 1] and two critics, which value an observation with an action. Each has its own MLPNode.
+    """An actor whose actions are in [-1, 1], and two critics, which map an observation and an action to a value.
 
-    `actor` and `critics` are the two parts of the flat tensor, with their parts of the gradients: one for each optimizer.
-    The encoder, if there is one, is trained with the critics, and the actor takes its output (Yarats et al. 2022). So losses
-    are written in the encoder's outputs h [B, H], which are the features if there is no encoder.
+    `actor` and `critics` are two parts of the flat tensor, with their parts of the gradients: one for each optimizer. The
+    encoder, if there is one, is trained with the critics, and the actor uses its output (Yarats et al. 2022). So methods for
+    losses take the encoder's outputs h [B, H], which are the features if there is no encoder.
     """
 
     def __init__(self, spec: PolicySpec, device: str | torch.device = "cpu", *, seed: int = 0) -> None:
@@ -312,11 +311,13 @@ class ActorAndCritics(FlatNetwork):
         self._critics = trainable(self._constant_critics, self.flat_grad[self.acting_size :])
 
     def acting_parameters(self) -> Floats:
-        """A copy of the parameters that workers act with: the actor, then the encoder."""
+        """A copy of the parameters with which workers act: those of the actor, then those of the encoder."""
         return self.flat[: self.acting_size].cpu().numpy().copy()
 
     def _stacked(self, critics: int, flat: Tensor) -> list[Tensor]:
-        """Weight [critics, out, in] and bias [critics, out] of each layer of the critics, as views of `flat` [C]."""
+        """Weight [critics, out, in] and bias [critics, out] of each layer of the first `critics` critics: views of `flat`
+        [C].
+        """
         each = flat.view(len(CRITICS), -1)[:critics]
         views = []
         at = 0
@@ -332,11 +333,11 @@ class ActorAndCritics(FlatNetwork):
         return self.actor_params(self.encode(x, images))
 
     def head(self, h: Tensor) -> Tensor:
-        """See `FlatNetwork`."""
+        """`actor_params`, without the exploration parameters that the learner sends."""
         return self.actor_params(h)
 
     def actor_params(self, h: Tensor) -> Tensor:
-        """The actor's output before the tangent: [B, D′] (deterministic) or [B, 2 D′].
+        """The actor's output before the hyperbolic tangent: [B, D′] if it is deterministic, else [B, 2 D′].
 
         For a squashed Gaussian, the second half is the logarithm of the standard deviations, clipped to [-20, 2].
         """
@@ -347,13 +348,13 @@ class ActorAndCritics(FlatNetwork):
         return torch.cat((mean, log_std.clamp(*LOG_STD_BOUNDS)), -1)
 
     def sample(self, h: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
-        """Actions [B, D′] of a squashed Gaussian and their log-densities [B], for noise [B, D′]."""
+        """Actions [B, D′] of a squashed Gaussian, and their log-densities [B], for standard normal noise [B, D′]."""
         return squashed_sample(self.actor_params(h), noise)
 
     def values(self, h: Tensor, action: Tensor, *, constant: bool = False, critics: int = len(CRITICS)) -> Tensor:
-        """The values [critics, B] of both critics, or of the first, for actions [B, D′] in [-1, 1].
+        """The values [critics, B] that both critics, or only the first, give to actions [B, D′] in [-1, 1].
 
-        `constant`: the critics get no gradient; the actions do. Use it for the loss of the actor.
+        With `constant`, gradients flow to the actions but not to the critics. Use it for the loss of the actor.
         """
         flat = self._constant_critics if constant else self._critics
         layers = partial(self._stacked, critics)
@@ -375,7 +376,7 @@ def network_of(
 
 
 def initial_fields(fields: Sequence[Field], generator: torch.Generator) -> Tensor:
-    """Parameters [P] to begin with: each field orthogonal with its gain, or zeros if the gain is 0."""
+    """Initial parameters [P]: each field is orthogonal with its gain, or zeros if the gain is 0."""
     parts = [torch.zeros(0, dtype=DTYPE)]
     for field in fields:
         part = torch.zeros(field.shape, dtype=DTYPE)

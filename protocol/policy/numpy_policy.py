@@ -1,6 +1,6 @@
-"""The forward pass of MLP policies in numpy. Workers act with it. Imports no torch.
+"""The forward pass of MLP policies in numpy, with which workers act. Imports no torch.
 
-A pass works on several lanes at once, [L, N, ·]. numpy's stacked matmul gives each lane the same bits that it would get
+A pass processes several lanes at once, [L, N, ·]. numpy's stacked matmul gives each lane the same bits that it would get
 alone, so a run does not depend on the number of its workers.
 """
 
@@ -40,7 +40,7 @@ class NumpyPolicy:
         self._hidden_outputs: list[Floats] = []  # [L, N, width] for each hidden layer, overwritten in each pass
 
     def load(self, parameters: Floats, buffers: Floats) -> None:
-        """Use these weights from now on, without a copy. Raises ValueError if their sizes do not fit the spec."""
+        """Use these weights from now on, without copying them. Raises `ValueError` if their sizes do not fit the spec."""
         if parameters.shape != (total_size(self._fields),) or buffers.shape != (buffer_size(self.spec),):
             raise ValueError(
                 f"weights: expected {total_size(self._fields)} parameters and {buffer_size(self.spec)} buffers, "
@@ -56,7 +56,7 @@ class NumpyPolicy:
         return self._parameters[f"{name}.weight"].T, self._parameters[f"{name}.bias"]
 
     def __call__(self, leaves: Sequence[Array], state: Floats | None = None) -> Floats:
-        """Distribution parameters [L, N, P] of the actions in these observations [L, N, *leaf]; see `Policy`."""
+        """Distribution params [L, N, P] for these observations [L, N, *leaf]; see `Policy`."""
         x = leaves[0] if self._is_one_vector else features(self.spec, leaves)
         if self.spec.normalize_observations:
             x = normalize(x, self._buffers["observation_mean"], self._buffers["observation_std"])

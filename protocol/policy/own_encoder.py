@@ -1,14 +1,14 @@
-"""A user's own encoder: a torch module between the observation and the rest of the network. Imports torch.
+"""A user-defined encoder: a torch module between the observation and the rest of the network. Imports torch.
 
-`module:factory` names a callable: factory(features, images) -> torch.nn.Module, where `features` is the number of features
-of all arrays of an observation that are not images, and `images` their shapes. The module is called with features
-[B, features] float32 (normalized if the run normalizes observations), then each image [B, *shape] uint8. It returns
-[B, K] float32. The recurrent core, the hidden layers and the heads follow, as without an encoder. Actor and critic share one
-encoder.
+`module:factory` names a callable: factory(features, images) -> torch.nn.Module. `features` is the number of features of all
+arrays of an observation that are not images; `images` has the shapes of the images. The module is called with the features
+[B, features] float32 (normalized if the run normalizes observations), then with each image [B, *shape] uint8. It returns
+[B, K] float32. The recurrent core, the hidden layers and the heads follow, just as without an encoder. Actor and critic
+share one encoder.
 
-The encoder's parameters are in the flat buffer with all others. It must have no other state: buffers (such as the running
-mean of BatchNorm) are not sent with the weights. It must not use dropout: the learner could not reproduce the worker's
-probabilities.
+The encoder's parameters are in the flat buffer with all others. It must have no other state, because buffers (such as the
+running mean of BatchNorm) are not sent with the weights. It must not use dropout, because the learner could not reproduce
+the worker's probabilities.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from millrace.protocol.policy.features import feature_size
 from millrace.protocol.random_streams import Purpose, torch_seed
 from millrace.protocol.specs import ActionSpec, EncoderSpec, Leaf, NamedShape, PolicySpec
 
-ROWS = 2  # observations of a trial pass: with only one, a module that mixes up rows would go unnoticed
+ROWS = 2  # observations in a trial pass: with only one, a module that mixes up rows would go unnoticed
 
 
 def describe_encoder(factory: str, observation: tuple[Leaf, ...], action: ActionSpec) -> EncoderSpec:
-    """Make the encoder once to find its parameters and output size.
+    """Make the encoder once, to find out its parameters and its output size.
 
-    Raises `UsageError`, with a one-line message, if it cannot be made or its output does not fit.
+    Raises `UsageError`, with a one-line message, if it cannot be made, or its output has the wrong shape or dtype.
     """
     spec = PolicySpec(observation, action)
     module = _make(factory, spec, seed=0)
@@ -37,7 +37,10 @@ def describe_encoder(factory: str, observation: tuple[Leaf, ...], action: Action
 
 
 def make_encoder(spec: PolicySpec, seed: int) -> torch.nn.Module:
-    """The encoder of this policy with the initial weights of this seed. Raises `UsageError` if its parameters differ."""
+    """The encoder of this policy, with the initial weights for this seed.
+
+    Raises `UsageError` if it cannot be made, or its parameters differ from those in the spec.
+    """
     wanted = spec.encoder
     assert wanted is not None
     module = _make(wanted.factory, spec, seed)
@@ -53,9 +56,9 @@ def make_encoder(spec: PolicySpec, seed: int) -> torch.nn.Module:
 
 
 def multiply_adds_of_encoder(spec: PolicySpec) -> int:
-    """Multiply-adds of a pass of one observation: for each module, its weights times the places of its output.
+    """Multiply-adds of a forward pass of one observation: for each module, its weights times the places of its output.
 
-    Exact for linear layers and convolutions. LSTM cells and attention use their weights more often than this.
+    This is exact for linear layers and convolutions. LSTM cells and attention use their weights more often than that.
     """
     assert spec.encoder is not None
     encoder = _make(spec.encoder.factory, spec, seed=0)
@@ -92,14 +95,17 @@ def _make(factory: str, spec: PolicySpec, seed: int) -> torch.nn.Module:
         raise UsageError(f"encoder {factory}: expected it to return a torch.nn.Module, got {type(module).__name__}")
     if kept := [name for name, _ in module.named_buffers()]:
         raise UsageError(f"encoder {factory}: expected only parameters, got the buffer {kept[0]}; use LayerNorm, say")
-    usual = (torch.float32, torch.get_default_dtype())  # the latter is the program's own choice, or an environment's
+    usual = (torch.float32, torch.get_default_dtype())  # the program or an environment may have set the latter
     if strange := [name for name, parameter in module.named_parameters() if parameter.dtype not in usual]:
         raise UsageError(f"encoder {factory}: expected float32 parameters, got another dtype in {strange[0]}")
     return module.float().eval()
 
 
 def _output_size(factory: str, module: torch.nn.Module, spec: PolicySpec) -> int:
-    """The output size K, found by a forward pass on `ROWS` observations of zeros."""
+    """The output size K, found by a forward pass on `ROWS` observations of zeros.
+
+    Raises `UsageError` if the module raises, or its output isn't float32 [ROWS, K].
+    """
     images = [torch.zeros(ROWS, *leaf.shape, dtype=torch.uint8) for leaf in spec.observation if leaf.is_image]
     try:
         with torch.no_grad():

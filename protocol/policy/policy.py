@@ -12,7 +12,7 @@ from millrace.protocol.wire.weight_dtypes import ActingDtype
 
 
 class Policy(Protocol):
-    """Chooses distribution parameters for observations. Leaves are [L, N, *leaf]; params are [L, N, P] float32.
+    """Computes distribution params [L, N, P] float32 for the observations [L, N, *leaf] of N copies in each of L lanes.
 
     `state` [L, N, S] float32 is the state of the recurrent core. A call updates it in place
     (`millrace.protocol.policy.recurrent`).
@@ -23,12 +23,13 @@ class Policy(Protocol):
         ...
 
     def __call__(self, leaves: Sequence[Array], state: Floats | None = None) -> Floats:
-        """Distribution parameters for these observations. Without `state`, each observation is the first of its episode."""
+        """Distribution params for these observations. Without `state`, each observation is the first of its episode."""
         ...
 
 
 def make_policy(spec: PolicySpec, images: ActingDtype = "float32") -> Policy:
-    """The policy of this spec: in numpy for an MLP, else (images, encoders) in torch, which is imported only then.
+    """The policy of this spec: in numpy if it is an MLP. With images or an encoder, it is in torch, which is only then
+    imported.
 
     `images` is the precision in which images are processed.
     """
