@@ -1,7 +1,7 @@
-"""How far a run is: one record that the learner sends, writes into the run folder, and shows. Pure.
+"""The progress of a run: one record that the learner sends, writes into the run folder, and shows. Pure.
 
 Rule: it is plain data of bounded size, so that it can be sent, and read from a folder that may come from a stranger.
-Everything that shows how far a run is renders this record, and counts nothing itself.
+Everything that shows the progress of a run renders this record, and counts nothing itself.
 """
 
 from __future__ import annotations
@@ -12,16 +12,16 @@ from millrace.protocol.bounds import Figure, Line, Moment, Name, Natural, Real
 
 
 class RunProgress(msgspec.Struct, frozen=True, kw_only=True):
-    """How far a run is at one moment. Returns are sums of raw rewards. A number that does not exist is None."""
+    """The progress of a run at one moment. Returns are sums of raw rewards. A number that does not exist is None."""
 
     at_s: Moment = 0.0
-    """when this was so; 0 if that is not known"""
+    """that moment; 0 if it is not known"""
     env_steps: Natural = 0
     """env steps that updates have used so far, including those before a resume"""
     collected: Natural = 0
     """env steps of the rollouts that the learner waits for, as workers report them; 0 while it waits for none"""
     total_steps: Natural = 0
-    """env steps to train for; 0 if there is no end: your own learner, or a vector environment"""
+    """env steps to train for; 0 if there is no end, as for your own learner, or a vector environment"""
     updates: Natural = 0
     """updates made so far, including those before a resume"""
     wall_s: Figure = 0.0
@@ -39,29 +39,29 @@ class RunProgress(msgspec.Struct, frozen=True, kw_only=True):
     workers_alive: Natural = 0
     """workers that have joined and are not lost"""
     workers_expected: Natural = 0
-    """workers that this run starts; 0: any number may join"""
+    """workers that this run starts; 0 if any number may join"""
     ledger: dict[Name, Natural] = {}
     """number of tickets and transitions in each state"""
     stages: dict[Name, Figure] = {}
     """seconds that the learner, and all workers together, have spent in each stage so far"""
     phase: Name = ""
-    """what the learner is doing: starting, gathering rollouts, learning, or evaluating; empty if that is not known"""
+    """the learner's current activity: starting, gathering rollouts, learning, or evaluating; empty if it is not known"""
     waiting: Line = ""
-    """who waits for whom, and for what share of the time, or how far an evaluation is: "evaluating for 41 s: 37 of 100
+    """who waits for whom, and for what share of the time, or the progress of an evaluation: "evaluating for 41 s: 37 of 100
     episodes (…"; empty if nobody waits long"""
     stop_reason: Line = ""
     """why the run ended; empty while it continues"""
     cut_short: bool = False
-    """whether an error or an interrupt ended it"""
+    """whether an error or an interrupt ended the run"""
 
     @property
     def env_steps_made(self) -> int:
-        """Env steps that updates have used, and those that the next one waits for."""
+        """Env steps that updates have used, plus those already collected for the next update."""
         return self.env_steps + self.collected
 
     @property
     def share(self) -> float:
-        """How much of the run is done, from 0 to 1; 0 if there is no end."""
+        """The share of the run that is done, from 0 to 1; 0 if the run has no end."""
         return min(1.0, self.env_steps_made / self.total_steps) if self.total_steps else 0.0
 
     @property

@@ -1,8 +1,9 @@
 """All random streams: each is derived from a seed and its purpose. Pure; imports no torch.
 
-Law: streams of one seed never share a purpose and indices, and none is the stream of the seed itself, because each has a
-spawn key of numpy's `SeedSequence`. gymnasium's environments draw from the seed itself (`np_random`). So the random numbers
-that choose actions, or rows to learn from, are independent of the environment's, even if both have the same seed.
+Law: no two streams of a seed share both purpose and indices, and none is the stream of the seed itself, because purpose and
+indices are a spawn key of numpy's `SeedSequence`. gymnasium's environments draw from the seed itself (`np_random`). So the
+random numbers that choose actions, or rows to learn from, are independent of the environment's, even if both have the same
+seed.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import numpy as np
 
 
 class Purpose(IntEnum):
-    """What a stream is for, and its indices.
+    """The purpose of a stream. The text below each purpose says what is drawn from it and, after a semicolon, its indices.
 
     The numbers determine the bits of every run: a new purpose gets a new number.
     """
@@ -21,19 +22,19 @@ class Purpose(IntEnum):
     WEIGHTS = 1
     """initial weights, except those of an encoder"""
     ENCODER = 2
-    """initial weights of an encoder: PyTorch's global generator"""
+    """initial weights of an encoder, drawn by PyTorch's global generator"""
     SHUFFLES = 3
-    """which rows make a minibatch"""
+    """the rows of each minibatch"""
     NOISE = 4
     """noise of SAC's actions and TD3's target actions in a gradient step"""
     REPLAY = 5
-    """what is drawn from a replay buffer"""
+    """the rows sampled from a replay buffer"""
     PRIOR = 6
-    """what is drawn from a dataset of prior data"""
+    """the rows sampled from a dataset of prior data"""
     COPIES = 7
     """reset seeds of env copies; lane, number of the start, copy"""
     ACTIONS = 8
-    """actions of rollouts, with their exploration; lane, with a stream for each round"""
+    """actions of rollouts, including exploration; lane, and within it a stream for each round"""
     EVALUATION = 9
     """reset seeds of a run's evaluations; episode"""
     CONFIRMATION = 10
@@ -43,32 +44,32 @@ class Purpose(IntEnum):
     RECORDING = 12
     """reset seeds of a recording; episode"""
     PLAYED_ACTIONS = 13
-    """actions of an episode, from its reset seed; and of a loaded policy"""
+    """actions of a played episode, where the seed is the episode's reset seed; also actions of a loaded policy"""
     REPLACEMENT = 14
-    """reset seed of an env copy that replaces a lost one, from the lost one's; incarnation"""
+    """reset seed of an env copy that replaces a lost one, derived from the lost one's seed; incarnation"""
     SECOND_INSTANCE = 15
-    """reset seed of the second instance of `ResetAhead`, from that of the first"""
+    """reset seed of the second instance of `ResetAhead`, derived from that of the first"""
     CLONING = 16
     """the order of demonstrations; epoch"""
     OPPONENTS = 17
     """actions of opponents; lane, round"""
     MATCHES = 18
-    """which opponent plays in a rollout; lane, round"""
+    """the opponent of a rollout; lane, round"""
     PLAYED_OPPONENTS = 19
-    """actions of opponents in an episode, from its reset seed"""
+    """actions of opponents in a played episode, where the seed is the episode's reset seed"""
     ROUNDS = 20
-    """times of the rounds that `millrace plan` imagines"""
+    """durations of the rounds that `millrace plan` simulates"""
 
 
 def generator(seed: int, purpose: Purpose, *indices: int) -> np.random.Generator:
-    """The stream, in numpy."""
+    """A numpy generator for the stream of this seed, purpose and indices."""
     return np.random.default_rng(_sequence(seed, purpose, indices))
 
 
 class RoundStreams:
-    """One stream for each round: that of round r begins 2**64 · r draws after that of round 0, of 2**128.
+    """One stream for each round: the stream of round r begins 2**64 · r draws after that of round 0 (the period is 2**128).
 
-    It is several times faster than `generator`. The streams share one generator, so only the newest may be drawn from.
+    This is several times faster than `generator`. The streams share one generator, so only the newest may be drawn from.
     """
 
     def __init__(self, seed: int, purpose: Purpose, *indices: int) -> None:
@@ -84,7 +85,7 @@ class RoundStreams:
 
 
 def env_seed(seed: int, purpose: Purpose, *indices: int) -> int:
-    """A reset seed, 31 bits, because environments pass seeds to C. Seeds of different indices differ in practice."""
+    """A reset seed. It has 31 bits, because environments pass seeds to C. In practice, other indices give another seed."""
     return int(_sequence(seed, purpose, indices).generate_state(1)[0] >> 1)
 
 

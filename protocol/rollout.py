@@ -1,23 +1,24 @@
 """The row format. Pure: arrays in, arrays out.
 
-Row t says: in `obs[t]` the policy took `action[t]`, got `reward[t]` and saw `obs[t+1]`, wherever `valid[t]`. This is
-gymnasium's NEXT_STEP autoreset: the step after an episode's end only resets that copy, so its row holds no transition and is
+Wherever `valid[t]` is True, row t says: in `obs[t]` the policy took `action[t]`, got `reward[t]` and saw `obs[t+1]`. This is
+gymnasium's NEXT_STEP autoreset: the step after an episode's end only resets that copy, so its row has no transition and is
 not valid. Hence, for every copy:
 
     valid[t+1]  ==  not (terminated[t] or truncated[t])
 
-If both flags are set, terminated wins. Every consumer (returns, losses, counts, replay buffer) masks with `valid`.
+If both flags are set, terminated wins. All code that uses rows (returns, losses, counts, replay buffer) masks with `valid`.
 
 With several agents, a column is one seat of a copy (`millrace.protocol.envs.seats`), and more rows are not valid: those of a
-seat that waits for others, or isn't present. A seat's row is the one in which its outcome arrives: until then `obs` shows
-the observation in which the seat acted, and `action` and `log_prob` its action, and the row after it shows its next
-observation. So the sentence above holds for every valid row, and one rule is added: *a row that is not valid passes
-through*. Rows between a seat's row and its next one don't change what is carried over, such as a return or a recurrent
-state. `ended` cuts, as always. `resets` says which steps only reset the copy:
+seat that waits for others, or isn't present. A valid row of a seat is the one in which the outcome of its action arrives.
+Until then, `obs` repeats the observation in which the seat acted, and `action` and `log_prob` repeat its action; the row
+after the valid one has the seat's next observation. So the sentence above holds for every valid row, and one rule is added:
+*a row that is not valid passes through*. Rows between two valid rows of a seat don't change what is carried from one to the
+other, such as a return or a recurrent state. Both are still cut where an episode has ended (terminated or truncated).
+`resets` says which steps only reset the copy:
 
-    an ended row is valid, and no later row of that seat is until its copy is reset
-    a step that resets has no valid row
-    if the agents take no turns, a valid row that has not ended is followed by a valid one
+    a row that is terminated or truncated is valid, and no later row of that seat is valid until its copy is reset
+    a step that resets a copy has no valid row of it
+    if agents don't take turns, a valid row that is neither terminated nor truncated is followed by a valid one
 """
 
 from __future__ import annotations
@@ -46,13 +47,13 @@ class Episode(msgspec.Struct, frozen=True, array_like=True):
     """number of steps (rule EPISODES)"""
     seconds: Seconds
     facts: Annotated[tuple[float, ...], Meta(max_length=MAX_FACTS)] = ()
-    """one number for each name in `RunSpec.facts`, from the info of the episode's last step; NaN where it had none"""
+    """one number for each name in `RunSpec.facts`, from the info of the episode's last step; NaN where the info lacked it"""
     opponent: Whole | None = None
-    """who played the other teams, as in a `Permit`; none if the policy played all seats"""
+    """who played the other teams, as in a `Permit`; null if the policy played all seats"""
 
 
 class Rollout(msgspec.Struct, frozen=True, tag=True, array_like=True, forbid_unknown_fields=True):
-    """T steps of a lane of N env copies, all acted under one version."""
+    """T steps of a lane of N env copies, with actions chosen under one version of the weights."""
 
     session: Natural
     lane: Natural
@@ -65,7 +66,7 @@ class Rollout(msgspec.Struct, frozen=True, tag=True, array_like=True, forbid_unk
     action: Array
     """[T, N, *action] as sampled: int64 counted from 0, or float32, before clipping or in [-1, 1] (`PolicySpec.head`)"""
     log_prob: Array
-    """[T, N] float32, under the policy that acted; zeros if it is the user's own and does not return them"""
+    """[T, N] float32: log-probabilities under the policy that acted; zeros if it is user-defined and doesn't return them"""
     reward: Array
     """[T, N] float32, raw"""
     terminated: Array
@@ -79,24 +80,24 @@ class Rollout(msgspec.Struct, frozen=True, tag=True, array_like=True, forbid_unk
     episodes: tuple[Episode, ...] = ()
     """the episodes that ended in this rollout, ordered by step, then by copy (rule EPISODE_ORDER)"""
     mask: Array | None = None
-    """[T+1, N, choices] bool: which actions were allowed in `obs`; none unless `RunSpec.masked`"""
+    """[T+1, N, choices] bool: which choices were allowed in `obs`; null unless `RunSpec.masked`"""
     extras: tuple[Array, ...] = ()
     """one array [T, N, *shape] for each of `RunSpec.extras`"""
     resets: Array | None = None
-    """[T+1, N] bool, with seats: whether step t only resets this copy; the last row is of the next rollout's first step. The
-    N of all other arrays is then `RunSpec.sent_columns`. None without seats: it is ~valid"""
+    """[T+1, N] bool, with seats: whether step t only resets this copy; the last row belongs to the first step of the next
+    rollout. The N of all other arrays is then `RunSpec.sent_columns`. Null without seats, where it would be ~valid"""
     begun: Annotated[tuple[EpisodeBegin, ...], Meta(max_length=MAX_COPIES)] = ()
-    """how the newest episode began of each copy that has one since the rollout before; none from a worker that cannot tell
-    (rule PAST)"""
+    """for each copy that has begun an episode since the previous rollout, how its newest one began; empty from a worker that
+    cannot report this (rule PAST)"""
     memory: tuple[Array, ...] = ()
-    """what else the worker needs in order to continue the lane after these rows: it comes back as it is, in `LanePast`. None
-    from a worker that cannot continue one (rule PAST)"""
+    """whatever else the worker needs in order to continue the lane after these rows: the learner returns it unchanged, in
+    `LanePast`. Empty from a worker that cannot continue a lane (rule PAST)"""
     saved: Annotated[tuple[Natural, ...], Meta(max_length=MAX_COPIES)] = ()
-    """the copies whose environment has saved its state, which is in `memory` (rule PAST)"""
+    """the copies whose environment has saved its state; the states are in `memory` (rule PAST)"""
 
     @property
     def env_steps(self) -> int:
-        """Number of steps of env copies, without those that only reset one."""
+        """Number of steps of env copies, not counting those that only reset a copy."""
         return _env_steps(self.valid, self.resets)
 
 
@@ -107,7 +108,7 @@ def _env_steps(valid: Array, resets: Array | None) -> int:
 
 
 def rollout_bytes(run: RunSpec) -> int:
-    """Number of bytes of all arrays of a rollout of this run."""
+    """Total number of bytes of the arrays in a rollout of this run."""
     T = run.rollout_steps
     N = run.sent_columns
     leaves = [(T + 1, leaf.shape, leaf.dtype) for leaf in run.policy.seen]
@@ -122,9 +123,9 @@ def rollout_bytes(run: RunSpec) -> int:
 
 
 def memory_bytes(run: RunSpec) -> int:
-    """Largest number of bytes of `Rollout.memory`, without the states that environments have saved.
+    """Largest number of bytes of `Rollout.memory`, not counting the states that environments have saved.
 
-    Without seats, it is the exact number, if the worker can continue a lane.
+    Without seats, it is the exact number if the worker can continue a lane.
     """
     if run.teams:
         return 0
@@ -133,13 +134,13 @@ def memory_bytes(run: RunSpec) -> int:
     if not run.seats:
         return of_copies + of_state
     action = run.policy.action
-    chosen = 32 * (action.choices + math.prod(action.shape) + 1)  # action, numbers of the distribution, noise
+    chosen = 32 * (action.choices + math.prod(action.shape) + 1)  # bytes of an action, its distribution params and its noise
     extras = sum(math.prod(extra.shape) * np.dtype(extra.dtype).itemsize for extra in run.extras)
     return of_copies + 2 * of_state + run.columns * (1 + chosen + extras)
 
 
 class Batch(msgspec.Struct, frozen=True):
-    """Rollouts side by side: T steps of ΣN columns, in lane order."""
+    """Several rollouts, concatenated along their columns: T steps of ΣN columns, in lane order."""
 
     obs: tuple[Array, ...]
     """one array [T+1, ΣN, *leaf] for each leaf"""
@@ -156,35 +157,36 @@ class Batch(msgspec.Struct, frozen=True):
     lane: npt.NDArray[np.int64]
     """[ΣN] the lane of each column"""
     fresh: Bools
-    """[ΣN] True where no state carries over from an earlier rollout: the column's lane has just been started, or a rollout
-    between the two was not used"""
+    """[ΣN] True where the rows don't continue those of an earlier batch: the column's lane has just been started, or a
+    rollout in between was not used"""
     columns_per_rollout: int
-    """N, with seats N · A: number of adjacent columns of each lane, or a multiple if the batch has several of its rollouts
+    """number of columns of each rollout: N, or N · A with seats. The columns of a lane are adjacent, even if the batch has
+    several of its rollouts
     """
     episodes: tuple[Episode, ...]
     extras: tuple[Array, ...] = ()
     """one array [T, ΣN, *shape] for each of `RunSpec.extras`"""
     mask: Bools | None = None
-    """[T+1, ΣN, choices] which actions were allowed in `obs`; None unless the run uses action masks"""
+    """[T+1, ΣN, choices] which choices were allowed in `obs`; None unless the run uses action masks"""
     resets: Bools | None = None
     """[T+1, copies of all lanes] which steps only reset a copy; None unless the environment has seats"""
 
     @property
     def env_steps(self) -> int:
-        """Number of steps of env copies, without those that only reset one."""
+        """Number of steps of env copies, not counting those that only reset a copy."""
         return _env_steps(self.valid, self.resets)
 
 
 def _by_column(flags: bool | Bools, columns: int) -> Bools:
-    """The flags by column, from a single flag or from one [N] for each env copy."""
+    """The flag of each column, from a single flag for all, or from flags [N] for N env copies."""
     return np.repeat(np.atleast_1d(flags), columns // np.size(flags))
 
 
 def stack_rollouts(rollouts: Sequence[Rollout], fresh: Sequence[bool | Bools] | None = None) -> Batch:
     """Copy rollouts into one writable batch [T, ΣN], in lane order; rollouts of one lane stay in the given order.
 
-    `fresh`: for each rollout, whether nothing carries over from an earlier one, or [copies] for each env copy; None: True
-    for the first of a lane.
+    `fresh` says for each rollout whether it doesn't continue an earlier one: as one flag, or as flags [copies] for each env
+    copy. If it is None, only the first rollout of a lane is fresh.
     """
     if fresh is None:
         fresh = [rollout.sequence == 0 for rollout in rollouts]
@@ -195,7 +197,7 @@ def stack_rollouts(rollouts: Sequence[Rollout], fresh: Sequence[bool | Bools] | 
         return np.concatenate(arrays, axis=1)
 
     def side_by_side_if_any(arrays: Sequence[Array | None]) -> Array | None:
-        """The joined array: either all rollouts of a run have it, or none."""
+        """The joined array; None if the rollouts don't have it. Either all rollouts of a run have it, or none."""
         return None if arrays[0] is None else side_by_side([array for array in arrays if array is not None])
 
     columns_per_rollout = ordered[0].reward.shape[1]

@@ -1,15 +1,15 @@
-"""The rules of the conversation, by name.
+"""The rules of the conversation between worker and learner, by name.
 
-What a rule says stands once, in README.md, behind a marker with its name:
+The text of a rule is written once, in README.md, after a marker with the rule's name:
 
     <!-- rule ORDER_ONCE -->An order that comes again is not executed again: the same answer is sent again.
 
-Rule: whatever keeps, checks or breaks a rule names it. State tables and other code do so in a comment (`rule ORDER_ONCE`);
-the model's invariants and mutations, the checks of clients and the mutants of a client, by `Rule.ORDER_ONCE`. What they are
-is shown, and held complete, by `tests/protocol/test_rules.py`.
+Rule: all code that keeps, checks or breaks a rule names it. State tables and other code do so in a comment
+(`rule ORDER_ONCE`). The model's invariants and mutations, the checks of clients and the mutants of a client do so by
+`Rule.ORDER_ONCE`. `tests/protocol/test_rules.py` lists all of them, and checks that none is missing.
 
-The words of a rule end at the next marker, which may have no name, or with their paragraph, list item or cell of a table. A
-rule with several markers has several parts. The meaning of a message or a field is a rule if it ends with `(rule CUT)`.
+The text of a rule ends at the next marker, which may have no name, or at the end of its paragraph, list item or table cell.
+A rule with several markers has several parts. The docstring of a message or a field is a rule if it ends with `(rule CUT)`.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ class Words(NamedTuple):
     section: str
     """the heading above it"""
     text: str
-    """in one line; an ellipsis stands for omitted text between two parts"""
+    """the text in one line; an ellipsis stands for omitted text between two parts"""
 
     @property
     def where(self) -> str:
-        """The document and its section, for people."""
+        """The document and its section, as an error shows them."""
         return f"protocol/README.md, “{self.section}”"
 
 
@@ -217,7 +217,7 @@ class Rule(Enum):
 
     @property
     def words(self) -> Words:
-        """Its text in the document."""
+        """The rule's text in the document."""
         return in_document()[self.name]
 
 

@@ -1,6 +1,6 @@
 """An environment as plain data: its spaces with exact bounds, its metadata and its time limit. It is sent in `Described`.
 
-Rule: sizes are checked before anything of that size is allocated. `check_size` checks a peer's description before the spaces
+Rule: sizes are checked before anything of that size is allocated. `check_size` checks a peer's description before its spaces
 are made.
 """
 
@@ -20,9 +20,9 @@ from millrace.protocol.errors import BadMessage
 MAX_LEAVES = 48  # arrays of an observation: a rollout sends each in its own frame
 MAX_DEPTH = 8
 MAX_WRAPPERS = 1 << 8  # classes of an environment's wrappers
-MAX_SPACES = 1 << 12  # of an environment, including nested ones, if they have random generators
+MAX_SPACES = 1 << 12  # spaces of an environment, including nested ones, whose random generators are sent
 MAX_SEATS = 1 << 10  # agents of an environment
-MAX_ELEMENTS = 1 << 24  # of all leaves of a space together
+MAX_ELEMENTS = 1 << 24  # elements of all leaves of a space together
 
 Shape = Annotated[tuple[Natural, ...], Meta(max_length=8)]
 Dtype = Literal[
@@ -88,37 +88,38 @@ SpaceSpec = BoxSpace | DiscreteSpace | MultiDiscreteSpace | MultiBinarySpace | D
 
 
 GeneratorState = Annotated[str, Meta(pattern=r"^([0-9a-f]{64}[01][0-9a-f]{8})?\Z")]
-"""State of numpy's PCG64 in hexadecimal digits: 32 of its state, 32 of its increment, 1 if half of a number is left to draw,
-8 of this half. Empty: none.
+"""State of numpy's PCG64 in hexadecimal digits: 32 for its state, 32 for its increment, 1 for whether half of a drawn number
+is left over, 8 for that half. Empty if there is no generator.
 """
 
 
 class EnvDescription(msgspec.Struct, frozen=True, array_like=True):
-    """All that the learner knows of the environment."""
+    """All that the learner knows about the environment."""
 
     observation: SpaceSpec
     action: SpaceSpec
     metadata: Array
-    """[bytes] uint8, `plain_values`: `Env.metadata` as far as it is plain data"""
+    """[bytes] uint8, `plain_values`: the entries of `Env.metadata` that are plain data"""
     spec: Text
-    """gymnasium's `EnvSpec` as JSON; empty if the environment has none, or one that JSON cannot hold"""
+    """gymnasium's `EnvSpec` as JSON; empty if the environment has none, or one that JSON cannot represent"""
     longest_episode: Natural
     """time limit in env steps; 0 if there is none"""
     render_mode: Name
     generators: Annotated[tuple[GeneratorState, ...], Meta(max_length=MAX_SPACES)] = ()
-    """the random generator of each space, if any is seeded: the observation space, the spaces inside it, depth first, then
-    the action space likewise. So samples that the learner draws are those of the environment
+    """the random generator of each space, if any is seeded: that of the observation space, those of the spaces inside it,
+    depth first, then likewise for the action space. So the learner draws the same samples as the environment would
     """
     wrappers: Annotated[tuple[Line, ...], Meta(max_length=MAX_WRAPPERS)] = ()
-    """the classes of the copy's gymnasium wrappers, as `module:Class`, and the wrappers from which these classes derive"""
+    """the classes of the copy's gymnasium wrappers, as `module:Class`, and the wrapper classes from which these derive"""
     seats: Annotated[tuple[Name, ...], Meta(max_length=MAX_SEATS)] = ()
-    """the names of the agents, if the environment has several or takes PettingZoo's form; the spaces are those of each"""
+    """the names of the agents, if the environment has several, or PettingZoo's interface; the spaces are those of each agent
+    """
     takes_turns: bool = False
     """whether a seat may have to wait for others between two of its actions"""
 
 
 def check_size(description: EnvDescription) -> None:
-    """Raise `BadMessage` if the spaces exceed the limits of leaves, nesting or elements. Allocates nothing."""
+    """Raise `BadMessage` if the spaces exceed the limits on leaves, nesting or elements. Allocates nothing."""
     for name, space in (("observation", description.observation), ("action", description.action)):
         check_space(f"{name} space", space)
 
@@ -134,7 +135,7 @@ def check_space(name: str, space: SpaceSpec) -> None:
 
 
 def _leaves(space: SpaceSpec, depth: int) -> Iterator[int]:
-    """The number of elements of each array."""
+    """The number of elements of each array. Raises `BadMessage` if the space is nested too deeply."""
     if depth > MAX_DEPTH:
         raise BadMessage(f"space: expected at most {MAX_DEPTH} levels of Dict and Tuple, got more")
     match space:

@@ -1,4 +1,4 @@
-"""Plain data that describe a run: spaces, policy, and how much to collect. They are sent in `Welcome`."""
+"""Plain data that describe a run: its spaces, its policy, and how much to collect. They are sent in `Welcome`."""
 
 from __future__ import annotations
 
@@ -13,42 +13,42 @@ from millrace.protocol.env_spec import AllowedCode, EnvSpec, PickledCallable, Sc
 from millrace.protocol.space_spec import Shape
 from millrace.protocol.wire.weight_dtypes import ActingDtype
 
-WIDE_DTYPES = frozenset({"float64", "int32", "uint32", "int64", "uint64"})  # with more than float32's 24 bits
-MIN_IMAGE_SIDE = 5  # pixels: a 3 x 3 convolution, then one with stride 2
-HEARTBEAT_S = 1.0  # between two heartbeats of a worker, unless the learner wants them more often
+WIDE_DTYPES = frozenset({"float64", "int32", "uint32", "int64", "uint64"})  # more precise than float32's 24 bits
+MIN_IMAGE_SIDE = 5  # pixels: room for a 3 x 3 convolution, then one with stride 2
+HEARTBEAT_S = 1.0  # seconds between two heartbeats of a worker, unless the learner wants them more often
 
 
 class Leaf(msgspec.Struct, frozen=True):
     """One array of an observation. A Dict or Tuple observation has several."""
 
     path: str
-    """where it stands in the observation, `camera/left`; empty when the observation is one array"""
+    """position of the array in the observation, such as `camera/left`; empty if the observation is one array"""
     kind: Literal["box", "discrete", "multidiscrete", "multibinary"]
     shape: Shape
     dtype: str
-    """numpy's name of the stored dtype, `float32`"""
+    """numpy's name for the stored dtype, such as `float32`"""
     sizes: tuple[int, ...] = ()
     """how many values each entry can take (discrete, multidiscrete)"""
     start: tuple[int, ...] = ()
     """the smallest value of each entry (discrete, multidiscrete)"""
     divisor: Literal[1, 255] = 1
-    """a network sees each value divided by this: 255 for a Box of bytes (uint8) whose bounds are 0 and 255"""
+    """each value is divided by this before a network gets it: 255 for a Box of bytes (uint8) whose bounds are 0 and 255"""
 
     @property
     def name(self) -> str:
-        """Its name in errors."""
+        """The name of the array in errors."""
         return f"observation {self.path}".strip()
 
     @property
     def is_wide(self) -> bool:
-        """Whether it is a Box of numbers that float32 may not distinguish, such as a time in seconds since 1970."""
+        """Whether this is a Box of numbers that float32 may not distinguish, such as times in seconds since 1970."""
         return self.kind == "box" and self.dtype in WIDE_DTYPES
 
     @property
     def is_image(self) -> bool:
-        """A three-dimensional array of bytes is an image: it goes through a convolutional network.
+        """Whether this is an image, which goes through convolutions: a three-dimensional array of bytes (uint8).
 
-        If one of its sides is smaller than the convolutions need, it is flattened like any other array.
+        If one of its sides is smaller than the convolutions need, it is not an image: it is flattened like any other array.
         """
         if self.kind != "box" or self.dtype != "uint8" or len(self.shape) != 3:
             return False
@@ -56,7 +56,7 @@ class Leaf(msgspec.Struct, frozen=True):
 
     @property
     def has_channels_last(self) -> bool:
-        """Whether an image's last dimension has the channels. It does, unless it is larger than the first."""
+        """Whether the channels are an image's last dimension. They are, unless it is larger than the first."""
         return self.shape[2] <= self.shape[0]
 
 
@@ -64,27 +64,27 @@ class ActionPart(msgspec.Struct, frozen=True):
     """One space inside a Dict or Tuple of actions."""
 
     path: tuple[str | int, ...]
-    """where it stands: the key in each Dict, and the number in each Tuple, from the outermost"""
+    """position of the space: the key in each Dict and the index in each Tuple, from the outermost"""
     kind: Literal["discrete", "multidiscrete", "multibinary", "box"]
     shape: Shape
     dtype: str
-    """dtype that the environment takes"""
+    """dtype that the environment expects"""
 
 
 class ActionSpec(msgspec.Struct, frozen=True):
     """The action space of the policy."""
 
     kind: Literal["discrete", "multidiscrete", "multibinary", "box", "mixed"]
-    """the gymnasium space it comes from; `mixed`: a Dict or Tuple of the others"""
+    """the kind of gymnasium space; `mixed` is a Dict or Tuple of the others"""
     shape: Shape
     dtype: str
-    """dtype that the environment takes; a Box action is stored as float32, unclipped or in [-1, 1] (`PolicySpec.head`). A
+    """dtype that the environment expects; a Box action is stored as float32, unclipped or in [-1, 1] (`PolicySpec.head`). A
     mixed action is stored as a row [D] float32: the choices of all Discrete and MultiDiscrete parts, then the bits of all
     MultiBinary parts, then the numbers of all Box parts, each in the order of `parts`
     """
     sizes: tuple[int, ...] = ()
-    """how many choices each entry has (discrete, multidiscrete, mixed); at most 2²⁴ in a mixed action, so that float32 is
-    exact
+    """number of choices of each entry (discrete, multidiscrete, mixed); at most 2²⁴ in a mixed action, so that a float32
+    represents each choice exactly
     """
     start: tuple[int, ...] = ()
     """the smallest value of each entry (discrete, multidiscrete, mixed): stored actions count from 0"""
@@ -93,7 +93,7 @@ class ActionSpec(msgspec.Struct, frozen=True):
     high: tuple[float, ...] = ()
     """upper bounds (box, mixed), flattened"""
     parts: tuple[ActionPart, ...] = ()
-    """those of a mixed action, in the order of the space"""
+    """the parts of a mixed action, in the order of the space"""
 
     @property
     def stored_dtype(self) -> str:
@@ -102,22 +102,22 @@ class ActionSpec(msgspec.Struct, frozen=True):
 
     @property
     def in_words(self) -> str:
-        """Its name in errors."""
+        """The name of the action in errors."""
         return "a Dict or Tuple" if self.kind == "mixed" else f"{self.kind}{list(self.shape)}"
 
     @property
     def choices(self) -> int:
-        """How many choices all its entries have together, which is the number of logits and the length of a mask."""
+        """Total number of choices of all entries, which is the number of their logits and the length of a mask."""
         return sum(self.sizes)
 
     @property
     def bits(self) -> int:
-        """How many bits it has (multibinary, mixed)."""
+        """Number of bits (multibinary, mixed)."""
         return math.prod(self.shape) - len(self.sizes) - self.numbers
 
     @property
     def numbers(self) -> int:
-        """How many numbers it has (box, mixed): each has a standard deviation."""
+        """Number of continuous elements (box, mixed); the policy has a standard deviation for each."""
         return len(self.low)
 
 
@@ -125,35 +125,35 @@ class NamedShape(msgspec.Struct, frozen=True, array_like=True):
     """Name and shape of an array."""
 
     name: str
-    """its name in torch's `named_parameters`"""
+    """name of the array; for a parameter of a module, the one in torch's `named_parameters`"""
     shape: tuple[int, ...]
-    """its shape"""
+    """shape of the array"""
 
 
 class EncoderSpec(msgspec.Struct, frozen=True):
-    """A torch module written by the user, which comes before all other layers; see `protocol/policy/own_encoder.py`."""
+    """A user-defined torch module that comes before all other layers; see `protocol/policy/own_encoder.py`."""
 
     factory: str
-    """the callable that makes it, as `my_package.networks:encoder`"""
+    """the callable that makes the module, such as `my_package.networks:encoder`"""
     arrays: tuple[NamedShape, ...]
-    """its parameters, in the module's order"""
+    """the module's parameters, in its own order"""
     size: int
-    """how many features it returns"""
+    """number of features that the module returns"""
 
 
 class OwnPolicySpec(msgspec.Struct, frozen=True):
-    """A policy written by the user, which acts in the workers; see `protocol/policy/called_policy.py`."""
+    """A user-defined policy, which acts in the workers; see `protocol/policy/called_policy.py`."""
 
     factory: str
-    """the callable that makes it, as `my_package.policies:make`; or only the name of `code`"""
+    """the callable that makes the policy, such as `my_package.policies:make`; with `code`, only the callable's name"""
     arrays: tuple[NamedShape, ...]
-    """its parameters, in the order of the flat vector"""
+    """the policy's parameters, in the order of the flat vector"""
     kwargs: dict[str, Scalar] = {}
     """keyword arguments of the callable"""
     state_size: int = 0
     """S, the size of the state of one env copy"""
     has_log_prob: bool = False
-    """whether it returns log-probabilities of its actions; without them `Rollout.log_prob` is zeros"""
+    """whether the policy returns log-probabilities of its actions; if not, `Rollout.log_prob` is zeros"""
     code: PickledCallable | None = None
     """the callable, pickled by cloudpickle"""
 
@@ -164,32 +164,34 @@ class PolicySpec(msgspec.Struct, frozen=True):
     observation: tuple[Leaf, ...]
     action: ActionSpec
     net: tuple[int, ...] = (64, 64)
-    """widths of the hidden layers of the actor, and of the critic; or of the Q-network"""
+    """widths of the hidden layers of the actor and of the critic, or of the Q-network"""
     activation: Literal["tanh", "relu"] = "tanh"
     normalize_observations: bool = False
-    """subtract the running mean, divide by the running standard deviation, clip to ±10 (not images)"""
+    """whether to subtract the running mean from observations, divide them by the running standard deviation, and clip them
+    to ±10 (not images)"""
     head: Literal["actor_critic", "q", "squashed", "deterministic"] = "actor_critic"
-    """a distribution over actions and a state value; or the value of every discrete action, for epsilon-greedy acting; or an
-    actor with two critics, for a bounded Box: a squashed Gaussian (tanh), or a deterministic action (tanh) plus noise. The
-    actions of these two are stored in [-1, 1] and scaled to low … high for the environment"""
+    """the outputs. `actor_critic`: a distribution over actions, and a state value. `q`: the value of every discrete action,
+    for epsilon-greedy acting. `squashed` and `deterministic`: an actor with two critics, for a bounded Box, whose action is
+    a squashed Gaussian (tanh), or deterministic (tanh) plus noise; these actions are stored in [-1, 1] and scaled to low …
+    high for the environment"""
     shared_net: bool = False
-    """actor and critic share their hidden layers"""
+    """whether actor and critic share their hidden layers"""
     dueling: bool = False
-    """dueling architecture: action values from a state value and advantages (Wang et al. 2016)"""
+    """whether to use the dueling architecture: action values from a state value and advantages (Wang et al. 2016)"""
     encoder: EncoderSpec | None = None
-    """a module written by the user; none: images go through convolutions, other arrays are used directly"""
+    """a user-defined module; null: images go through convolutions, and other arrays are used directly"""
     core: Literal["lstm", "gru"] | None = None
-    """recurrent core between the features and the hidden layers; none: a policy without memory"""
+    """the recurrent core between the features and the hidden layers; null: a policy without memory"""
     core_size: int = 64
     """number of units of the core"""
     own: OwnPolicySpec | None = None
-    """a policy written by the user, in place of all that the fields after `action` describe"""
+    """a user-defined policy, which replaces everything that the fields after `action` describe"""
     critic: tuple[Leaf, ...] = ()
-    """further arrays of an observation, which only the critic sees: rows hold them after the others"""
+    """further arrays of an observation, which only the critic sees; in rows, they come after the others"""
 
     @property
     def seen(self) -> tuple[Leaf, ...]:
-        """All arrays of an observation in rows."""
+        """All arrays of an observation that rows contain."""
         return (*self.observation, *self.critic)
 
     @property
@@ -226,7 +228,7 @@ class PolicySpec(msgspec.Struct, frozen=True):
 
 
 class ExtraArray(msgspec.Struct, frozen=True, array_like=True):
-    """A further array of a rollout: [T, N, *shape]."""
+    """An additional array of a rollout, [T, N, *shape]."""
 
     name: str
     shape: tuple[int, ...]
@@ -234,16 +236,16 @@ class ExtraArray(msgspec.Struct, frozen=True, array_like=True):
 
 
 class WaitSpec(msgspec.Struct, frozen=True, tag=True):
-    """A learner whose run has not begun, because it does not know the environment yet. The worker waits in its session for
-    orders to describe one, and for a second `Welcome`, which brings the run.
+    """The run has not begun, because the learner does not know the environment yet. The worker waits in its session for
+    orders to describe an environment, and for a second `Welcome`, which contains the run.
     """
 
     call_timeouts: CallTimeouts = CallTimeouts()
     """how long a call of user code may take before the worker's supervisor ends it; ignored by a worker without one"""
     heartbeat_s: float = HEARTBEAT_S
     learner_timeout_s: float = 600.0
-    """a worker says Hello again if no message of the learner has followed its Heartbeat for this long. The learner may read
-    a checkpoint or a dataset for long before the run begins, without reading messages
+    """seconds after a Heartbeat at which a worker says Hello again if the learner has sent nothing since. Before the run
+    begins, the learner may read a checkpoint or a dataset for a long time, without reading messages
     """
 
 
@@ -253,9 +255,9 @@ class RunSpec(msgspec.Struct, frozen=True, tag=True):
     env: EnvSpec
     policy: PolicySpec
     rollout_steps: int
-    """T"""
+    """T, the number of steps of a rollout"""
     copies: int
-    """N, env copies in a lane"""
+    """N, the number of env copies in a lane"""
     lanes: int
     seed: int
     vector: str = "loop"
@@ -263,48 +265,48 @@ class RunSpec(msgspec.Struct, frozen=True, tag=True):
     (`native`) or by envpool's (`envpool`), or in a way that a package on the worker's machine adds
     """
     zstd: bool = False
-    """whether workers may also compress the larger arrays of their rollouts with Zstandard"""
+    """whether workers may compress the larger arrays of their rollouts with Zstandard"""
     images_dtype: ActingDtype = "float32"
     """precision in which workers process images with the built-in convolutions"""
     masked: bool = False
-    """whether rollouts carry a mask of the allowed actions"""
+    """whether rollouts contain masks of the allowed actions"""
     facts: tuple[str, ...] = ()
     """names of numbers that the environment reports in `info` when an episode ends"""
     extras: tuple[ExtraArray, ...] = ()
-    """further arrays of each rollout"""
+    """additional arrays of each rollout"""
     seats: tuple[str, ...] = ()
     """names of the A agents of each copy; empty if the environment is gymnasium's, which has one"""
     takes_turns: bool = False
     """whether a seat may have to wait for others between two of its actions"""
     teams: tuple[tuple[int, ...], ...] = ()
-    """with opponents: the seats of each team, all of one size. In each copy the policy plays one team, and rollouts have the
-    rows of that one alone. Empty: it plays all seats"""
+    """with opponents: the seats of each team; all teams have the same size. In each copy, the policy plays one team, and
+    rollouts contain only the rows of that team. Empty: the policy plays all seats"""
     scripted: tuple[str, ...] = ()
     """opponents that aren't weights: each is a callable that makes a policy (`protocol/policy/called_policy.py`)"""
     opponent: PolicySpec | None = None
-    """the policy of opponents, if it is not `policy`"""
+    """the policy of the opponents, if it differs from `policy`"""
     call_timeouts: CallTimeouts = CallTimeouts()
     """how long a call of user code may take before the worker's supervisor ends it; ignored by a worker without one"""
     heartbeat_s: float = HEARTBEAT_S
     restart_episodes: int = 0
-    """after this many episodes, a worker that can do so closes an env copy and creates it again, to continue as the copy
-    would have done; 0: never"""
+    """after this many episodes, a worker that can do so closes an env copy and creates it again, so that the new copy
+    continues exactly as the old one would have; 0: never"""
     learner_timeout_s: float = 30.0
-    """a worker says Hello again if no message of the learner has followed its Heartbeat for this long"""
+    """seconds after a Heartbeat at which a worker says Hello again if the learner has sent nothing since"""
 
     @property
     def columns(self) -> int:
-        """N · A, the columns of a lane: those of a copy's seats are adjacent."""
+        """N · A, the number of columns of a lane. The columns of a copy's seats are adjacent."""
         return self.copies * self.seats_of_copy
 
     @property
     def sent_seats(self) -> int:
-        """How many seats of each copy have rows in a rollout."""
+        """Number of seats of each copy that have rows in a rollout."""
         return len(self.teams[0]) if self.teams else self.seats_of_copy
 
     @property
     def sent_columns(self) -> int:
-        """The columns of a rollout: those of a lane, or of the policy's team alone."""
+        """Number of columns of a rollout: all those of the lane, or only those of the policy's team."""
         return self.copies * self.sent_seats
 
     def team_of(self, lane: int, copy: int) -> int:
@@ -313,18 +315,18 @@ class RunSpec(msgspec.Struct, frozen=True, tag=True):
 
     @property
     def info_keys(self) -> tuple[str, ...]:
-        """The facts that an environment reports. The later ones are computed: the score, or the returns of the seats."""
+        """The facts that the environment itself reports. Those after them are computed: the score, or the seats' returns."""
         counted = 1 if self.teams else len(self.seats) if self.has_seat_returns else 0
         return self.facts[: len(self.facts) - counted]
 
     @property
     def has_seat_returns(self) -> bool:
-        """Whether the return of each seat is a fact of an episode, which it is unless there are too many."""
+        """Whether the facts of an episode include the return of each seat, as they do unless there are too many seats."""
         return bool(self.seats) and self.facts[-len(self.seats) :] == seat_returns(self.seats)
 
     @property
     def seats_of_copy(self) -> int:
-        """A; 1 for a gymnasium environment."""
+        """A, the number of seats of a copy; 1 for a gymnasium environment."""
         return max(1, len(self.seats))
 
     @property
@@ -334,15 +336,15 @@ class RunSpec(msgspec.Struct, frozen=True, tag=True):
 
     @property
     def sent_axes(self) -> tuple[str, str | tuple[str, ...]]:
-        """The axes of the rows that are sent.
+        """The axes of the rows that are sent, for errors.
 
-        With teams, a column belongs to one seat in one copy and to another in the next.
+        With teams, a column can't be named after a seat, because it belongs to different seats in different copies.
         """
         return ("step", "column") if self.teams else self.row_axes
 
     @property
     def policy_code(self) -> tuple[str, ...]:
-        """The user-defined callables that make policies, or parts of them, in the workers, by their names in errors."""
+        """The user-defined callables that make policies, or parts of them, in the workers, as errors name them."""
         called = [("encoder", self.policy.encoder), ("policy", self.policy.own)]
         if self.opponent is not None:
             called.append(("encoder", self.opponent.encoder))
@@ -358,21 +360,28 @@ class RunSpec(msgspec.Struct, frozen=True, tag=True):
 
 
 SCORE = "score"
-"""Name of the last fact of an episode with opponents: 1 if the policy's team had the highest return, 1/2 in a tie, or 0."""
+"""Name of the last fact of an episode with opponents: 1 if the policy's team had the highest return, 1/n if n teams tied for
+it, else 0.
+"""
 
 
 def facts_of_all_seats(info_keys: tuple[str, ...], seats: tuple[str, ...]) -> tuple[str, ...]:
-    """Names of the facts of an episode without opponents: what the environment reports, then the returns of the seats."""
+    """Names of the facts of an episode without opponents: those that the environment reports, then the seats' returns.
+
+    The latter are left out if that would be too many facts.
+    """
     return info_keys + (seat_returns(seats) if len(seats) + len(info_keys) <= MAX_FACTS else ())
 
 
 def seat_returns(seats: tuple[str, ...]) -> tuple[str, ...]:
-    """The names of the returns of these seats among the facts of an episode."""
+    """The names that the returns of these seats have among the facts of an episode."""
     return tuple(one_line(f"return_{seat}", MAX_NAME) for seat in seats)
 
 
 SEAT_LEAVES = (Leaf("acts", "box", (), "bool"), Leaf("complete", "box", (), "bool"), Leaf("outside", "box", (), "float64"))
-"""Arrays beside those of the observation, of a vector environment with seats; see `millrace.protocol.envs.seats.SeatStep`"""
+"""The arrays that follow those of the observation in a vector environment with seats; see
+`millrace.protocol.envs.seats.SeatStep`.
+"""
 
 
 class StepSpec(msgspec.Struct, frozen=True, tag=True):
@@ -383,28 +392,28 @@ class StepSpec(msgspec.Struct, frozen=True, tag=True):
     copies: tuple[int, ...]
     """index in `envs` for each copy, in the order of the whole vector environment"""
     lanes: tuple[int, ...]
-    """how many copies each lane has; lane 0 has the first copies"""
+    """number of copies of each lane; lane 0 has the first copies"""
     observation: tuple[Leaf, ...]
     action: tuple[Leaf, ...]
-    """the arrays of an action, described as those of an observation are"""
+    """the arrays of an action, described in the same way as those of an observation"""
     autoreset: Literal["NextStep", "SameStep", "Disabled"] = "NextStep"
     """what happens when an episode ends, by the names of gymnasium's `AutoresetMode`"""
     render_mode: str | None = None
-    """passed to each copy"""
+    """the render mode with which each copy is made"""
     evaluation_copies: int = 0
-    """number of copies, the last ones, that play evaluations; such a copy's number counts from the first of them"""
+    """how many of the copies play evaluations; they are the last ones, and have numbers of their own, from 0"""
     seats: tuple[str, ...] = ()
-    """names of the A agents of each copy; empty if the environments are gymnasium's. With seats, arrays have N · A rows in
-    place of N, those of a copy side by side, and three more follow the observation's: `acts` and `complete` (bool), and
-    `outside` (float64)
+    """names of the A agents of each copy; empty if the environments are gymnasium's. With seats, arrays have N · A rows
+    instead of N, where the rows of a copy are adjacent, and three more arrays follow those of the observation: `acts` and
+    `complete` (bool), and `outside` (float64)
     """
     call_timeouts: CallTimeouts = CallTimeouts()
     """how long a call of user code may take before the worker's supervisor ends it; ignored by a worker without one"""
     heartbeat_s: float = HEARTBEAT_S
     learner_timeout_s: float = 600.0
-    """a worker says Hello again if no message of the learner has followed its Heartbeat for this long. The caller may
-    compute for long between two steps, without reading messages; workers that end with the learner's process wait for ever
-    (infinity)
+    """seconds after a Heartbeat at which a worker says Hello again if the learner has sent nothing since. Between two steps,
+    the caller may compute for a long time, without reading messages; infinite for workers that end with the learner's
+    process
     """
 
     def first_copy(self, lane: int) -> int:
@@ -413,7 +422,7 @@ class StepSpec(msgspec.Struct, frozen=True, tag=True):
 
     @property
     def seats_of_copy(self) -> int:
-        """A; 1 for gymnasium environments."""
+        """A, the number of seats of a copy; 1 for gymnasium environments."""
         return max(1, len(self.seats))
 
     @property

@@ -1,13 +1,13 @@
 """A token bucket: limits a rate, and allows a burst. Pure: `now` is an argument.
 
-Rule: at most `most` tokens are spent at once, and `per_s` in each second after that.
+Rule: at most `most` tokens can be spent at once, and `per_s` more in each second after that.
 """
 
 from __future__ import annotations
 
 
 class TokenBucket:
-    """A bucket that is full at first and fills again at a steady rate."""
+    """A bucket that is full at first, and is refilled at a steady rate."""
 
     def __init__(self, most: float, per_s: float) -> None:
         self._most = most

@@ -1,4 +1,4 @@
-"""Workers step environments and stream rollouts. Never imports millrace.learner. Imports torch only for an image policy."""
+"""Workers step environments and send rollouts. Never imports millrace.learner; imports torch only if the policy needs it."""
 
 if __name__ != "millrace.workers":  # otherwise each module and class would exist twice
     raise ImportError(f"import millrace.workers instead of {__name__}", name=__name__)

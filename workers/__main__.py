@@ -2,8 +2,8 @@
 
 The supervisor imports neither numpy nor gymnasium. The same program with `--parent` is a worker (`workers/program.py`).
 
-Exit codes: 0 drained or asked to leave; 1 failed, or no learner answered; 2 refused, or bad usage. With --stay, only being
-asked to leave or refused ends it.
+Exit codes: 0 if it was drained or asked to leave; 1 if it failed, or no learner answered; 2 if it was refused or used
+wrongly. With --stay, it ends only if it is asked to leave, or refused.
 """
 
 from __future__ import annotations
@@ -30,7 +30,9 @@ log = logging.getLogger("millrace.worker")
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run workers, one or with --processes many. Returns the exit code. Raises `UsageError` for words that aren't flags."""
+    """Run one worker, or several with --processes. Returns the exit code. Raises `UsageError` for words that
+    aren't flags.
+    """
     flags = parse_flags(WorkerFlags, sys.argv[1:] if argv is None else argv, "worker")
     shown = one_line(flags.called, MAX_NAME)
     logging.basicConfig(
@@ -51,7 +53,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _check(flags: WorkerFlags) -> None:
-    """Raise `UsageError` for a flag that no worker can obey."""
+    """Raise `UsageError` if the value of a flag is one that no worker can use."""
     if flags.address.startswith("inproc://"):
         raise UsageError(f"address {flags.address}: expected ipc://PATH or tcp://HOST:PORT; inproc reaches no other process")
     check_worker_name(flags.called if flags.processes == 1 else f"{flags.called}-w{flags.processes - 1}")
@@ -88,9 +90,10 @@ def _supervise(flags: WorkerFlags, token: Token | None, signals: list[int]) -> i
 
 
 def _count_signals() -> list[int]:
-    """SIGTERM, SIGINT and SIGHUP ask to leave: the first after the rollout in progress, the second at once.
+    """Install handlers that append SIGTERM, SIGINT and SIGHUP to the list that this returns.
 
-    A SIGHUP that is ignored (`nohup`) stays ignored.
+    The first signal asks the program to leave after the rollout in progress, the second to leave immediately. A SIGHUP that
+    is ignored (`nohup`) stays ignored.
     """
     received: list[int] = []
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):

@@ -1,9 +1,9 @@
 """How the actions of a rollout are chosen: by a built-in policy, for all lanes in one pass, or by a user-defined one.
 
-Rule: the actions of a lane depend on its observations, state and random generator, and not on the other lanes. Calls of user
-code are recorded on the worker's page (`workers/activity.py`), so that they have a timeout; this doesn't slow built-in
-policies. In a masked run, the last array of an observation is the mask of the allowed actions
-(`millrace.protocol.policy.masks`).
+Rule: the actions of a lane depend on its observations, state and random generator, and not on other lanes. Calls of user
+code are recorded on the worker's page (`workers/activity.py`), so that the supervisor can enforce their timeouts; calls of
+built-in policies aren't, so this doesn't slow them. In a masked run, the last array of an observation is the mask of the
+allowed actions (`millrace.protocol.policy.masks`).
 """
 
 from __future__ import annotations
@@ -24,11 +24,13 @@ from millrace.protocol.specs import RunSpec
 from millrace.workers.activity import ACTING, activity
 
 Stream = Callable[[], np.random.Generator]
-"""Gives a random generator, the same in each call. Seeding one takes as long as a step, and greedy actions need none."""
+"""Returns a random generator, the same one in each call. It is only called if a generator is needed, because greedy actions
+need none, and seeding one takes as long as a step.
+"""
 
 
 class ActedRows(NamedTuple):
-    """The columns of a rollout that its policy wrote."""
+    """The arrays of a lane's rollout that its policy has computed."""
 
     action: Array
     """[T, N, *action]"""
@@ -39,25 +41,25 @@ class ActedRows(NamedTuple):
 
 
 class StepActions(Protocol):
-    """The actions of L lanes, step by step."""
+    """Chooses the actions of L lanes, step by step."""
 
     def act(self, t: int, obs: Sequence[Array], state: Floats) -> Array:
-        """Choose the actions [L, N, *action] of step t in observations [L, N, *leaf]. Updates state [L, N, S].
+        """Choose the actions [L, N, *action] of step t for observations [L, N, *leaf]. Updates `state` [L, N, S] in place.
 
-        The array is new: the caller may change it.
+        The returned array is new, so the caller may change it.
         """
         ...
 
     def written(self, i: int) -> list[Array]:
-        """All arrays [T, N, …] of lane i in which `act` keeps its results, one row for each step."""
+        """All arrays [T, N, …] of lane i in which `act` stores its results, with one row for each step."""
         ...
 
 
 class RolloutActions(StepActions, Protocol):
-    """The actions of one rollout of each of L lanes, which are kept."""
+    """Chooses the actions of one rollout for each of L lanes, and keeps them."""
 
     def columns(self, i: int) -> ActedRows:
-        """The columns of lane i after T steps."""
+        """The arrays of lane i, once all T steps are done."""
         ...
 
 
@@ -69,23 +71,25 @@ class Acting(Protocol):
         ...
 
     def begin(self, generators: Sequence[np.random.Generator]) -> RolloutActions:
-        """Begin a rollout of the lanes that have these random generators."""
+        """Begin a rollout for each of several lanes, which have these random generators."""
         ...
 
     def choose(self, obs: Sequence[Array], state: Floats, stream: Stream, *, greedy: bool) -> Array:
-        """Actions [k, *action] in observations [1, k, *leaf]. Updates state [1, k, S]."""
+        """Actions [k, *action] for observations [1, k, *leaf]. Updates `state` [1, k, S] in place."""
         ...
 
 
 def acting_of(run: RunSpec, policy: Policy | CalledPolicy) -> Acting:
-    """How this policy acts in this run."""
+    """The `Acting` for this policy in this run."""
     if isinstance(policy, CalledPolicy):
         return _OwnActing(run, policy)
     return _BuiltInActing(run, policy if run.policy.encoder is None else _EncodingPolicy(run.policy.encoder.factory, policy))
 
 
 class _EncodingPolicy:
-    """A built-in policy with a user-defined encoder: calls are recorded on the page, and its errors are the policy's."""
+    """A built-in policy with a user-defined encoder. Its calls are recorded on the page, and its errors are raised as
+    `PolicyFailed`.
+    """
 
     def __init__(self, encoder: str, policy: Policy) -> None:
         self._encoder = encoder
@@ -105,7 +109,7 @@ class _EncodingPolicy:
 
 
 class _BuiltInActing:
-    """A built-in policy. One call draws the noise of a whole rollout, and one computes its log-probabilities."""
+    """A built-in policy. One call draws the noise of a whole rollout, and another computes all its log-probabilities."""
 
     def __init__(self, run: RunSpec, policy: Policy) -> None:
         self.run = run
@@ -116,7 +120,7 @@ class _BuiltInActing:
         self.policy.load(parameters, buffers)
 
     def params(self, obs: Sequence[Array], state: Floats) -> Floats:
-        """The distribution parameters [L, N, P]. Updates state."""
+        """The distribution params [L, N, P] for observations [L, N, *leaf]. Updates `state` [L, N, S] in place."""
         leaves = obs[: len(self.run.policy.observation)]
         params = self.policy(leaves, state)
         return forbid(params, obs[-1]) if self.run.masked else params
@@ -173,7 +177,7 @@ class _OwnActing:
             self._policy.load(parameters, buffers)
 
     def act(self, obs: Sequence[Array], state: Floats, generator: np.random.Generator, *, greedy: bool = False) -> Acted:
-        """What the policy returns for the copies of one lane: obs [N, *leaf], state [N, S]."""
+        """What the policy returns for the copies of one lane, given `obs` [N, *leaf] and `state` [N, S]."""
         mask = obs[-1] if self.run.masked else None
         with self._page.during(ACTING):
             return self._policy.act(obs[: len(self.run.policy.observation)], state, generator, mask=mask, greedy=greedy)
@@ -204,7 +208,7 @@ class _OwnActions:
             acted = self._acting.act([leaf[i] for leaf in obs], state[i], generator)
             self._action[i, t] = acted.action
             state[i] = acted.state
-            for array, extra in zip(self._written, acted.extras, strict=False):  # the last may be absent: log_prob
+            for array, extra in zip(self._written, acted.extras, strict=False):  # log_prob, the last, may be absent
                 array[i, t] = extra
         return np.array(self._action[:, t])  # a copy, because an environment may change its action
 

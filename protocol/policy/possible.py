@@ -1,7 +1,7 @@
-"""Whether a policy can be made from a specification in a file. Pure; imports no torch.
+"""Checks whether a policy can be made from a spec that was read from a file. Pure; imports no torch.
 
-Rule: a file has the same limits as a worker's description of an environment (`protocol/space_spec.py`), and weights too
-large for a message are refused before anything of their size is allocated.
+Rule: such a spec has the same limits as a worker's description of an environment (`protocol/space_spec.py`), and weights
+that are too large for a message are refused before anything of their size is allocated.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ MOST_LAYERS = 64
 
 
 def why_impossible(spec: PolicySpec) -> str:
-    """Why no policy can be made from this, in one line; empty if one can."""
+    """Why no policy can be made from this spec, in one line; empty if one can."""
     leaves = spec.observation
     action = spec.action
     paths = {leaf.path for leaf in leaves}

@@ -1,11 +1,13 @@
 """The recurrent core of a policy, in numpy. Pure; imports no torch.
 
 The core is between the features and the hidden layers. Each env copy has its own state [..., S]. The row format defines when
-the state is reset. If row t is valid, `obs[t+1]` is processed with the state after `obs[t]`. If row t is not valid, it is
-the reset, and `obs[t+1]` is processed with a state of zeros. (While a policy acts, `workers/lanes/runner.py`, which steps
-its lanes, sets the state to zeros.) So the final observation of an episode still has its episode's state.
+the state is reset. If row t is valid, `obs[t+1]` is processed with the state after `obs[t]`. If row t is not valid, it only
+resets the copy, and `obs[t+1]` is processed with a state of zeros. (While a policy acts, `workers/lanes/runner.py`, which
+steps its lanes, sets the state to zeros.) So the final observation of an episode is still processed with its episode's
+state.
 
-LSTM (Hochreiter and Schmidhuber 1997) and GRU (Cho et al. 2014), computed as in torch, with torch's order of gates.
+A core is an LSTM (Hochreiter and Schmidhuber 1997) or a GRU (Cho et al. 2014). Both are computed as in torch, with torch's
+order of gates.
 """
 
 from __future__ import annotations
@@ -19,7 +21,7 @@ import numpy.typing as npt
 from millrace.protocol.arrays import Floats
 from millrace.protocol.specs import PolicySpec
 
-GATES = {"lstm": 4, "gru": 3}
+GATES = {"lstm": 4, "gru": 3}  # linear maps per unit of a core, the candidate state included
 
 
 def zero_state(spec: PolicySpec, *lead: int) -> Floats:
@@ -28,16 +30,16 @@ def zero_state(spec: PolicySpec, *lead: int) -> Floats:
 
 
 def core_shapes(spec: PolicySpec, inputs: int) -> tuple[tuple[int, int], tuple[int, int]]:
-    """The shapes [out, in] of the two linear maps to the gates: from the inputs, and from the state."""
+    """The shapes [out, in] of the two linear maps to the gates: from `inputs` inputs, and from the state."""
     assert spec.core is not None
     gates = GATES[spec.core] * spec.core_size
     return (gates, inputs), (gates, spec.core_size)
 
 
 def advance(spec: PolicySpec, parameters: Mapping[str, npt.NDArray[Any]], x: Floats, state: Floats) -> Floats:
-    """Advance the core by one step with input x [..., D]. Returns the output [..., core_size].
+    """Advance the core by one step with input x [..., D], updating `state` [..., S] in place.
 
-    Updates `state` [..., S] in place.
+    Returns the output [..., core_size].
     """
 
     def linear(name: str, values: Floats) -> Floats:
@@ -65,5 +67,5 @@ def advance(spec: PolicySpec, parameters: Mapping[str, npt.NDArray[Any]], x: Flo
 
 
 def _sigmoid(z: Floats) -> Floats:
-    """The sigmoid by tanh, which does not overflow and gives the same bits for every array size."""
+    """The sigmoid, computed with tanh, which does not overflow and gives the same bits for every array size."""
     return np.asarray(0.5 + 0.5 * np.tanh(np.float32(0.5) * z), np.float32)

@@ -35,10 +35,10 @@ class _TorchFactor(NamedTuple):
     """One of the independent distributions of an action."""
 
     of: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
-    """its log-probability and entropy"""
+    """a function from its params and actions to its log-probability and entropy"""
     params: int
     actions: int
-    """how many columns it has of the params [B, P], and of the actions [B, D]"""
+    """number of its columns in the params [B, P], and in the actions [B, D]"""
 
 
 def _factors(spec: ActionSpec) -> list[_TorchFactor]:
@@ -51,10 +51,10 @@ def _factors(spec: ActionSpec) -> list[_TorchFactor]:
 
 
 def policy_log_prob(policy: PolicySpec, params: Tensor, action: Tensor) -> Tensor:
-    """Log π(action) [B] of an actor's params [B, P] and stored actions [B, *action] from any source.
+    """Log π(action) [B] for an actor's params [B, P] and stored actions [B, *action], whatever policy chose them.
 
-    A squashed action is taken to be at most `SQUASHED_BOUND` in size: the density of ±1 itself is zero or infinite. A
-    deterministic actor gets normal noise of standard deviation 1 around its action.
+    Squashed actions are clipped to ± `SQUASHED_BOUND`, because the density of ±1 itself is zero or infinite. A deterministic
+    actor is treated as a normal distribution with standard deviation 1 around its action.
     """
     match policy.head:
         case "squashed":
@@ -84,7 +84,7 @@ def _categorical(logits: Tensor, choice: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _bernoulli(logits: Tensor, bits: Tensor) -> tuple[Tensor, Tensor]:
-    """Log-probability and entropy for logits [B, k] and as many bits."""
+    """Log-probability and entropy for logits [B, k] and bits [B, k]."""
     softplus = F.softplus(logits)
     return (bits.to(logits.dtype) * logits - softplus).sum(-1), (softplus - logits * torch.sigmoid(logits)).sum(-1)
 

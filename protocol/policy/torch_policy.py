@@ -1,4 +1,4 @@
-"""The forward pass of policies that need torch (images, custom encoders). Workers act with it.
+"""The forward pass of policies that need torch (images, user-defined encoders), with which workers act.
 
 Rule: it does not depend on the defaults that the program, or an environment, has chosen for its own use of torch.
 """
@@ -21,12 +21,17 @@ from millrace.protocol.wire.weight_dtypes import ActingDtype
 
 
 class TorchPolicy:
-    """Acts like `NumpyPolicy`, also on images. Lanes are computed one by one: their results do not depend on other lanes."""
+    """Like `NumpyPolicy`, for images and encoders. Lanes are computed one by one, so that a lane's result does not depend on
+    other lanes.
+    """
 
     def __init__(
         self, spec: PolicySpec, device: str = "cpu", *, together: bool = False, images: ActingDtype = "float32"
     ) -> None:
-        """`together`: compute all lanes at once; the caller always passes all. `images`: precision for images."""
+        """With `together`, all lanes are computed at once: use it if every call passes the same lanes.
+
+        `images` is the precision in which images are processed.
+        """
         self.spec = spec
         self._images_dtype = images
         self._device = device
@@ -36,7 +41,7 @@ class TorchPolicy:
         self._buffers: dict[str, Floats] = {}
 
     def load(self, parameters: Floats, buffers: Floats) -> None:
-        """Copy these weights and use them from now on. Raises ValueError if their sizes do not fit the spec."""
+        """Copy these weights, and use them from now on. Raises `ValueError` if their sizes do not fit the spec."""
         count = self._net.acting_size
         if parameters.shape != (count,) or buffers.shape != (buffer_size(self.spec),):
             raise ValueError(
@@ -50,7 +55,7 @@ class TorchPolicy:
         self._buffers = named_views(buffers, buffer_layout(self.spec))
 
     def __call__(self, leaves: Sequence[Array], state: Floats | None = None) -> Floats:
-        """Distribution parameters [L, N, P] of the actions in these observations [L, N, *leaf]; see `Policy`."""
+        """Distribution params [L, N, P] for these observations [L, N, *leaf]; see `Policy`."""
         x = features(self.spec, leaves)
         if self.spec.normalize_observations:
             x = normalize(x, self._buffers["observation_mean"], self._buffers["observation_std"])
@@ -70,7 +75,9 @@ class TorchPolicy:
         return np.concatenate([out, np.broadcast_to(appended, (*out.shape[:-1], len(appended)))], -1)
 
     def _lane(self, x: Floats, images: Sequence[Array], state: Floats) -> Floats:
-        """Distribution parameters [N, P] of one lane, for x [N, D], images [N, *leaf] and state [N, S], updated in place."""
+        """Distribution params [N, P] of one lane, for x [N, D], images [N, *leaf] and state [N, S], which is updated in
+        place.
+        """
         inputs = torch.tensor(x, device=self._device), [torch.tensor(image, device=self._device) for image in images]
         with defaults_of_thread(), torch.no_grad():
             params, after = self._net.act(*inputs, torch.tensor(state, device=self._device))

@@ -1,8 +1,9 @@
-"""Checks arrays from elsewhere: shape, dtype, and that values are finite and in their space. Pure.
+"""Checks arrays from elsewhere: their shapes and dtypes, and that values are finite and in their space. Pure.
 
-Each check returns an error of one line; empty if nothing is wrong. A line names the first wrong value and its place:
-`axes` names the leading dimensions of an array, so that ("step", "copy") leads to "at step 3, copy 1". The names of a copy's
-seats in place of "copy" say that it has a column for each: ("step", ("black", "white")) leads to "at step 3, copy 1, white".
+Each check returns an error of one line, or an empty string if nothing is wrong. The line names the first wrong value and its
+place. `axes` names the leading dimensions of an array: with ("step", "copy"), the place is "at step 3, copy 1". If each copy
+has a column for each of its seats, the names of the seats stand in place of "copy": with ("step", ("black", "white")), the
+place is "at step 3, copy 1, white".
 """
 
 from __future__ import annotations
@@ -20,18 +21,18 @@ STEP_AND_COPY: Axes = ("step", "copy")
 
 
 class Expected(NamedTuple):
-    """An array, and what is expected of it."""
+    """An array, and its expected shape, dtype and space."""
 
     name: str
     array: Array
     shape: tuple[int, ...]
     dtype: str
     space: Leaf | ActionSpec | None = None
-    """None: any finite numbers. For an action: as stored, with choices from 0."""
+    """If None, the values may be any finite numbers. The values of an action are as stored: choices count from 0."""
 
 
 def wrong_arrays(expected: Iterable[Expected], axes: Axes | None = STEP_AND_COPY) -> str:
-    """What is wrong with the first of these arrays that is wrong. `axes` None: whatever values it has."""
+    """What is wrong with the first wrong one of these arrays. If `axes` is None, only shapes and dtypes are checked."""
     for each in expected:
         array = each.array
         if why := _misfit(array, each.shape, each.dtype) or (axes is not None and wrong_values(array, each.space, axes)):
@@ -50,20 +51,20 @@ def wrong_observation(
 
 
 def wrong_values(array: Array, space: Leaf | ActionSpec | None = None, axes: Axes = STEP_AND_COPY, first: int = 0) -> str:
-    """What is wrong with values [..., *shape]: one is not finite, or not in its `space`, if that has countable values.
+    """What is wrong with values [..., *shape]: a value is not finite, or is not in its `space`.
 
-    The bounds of a Box are not checked, because many environments exceed theirs. `first`: the number of row 0.
+    The bounds of a Box are not checked, because many environments exceed theirs. `first` is the number of row 0 in errors.
     """
-    # `count_nonzero` takes a third of the time of `all` and `any`.
+    # `count_nonzero` takes a third of the time that `all` or `any` takes.
     if array.dtype.kind == "f" and np.count_nonzero(finite := np.isfinite(array)) != array.size:
         return f"expected finite values, got {_first(array, ~finite, axes, first)}"
     if space is None or space.kind == "box" or array.dtype.kind == "b":
         return ""
     if space.kind == "mixed":
         sizes = np.array((*space.sizes, *[2] * space.bits), np.int64)
-        array = array[..., : len(sizes)]  # numbers follow
+        array = array[..., : len(sizes)]  # without the numbers of Box parts, which come last
     else:
-        sizes = np.reshape(space.sizes, space.shape) if space.sizes else np.full(space.shape, 2)  # of MultiBinary
+        sizes = np.reshape(space.sizes, space.shape) if space.sizes else np.full(space.shape, 2)  # 2: MultiBinary
     start = np.reshape(space.start, space.shape) if space.start and isinstance(space, Leaf) else np.zeros_like(sizes)
     counts = array - start
     wrong = (counts < 0) | (counts >= sizes)
@@ -76,7 +77,7 @@ def wrong_values(array: Array, space: Leaf | ActionSpec | None = None, axes: Axe
 
 
 def _misfit(array: Array, shape: tuple[int, ...], dtype: str) -> str:
-    """What is wrong with the shape and the dtype of an array, or with the bytes of its flags."""
+    """What is wrong with the shape or dtype of an array, or with its bytes if it is bool: they must be 0 or 1."""
     if array.shape != shape or array.dtype != np.dtype(dtype):
         got = f"{array.dtype}{list(array.shape)}"
         return f"expected {dtype}{list(shape)}, got {got}; is its environment the same version?"
@@ -94,7 +95,7 @@ def _first(array: Array, wrong: Bools, axes: Axes, first: int) -> str:
 
 
 def place_of(index: Iterable[int], axes: Axes) -> str:
-    """The position of an entry of an array, in words."""
+    """The position of an entry of an array, in words; see the top of this file."""
     words = []
     for axis, number in zip(axes, index, strict=False):
         copy, seat = (number, None) if isinstance(axis, str) else divmod(number, len(axis))

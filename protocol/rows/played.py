@@ -1,4 +1,4 @@
-"""The arrays of `EpisodeRows`: consecutive rows of a played episode. Pure."""
+"""Checks the arrays of `EpisodeRows`: consecutive rows of a played episode. Pure."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from millrace.protocol.specs import RunSpec
 def reason_to_reject(
     rows: EpisodeRows, before: Sequence[EpisodeRows], run: RunSpec, most_steps: int, with_frames: bool
 ) -> str:
-    """What is wrong with these rows; empty if they can be used. `before`: the earlier rows of their episode."""
+    """What is wrong with these rows; empty if they can be used. `before` has the earlier rows of the same episode."""
     policy = run.policy
     seats = (len(run.seats),) if run.seats else ()
     if before and (before[-1].terminated[-1] or before[-1].truncated[-1]):
@@ -40,7 +40,11 @@ def reason_to_reject(
 
 
 def _wrong_frames(frames: Array | None, end: int, L: int, first: Sequence[Array | None], wanted: bool) -> str:
-    """What is wrong with the frames of rows; `end`: the number of observations of the episode up to their last."""
+    """What is wrong with the frames of L rows.
+
+    `end` is the number of observations of the episode up to the last of these rows. `first` has the frames of the episode's
+    first rows, and is empty if these are the first.
+    """
     if frames is None:
         return "frames: expected those of the first observations" if wanted and not first else ""
     if not wanted or end > MOST_FRAMES:

@@ -1,8 +1,9 @@
-"""Checks a rollout: arrays of the run's shapes and dtypes, values in its spaces, and the row law. Pure.
+"""Checks a rollout: its shapes and dtypes must be those of the run, its values in the run's spaces, and its rows must obey
+the row law. Pure.
 
-Rule: the worker that has the environment finds everything that an environment can break, before it sends: values by
-`workers/copies/value_checks.py`, the law of seats by `protocol/envs/seats.py`. The learner checks everything again, because
-a worker may be hostile.
+Rule: a worker finds everything that its environment can break before it sends a rollout: `workers/copies/value_checks.py`
+checks values, and `protocol/envs/seats.py` checks the law of seats. The learner checks everything again, because a worker
+may be hostile.
 """
 
 from __future__ import annotations
@@ -20,14 +21,16 @@ from millrace.protocol.rows.array_checks import Axes, Expected, place_of, wrong_
 from millrace.protocol.specs import ActionSpec, RunSpec
 
 LARGEST_REWARD = float(np.finfo(np.float32).max) * (1 + 2**-25)
-"""No larger number is finite as a float32: returns are sums of rewards before they are rounded."""
-OF_SAVED_BYTES = 1_000  # overhead of a saved state
+"""The largest number that is still finite when it is rounded to float32. Returns are sums of rewards before
+this rounding.
+"""
+OF_SAVED_BYTES = 1_000  # bytes of overhead of each saved state
 
 
 def validate(rollout: Rollout, run: RunSpec, most_steps: int = LARGEST) -> None:
     """Check a rollout. Raises `BadRollout`, with a one-line message, if it does not fit the run or breaks the row format.
 
-    `most_steps`: the longest that an episode can be.
+    `most_steps` is the largest possible length of an episode.
     """
     T = run.rollout_steps
     N = run.sent_columns
@@ -40,7 +43,7 @@ def validate(rollout: Rollout, run: RunSpec, most_steps: int = LARGEST) -> None:
         Expected("terminated", rollout.terminated, (T, N), "bool"),
         Expected("truncated", rollout.truncated, (T, N), "bool"),
         Expected("valid", rollout.valid, (T, N), "bool"),
-        Expected("state", rollout.state[None], (1, N, run.policy.state_size), "float32"),  # its row is step 0
+        Expected("state", rollout.state[None], (1, N, run.policy.state_size), "float32"),  # an error says "at step 0"
     ]
     if (rollout.mask is not None) != run.masked:
         raise BadRollout(f"mask: expected {'one' if run.masked else 'none'}")
@@ -77,7 +80,7 @@ def validate(rollout: Rollout, run: RunSpec, most_steps: int = LARGEST) -> None:
     begun = [each.copy for each in rollout.begun]
     if len(set(begun)) < len(begun) or max(begun, default=0) >= run.copies:
         raise BadRollout(f"begun: expected each of the copies 0 to {run.copies - 1} at most once, got {begun[:100]}")
-    if (start := max((each.start for each in rollout.begun), default=0)) > LARGEST // 2:  # the next ones must fit, too
+    if (start := max((each.start for each in rollout.begun), default=0)) > LARGEST // 2:  # later starts must fit too
         raise BadRollout(f"begun: expected starts up to {LARGEST // 2}, got {start}")
     if len(set(rollout.saved)) < len(rollout.saved) or max(rollout.saved, default=0) >= run.copies:
         raise BadRollout(f"saved: expected copies 0 to {run.copies - 1}, each at most once, got {rollout.saved[:100]}")
@@ -87,12 +90,15 @@ def validate(rollout: Rollout, run: RunSpec, most_steps: int = LARGEST) -> None:
 
 
 def _check_seats(valid: Array, ended: Array, resets: Array, run: RunSpec) -> None:
-    """Raise `BadRollout` if the rows of seats break the row law. Arrays [T, N·A], `resets` [T+1, N]."""
+    """Raise `BadRollout` if the rows of seats break the row law. `valid` and `ended` are [T, N · A], `resets`
+    is [T+1, N].
+    """
     reset = np.repeat(resets, run.sent_seats, axis=1)  # [T+1, N·A]
     steps = np.arange(len(valid))[:, None]
-    row, end, begin = (np.maximum.accumulate(np.where(flags, steps, -1)) for flags in (valid, ended, reset[:-1]))  # the last
-    gone = np.zeros_like(reset)  # the seat has left this episode
-    plays = np.zeros_like(reset)  # it has a row in this episode
+    # The last valid row, the last end and the last reset up to each step.
+    row, end, begin = (np.maximum.accumulate(np.where(flags, steps, -1)) for flags in (valid, ended, reset[:-1]))
+    gone = np.zeros_like(reset)  # whether the seat has left this episode
+    plays = np.zeros_like(reset)  # whether the seat has a row in this episode, and has not left
     gone[1:] = end > begin
     plays[1:] = row > end
     idle = plays[:-1] & ~valid if not run.takes_turns else np.zeros_like(valid)
@@ -109,7 +115,7 @@ def _check_seats(valid: Array, ended: Array, resets: Array, run: RunSpec) -> Non
 
 
 def _check_mask(mask: Array, rollout: Rollout, action: ActionSpec, axes: Axes) -> None:
-    """Raise `BadRollout` if a mask allows no choice, or forbids the chosen action."""
+    """Raise `BadRollout` if a mask allows no choice at all, or forbids the action that was chosen."""
     if (empty := no_choice(mask, action)).any():
         raise BadRollout(f"mask: expected an allowed choice at {place_of(np.argwhere(empty)[0], axes)}, got none")
     if (wrong := rollout.valid & not_allowed(rollout.action, mask[:-1], action)).any():
@@ -119,15 +125,15 @@ def _check_mask(mask: Array, rollout: Rollout, action: ActionSpec, axes: Axes) -
 
 
 def wrong_episode(episode: Episode, run: RunSpec, most_steps: int) -> str:
-    """What is wrong with an episode of at most this many steps; empty if it can belong to the run."""
+    """What is wrong with an episode; empty if it can be one of the run, whose episodes have at most `most_steps` steps."""
     whole = 0 < episode.length <= most_steps and 0 <= episode.seconds < math.inf
-    if not (whole and abs(episode.reward) <= episode.length * run.seats_of_copy * LARGEST_REWARD):  # false for NaN too
+    if not (whole and abs(episode.reward) <= episode.length * run.seats_of_copy * LARGEST_REWARD):  # also wrong for NaN
         return f"expected a finite return of 1 to {most_steps} float32 rewards and a duration, got {episode}"
     return wrong_facts(episode, run)
 
 
 def wrong_facts(episode: Episode, run: RunSpec) -> str:
-    """What is wrong with the facts of an episode; empty if they are those of the run, each finite or NaN (missing)."""
+    """What is wrong with the facts of an episode; empty if they are those of the run. A missing fact is NaN."""
     if len(episode.facts) != len(run.facts):
         return f"expected {len(run.facts)} facts, got {len(episode.facts)}"
     if any(map(math.isinf, episode.facts)):

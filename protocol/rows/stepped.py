@@ -1,4 +1,4 @@
-"""The arrays of a `Stepped`: a row for every copy of a lane of a vector environment. Pure."""
+"""Checks the arrays of a `Stepped`, which have a row for every copy of a lane of a vector environment. Pure."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from millrace.protocol.specs import StepSpec
 
 
 def wrong_rows(answer: Stepped, spec: StepSpec, axes: Sequence[str] | None) -> str:
-    """What is wrong with the arrays of an answer, or with their values if `axes` are given; empty if nothing is."""
+    """What is wrong with the arrays of an answer; empty if nothing is. Values are only checked if `axes` is not None."""
     N = spec.lanes[answer.lane] * spec.seats_of_copy
     numbers = [
         Expected("reward", answer.reward, (N,), "float64"),

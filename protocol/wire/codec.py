@@ -1,13 +1,13 @@
-"""Message <-> frames. Pure: bytes in, records out; bounded; no pickle.
+"""Encodes messages as frames, and decodes them. Pure; all sizes are bounded; nothing is unpickled.
 
-Frame 0 is the head, msgpack: [type's name, field, field, …] in the order of the record, each array in its place as [dtype,
-shape, index of its frame]. Only `Hello` and `Refuse` are maps (fields by name, and the type's name under `type`), because
-every version must understand them. Frames 1… are the arrays' raw bytes, C-ordered, little-endian. Everything that a peer
-sends is checked before it is used: the number of frames and bytes, the head's size and nesting, every type, every shape. A
-received array is a read-only view of its frame, not a copy.
+Frame 0 is the head, in msgpack: [type's name, field, field, …] in the order of the record. In place of an array it has
+[dtype, shape, index of the array's frame]. Only `Hello` and `Refuse` are maps (fields by name, and the type's name under
+`type`), because every version must understand them. Frames 1… are the arrays' raw bytes, C-ordered and little-endian.
+Everything that a peer sends is checked before it is used: the number of frames and bytes, the head's size and nesting, every
+type, every shape. A received array is a read-only view of its frame, not a copy.
 
-Arrays of a rollout may be packed (`compression.py`): [dtype, shape, index, packings]. The receiver limits the unpacked size
-of all packed arrays of a message together.
+Arrays of a rollout may be packed (`compression.py`). In the head they are [dtype, shape, index, packings]. The receiver
+limits the total unpacked size of all packed arrays of a message.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ DTYPES = {
 }
 
 MessageTypes = tuple[Any, Any]
-"""Types encoded as arrays, and types encoded as maps. msgspec accepts no union of both kinds."""
+"""The message types that are encoded as arrays, and those encoded as maps. msgspec accepts no union of both kinds."""
 TO_WORKER: MessageTypes = (reduce(operator.or_, (kind for kind in get_args(ToWorker) if kind is not Refuse)), Refuse)
 TO_LEARNER: MessageTypes = (
     reduce(operator.or_, (kind for kind in get_args(ToLearner | Inquire) if kind is not Hello)),
@@ -70,9 +70,10 @@ assert sys.byteorder == "little", (
 
 
 def encode(message: ToLearner | Inquire | ToWorker | ToObserver, packing: Packing | None = None) -> list[Buffer]:
-    """Frames of a message. Arrays are not copied: do not change them afterwards. `packing` applies to rollouts only.
+    """Encode a message as frames. Arrays are not copied, so do not change them afterwards. `packing` applies only to
+    rollouts.
 
-    Raises `ValueError` if its head is too long.
+    Raises `ValueError` if the head is too long.
     """
     frames: list[Buffer] = [b""]
     packing = packing if isinstance(message, Rollout) else None
@@ -117,22 +118,22 @@ def check_can_be_sent(env: str, run: RunSpec | StepSpec) -> None:
 
 
 def decode_to_learner(frames: Sequence[Buffer], packed_bytes_limit: int = 0) -> ToLearner | Inquire:
-    """A message of a worker or an observer. Raises `BadMessage` for anything else, and no other error.
+    """Decode a message of a worker or an observer. Raises `BadMessage` for anything else, and no other error.
 
-    `packed_bytes_limit`: unpacked size of all its packed arrays together, at most; 0 forbids packed arrays.
+    `packed_bytes_limit` is the largest total unpacked size of the message's packed arrays; 0 forbids packed arrays.
     """
     message: ToLearner | Inquire = _decode(frames, TO_LEARNER, packed_bytes_limit)
     return message
 
 
 def decode_to_worker(frames: Sequence[Buffer]) -> ToWorker:
-    """A message of the learner to a worker. Raises `BadMessage` for anything else, and no other error."""
+    """Decode a message of the learner to a worker. Raises `BadMessage` for anything else, and no other error."""
     message: ToWorker = _decode(frames, TO_WORKER, max_items=MAX_HEAD_BYTES)
     return message
 
 
 def decode_to_observer(frames: Sequence[Buffer]) -> ToObserver:
-    """The learner's answer to an observer. Raises `BadMessage` for anything else, and no other error."""
+    """Decode the learner's answer to an observer. Raises `BadMessage` for anything else, and no other error."""
     message: ToObserver = _decode(frames, TO_OBSERVER)
     return message
 
@@ -179,12 +180,14 @@ def _decode(frames: Sequence[Buffer], kinds: MessageTypes, packed_bytes_limit: i
             max_ext_len=0,
             strict_map_key=True,
         )
-        named = type(head) is dict and "type" in head  # with only one type, msgspec would accept a map without it
+        named = type(head) is dict and "type" in head  # if a map can be of one type only, msgspec accepts it without "type"
         message = msgspec.convert(head, by_name if named else by_position, dec_hook=hook)
     except BadMessage as error:
-        raise BadMessage(one_line(str(error), 500)) from error  # it may quote the peer
+        raise BadMessage(one_line(str(error), 500)) from error  # the error may quote text of the peer
     except Exception as error:  # msgpack and msgspec raise a dozen types for invalid bytes
-        reason = one_line(" ".join(_explain_validation_error(str(error), head, by_position).split()), 200)  # quotes the peer
+        reason = one_line(
+            " ".join(_explain_validation_error(str(error), head, by_position).split()), 200
+        )  # may quote the peer
         raise BadMessage(f"head is not a message of millrace: {type(error).__name__}: {reason}") from error
     if isinstance(message, Described):
         check_size(message.description)
@@ -194,7 +197,9 @@ def _decode(frames: Sequence[Buffer], kinds: MessageTypes, packed_bytes_limit: i
 
 
 def _explain_validation_error(error: str, head: object, kinds: Any) -> str:
-    """The error text of msgspec with field names in place of positions, and the number of fields without the type's name."""
+    """msgspec's error text, with the names of fields in place of their positions, and not counting the type's name as a
+    field.
+    """
     match head:
         case [str() as name, *given]:
             kind = next((kind for kind in get_args(kinds) or (kinds,) if kind.__name__ == name), None)
@@ -215,12 +220,12 @@ class _DescribedArray(NamedTuple):
     shape: list[int]
     frame_index: int
     size: int
-    """bytes, once it is unpacked"""
+    """bytes of the array once it is unpacked"""
     packings: list[object] | None
 
 
 def _described(frames: Sequence[Buffer], value: object) -> _DescribedArray:
-    """The array that this part of a head describes: `[dtype, shape, index]`, perhaps with packings."""
+    """Parse an array's description in a head: `[dtype, shape, index]`, perhaps with packings. Raises `BadMessage`."""
     if not (type(value) is list and 3 <= len(value) <= 4):
         raise BadMessage(f"array expected [dtype, shape, index], got {str(value)[:80]}")
     name, shape, index = value[:3]

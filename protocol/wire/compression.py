@@ -1,14 +1,16 @@
 """Packing (lossless compression) of the arrays of a rollout. Pure: bytes in, bytes out.
 
 A packing has a name. The head lists the packings of an array in the order in which they were applied. `zstd` is a Zstandard
-frame (RFC 8878) that declares its content size. `stack` is for frame stacks as gymnasium's FrameStackObservation makes them,
-uint8 [T+1, N, k, H, W, …]. Step t+1 is mostly step t shifted by one frame: only its newest frame is new. Its payload is
+frame (RFC 8878) that declares its content size. `stack` is for frame stacks, as made by gymnasium's FrameStackObservation:
+uint8 [T+1, N, k, H, W, …]. In most cases, step t+1 is step t shifted by one frame, so that only its newest frame is new. The
+payload of a stack is
 
     bits     [N, T]        1: step t+1 of copy n is step t shifted by one frame; lowest bit first, zeros up to a whole byte
     frames   [M, H, W, …]  by copy, then by step: the newest frame of a shifted step, all k frames of any other step
 
-so a step consists of the last k frames up to its own. Sizes from a peer are checked before memory is allocated: a stack is
-at most k times as large as its payload, and the content size of a Zstandard frame must be what the array needs.
+So each step consists of its own newest frame and the k - 1 frames before it. Sizes from a peer are checked before memory is
+allocated: a stack is at most k times as large as its payload, and a Zstandard frame must declare the size that the array
+needs.
 """
 
 from __future__ import annotations
@@ -26,13 +28,13 @@ from millrace.protocol.errors import BadMessage
 Frame = bytes | memoryview
 
 MAX_STACK = 16
-MIN_FRAME_BYTES = 64  # for smaller frames an index of the frames would be larger than the frames
+MIN_FRAME_BYTES = 64  # with smaller frames, an index of the frames would be larger than the frames
 MIN_STACK_SAVING = 0.25  # fraction of a stack's bytes that packing must save
-ZSTD_LEVEL = -1  # saves as much on images as higher levels do, and gives up at once on incompressible bytes
+ZSTD_LEVEL = -1  # saves as much on images as higher levels, and quickly skips incompressible bytes
 MIN_ZSTD_BYTES = 1024  # compressing smaller arrays costs more than it saves
 MIN_ZSTD_SAVING = 0.1  # fraction of an array's bytes that compression must save
-PROBED_STEPS = 8  # steps compared first; all steps are compared only if enough of these are shifted
-COMPARED_WORDS = 1 << 15  # per comparison, so that they stay in the CPU cache
+PROBED_STEPS = 8  # number of steps that are compared first; all steps are compared only if enough of these are shifted
+COMPARED_WORDS = 1 << 15  # words per comparison, few enough to stay in the CPU cache
 
 
 @dataclass(frozen=True)
@@ -40,12 +42,12 @@ class Packing:
     """The packings that a sender may apply to the arrays of a rollout."""
 
     stack: bool = False
-    """send each frame of a frame stack once"""
+    """whether to send each frame of a frame stack only once"""
     zstd: bool = False
-    """compress arrays with Zstandard where that saves enough"""
+    """whether to compress arrays with Zstandard where that saves enough"""
 
     def pack(self, array: Array) -> tuple[Frame, list[str]]:
-        """The array's frame and the names of its packings; no names if its raw bytes are sent."""
+        """The array's frame, and the names of its packings; there are no names if its raw bytes are sent."""
         frame: Frame = raw_bytes(array)
         packings: list[str] = []
         if self.stack and (payload := pack_stack(array)) is not None:
@@ -63,7 +65,10 @@ def raw_bytes(array: Array) -> memoryview:
 
 
 def unpack_array(frame: Frame, packings: Sequence[object], dtype: np.dtype[Any], shape: Sequence[int]) -> Array:
-    """Unpack a frame into a read-only array. The caller has checked its size. Raises `BadMessage`."""
+    """Unpack a frame into a read-only array of this dtype and shape, whose size the caller must have checked.
+
+    Raises `BadMessage` if that isn't possible.
+    """
     size = dtype.itemsize * math.prod(shape)
     match packings:
         case ["stack"]:
@@ -77,7 +82,7 @@ def unpack_array(frame: Frame, packings: Sequence[object], dtype: np.dtype[Any],
 
 
 def has_zstd() -> bool:
-    """Whether the package zstandard, which is an extra, is installed here."""
+    """Whether the optional package zstandard is installed here."""
     try:
         import zstandard  # noqa: F401
     except ImportError:
@@ -86,7 +91,7 @@ def has_zstd() -> bool:
 
 
 def _compressed(frame: Frame) -> bytes | None:
-    """A Zstandard frame; None if it saves too little."""
+    """The bytes as a Zstandard frame; None if that saves too little."""
     if len(frame) < MIN_ZSTD_BYTES:
         return None
     import zstandard
@@ -96,13 +101,13 @@ def _compressed(frame: Frame) -> bytes | None:
 
 
 def _decompressed(frame: Frame, least: int, most: int) -> bytes:
-    """The content of a Zstandard frame, if it declares `least` to `most` bytes. Raises `BadMessage`."""
+    """The content of a Zstandard frame. Raises `BadMessage` unless the frame declares a size of `least` to `most` bytes."""
     try:
         import zstandard
     except ImportError:
         raise BadMessage("zstd was not requested, and cannot be read here") from None
     try:
-        held = zstandard.frame_content_size(frame)  # -1: not declared
+        held = zstandard.frame_content_size(frame)  # -1 if the frame doesn't declare it
         if not least <= held <= most:
             raise BadMessage(f"zstd: expected a frame that declares {least} to {most} bytes, got {held}")
         return zstandard.ZstdDecompressor().decompress(frame, allow_extra_data=False)
@@ -126,12 +131,14 @@ def pack_stack(array: Array) -> Bytes | None:
     payload = np.empty(bits.size + chosen.size * frames.shape[-1], np.uint8)
     payload[: bits.size] = bits
     out = payload[bits.size :].reshape(chosen.size, -1)
-    np.take(frames.reshape(-1, frames.shape[-1]), chosen, axis=0, out=out, mode="clip")  # mode "raise" would copy once more
+    np.take(
+        frames.reshape(-1, frames.shape[-1]), chosen, axis=0, out=out, mode="clip"
+    )  # the mode "raise" makes another copy
     return payload
 
 
 def unpack_stack(payload: Frame, dtype: np.dtype[Any], shape: Sequence[int]) -> Array:
-    """Unpack a payload into a read-only frame stack. Raises `BadMessage`."""
+    """Unpack a payload into a read-only frame stack. Raises `BadMessage` if the payload isn't one for this shape."""
     if not _may_be_stack(dtype, shape):
         expected = f"uint8 [T+1, N, 2 to {MAX_STACK}, H, W, …] with frames of {MIN_FRAME_BYTES} bytes or more"
         raise BadMessage(f"stack: expected {expected}, got {dtype.str}{list(shape)}")
@@ -167,10 +174,10 @@ def _may_be_stack(dtype: np.dtype[Any], shape: Sequence[int]) -> bool:
 
 
 def _find_shifted_steps(frames: Bytes) -> Bools | None:
-    """[N, T] whether each step is the step before, shifted by one frame; None if too few steps are."""
+    """[N, T] whether each step is the step before it shifted by one frame; None if this holds for too few steps."""
     steps, copies, k, size = frames.shape
     words = frames.view(next(f"u{width}" for width in (8, 4, 2, 1) if size % width == 0))
-    fewest = MIN_STACK_SAVING * steps * k / (k - 1)  # for each copy
+    fewest = MIN_STACK_SAVING * steps * k / (k - 1)  # shifted steps that each copy needs on average
 
     def same(before: Array, after: Array) -> Bools:
         return np.asarray((before[:, :, 1:] == after[:, :, :-1]).reshape(len(after), copies, -1).all(-1))

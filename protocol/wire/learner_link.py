@@ -1,12 +1,13 @@
 """The learner's end of the connections: one ROUTER socket, many workers. The address chooses the transport.
 
-ROUTER_MANDATORY: without it a ROUTER silently drops messages at its high-water mark. ROUTER_HANDOVER: without it a worker
-that returns is locked out until its half-open connection times out. A link belongs to one thread.
+The socket needs two options. Without ROUTER_MANDATORY, a ROUTER silently drops messages at its high-water mark. Without
+ROUTER_HANDOVER, a worker that returns is locked out until its half-open connection times out. Only one thread may use a
+link.
 
-With keys, a peer is a routing id *and* the key that it uses, which libzmq proves for every message. A client that claims
-another's routing id with its own key is therefore another peer: it cannot speak in that worker's session, nor end it. It
-cannot even cut that worker's connection (a handover leaves the earlier connection open but unread), because a worker's
-routing id ends in a tag that only the holder of its key can make.
+With keys, a peer is identified by its routing id *and* its key, which libzmq verifies for every message. A client that
+claims another's routing id with its own key is therefore another peer: it can neither speak in that worker's session nor end
+it. It cannot even cut that worker's connection by a handover (which leaves the earlier connection open but unread), because
+a worker's routing id ends in a tag that only the holder of its key can compute.
 """
 
 from __future__ import annotations
@@ -40,16 +41,19 @@ class LearnerLink:
     def __init__(
         self, address: str, context: zmq.Context[zmq.Socket[bytes]] | None = None, keyring: Keyring | None = None
     ) -> None:
-        """With a keyring (only over tcp), only its clients may connect. A context can hold one such link."""
+        """Bind to the address. With a keyring (only over tcp), only the clients on its list may connect.
+
+        A context can have only one link with a keyring. Raises `UsageError` if the address is not valid or can't be bound.
+        """
         check_address(address)
         self.context = context or zmq.Context.instance()
         self.keyring = keyring
         self.received = Traffic()
         self.sent = Traffic()
         self.refused_messages = 0
-        """messages with keys that are not allowed any more"""
+        """number of messages that were refused because their keys are no longer allowed"""
         self.packed_bytes_limit = 0
-        """most bytes that the packed arrays of one message may unpack to; 0: no array may be packed"""
+        """largest total unpacked size, in bytes, of the packed arrays of one message; 0: no array may be packed"""
         self._last_keys: dict[bytes, str] = {}  # routing id -> key of its last message
         self._log_limiter = LogRateLimiter()
         self._socket = self.context.socket(zmq.ROUTER)
@@ -68,7 +72,7 @@ class LearnerLink:
             self.close(linger_s=0.0)
             raise UsageError(_bind_error(address, error)) from error
         self.address = bytes(self._socket.get(zmq.LAST_ENDPOINT)).decode().rstrip("\0")
-        """where workers connect, with the port that was chosen for `*`"""
+        """the address to which workers connect, with the port that was chosen for `*`"""
 
     @property
     def refused(self) -> int:
@@ -76,15 +80,18 @@ class LearnerLink:
         return self._authenticator.refused if self._authenticator is not None else 0
 
     def poll(self, timeout_s: float) -> bool:
-        """Wait until something arrives, at most `timeout_s`. Raises `RunError` if the authenticator ended."""
+        """Wait until a message arrives, at most `timeout_s` seconds. Returns whether one has arrived.
+
+        Raises `RunError` if the authenticator's thread has ended.
+        """
         if self._authenticator is not None and not self._authenticator.is_alive():
             raise RunError(f"authenticator of {self.address}: its thread has ended, see the log; start again with --resume")
         return bool(self._socket.poll(max(0, int(timeout_s * 1000))))
 
     def poll_beside(self, fds: Sequence[int], timeout_s: float) -> bool:
-        """Wait until something arrives, or one of these file descriptors can be read, at most `timeout_s`.
+        """Wait until a message arrives, or one of these file descriptors can be read, at most `timeout_s` seconds.
 
-        True if something has arrived.
+        Returns whether a message has arrived.
         """
         poller = zmq.Poller()
         for each in (self._socket, *fds):
@@ -92,7 +99,9 @@ class LearnerLink:
         return any(ready is self._socket for ready, _ in poller.poll(max(0, int(timeout_s * 1000))))
 
     def receive(self) -> Iterator[tuple[bytes, ToLearner | Inquire | BadMessage]]:
-        """Messages that have arrived, each with its sender; at most MAX_MESSAGES. An unreadable one comes as its error."""
+        """Messages that have arrived, each with its sender; at most MAX_MESSAGES. In place of an unreadable message, yields
+        the error.
+        """
         sender_keys: list[str] | None = None if self.keyring is None else []
         for _ in range(MAX_MESSAGES):  # so that a flood can't block the learner
             frames = receive_frames(self._socket, sender_keys)
@@ -110,27 +119,29 @@ class LearnerLink:
                 yield peer, error
 
     def rejection_reason(self, peer: bytes) -> str:
-        """Why this peer is not allowed any more; empty if it is."""
+        """Why this peer is no longer allowed to connect; empty if it is."""
         return "" if self.keyring is None else self.keyring.allowed.rejection_reason(_key_of(peer))
 
     def name_for_log(self, peer: bytes) -> str:
-        """The name for log lines about this peer: the name of its key, or without keys its own name."""
+        """The name for log lines about this peer: the name of its key, or, without keys, the name that it gives itself."""
         return name_for_people(peer) if self.keyring is None else self.keyring.allowed.name_of(_key_of(peer))
 
     def source(self, peer: bytes) -> str:
-        """The name of this peer's key. Empty without keys, because names prove nothing then."""
+        """The name of this peer's key. Empty without keys, because then names prove nothing."""
         return "" if self.keyring is None else self.name_for_log(peer)
 
     def _peer(self, routing_id: bytes, key: str) -> bytes:
-        """The peer that uses this routing id now."""
-        self._last_keys.pop(routing_id, None)  # so that the routing id of the oldest message is first
+        """The id of the peer with this routing id and key, which is recorded as the one that uses the routing id now."""
+        self._last_keys.pop(routing_id, None)  # so that the dict stays in the order of last messages
         self._last_keys[routing_id] = key
         if len(self._last_keys) > MAX_REMEMBERED_KEYS:
             del self._last_keys[next(iter(self._last_keys))]
         return b"%s\0%s" % (routing_id, key.encode())
 
     def _refuse_key(self, peer: bytes) -> bool:
-        """Count and answer a message if its key is not allowed any more. Returns whether that was so."""
+        """If the peer's key is no longer allowed, count its message and answer with a `Refuse`. Returns whether
+        that was so.
+        """
         why = self.rejection_reason(peer)
         if why:
             self.refused_messages += 1
@@ -145,7 +156,7 @@ class LearnerLink:
         return bool(why)
 
     def send(self, peer: bytes, frames: Sequence[Buffer]) -> bool:
-        """Send; False if the peer is gone."""
+        """Send a message. Returns False if the peer is gone or its queue is full."""
         if self.keyring is not None:
             routing_id, _, key = peer.rpartition(b"\0")
             if self._last_keys.get(routing_id) != key.decode():
@@ -162,9 +173,9 @@ class LearnerLink:
         return True
 
     def close(self, linger_s: float = LINGER_MS / 1000) -> None:
-        """Send what is queued, at most `linger_s`, and close."""
+        """Send queued messages, for at most `linger_s` seconds, and close the socket."""
         if self._authenticator is not None and not self._socket.closed:
-            self._socket.disable_monitor()  # before its reader is closed: libzmq blocks without one
+            self._socket.disable_monitor()  # before the monitor's reader is closed: libzmq blocks without a reader
         self._socket.close(linger=int(linger_s * 1000))
         if self._authenticator is not None:
             self._authenticator.close()

@@ -1,10 +1,10 @@
-"""Plain values <-> bytes, for `info` dicts and the results of calls. Types are kept. Pure; no pickle.
+"""Converts plain values to bytes and back, for `info` dicts and the results of calls. Types are kept. Pure; no pickle.
 
-Plain is None, bool, int, float, complex, str, bytes, list, tuple, dict, and numpy's scalars and arrays (of these dtypes,
-and of objects that are plain). Text with a lone surrogate, which UTF-8 cannot encode, and integers with more decimal digits
-than Python converts are not plain. Anything else raises `TypeError`, or, if the caller asks for it, is sent as its `repr`
-and arrives as a `ReprString`, which cannot be confused with a string. For such a caller, subclasses of dict are plain, too:
-they arrive as dicts.
+A value is plain if it is None, a bool, int, float, complex, str, bytes, list, tuple, dict, or one of numpy's scalars or
+arrays (of these dtypes, or of objects that are plain). Strings with a lone surrogate, which UTF-8 cannot encode, and
+integers with more decimal digits than Python converts are not plain. A value that isn't plain raises `TypeError`; if the
+caller asks for it, the value is instead sent as its `repr` and arrives as a `ReprString`, which cannot be confused with a
+string. For such a caller, subclasses of dict are plain too: they arrive as dicts.
 """
 
 from __future__ import annotations
@@ -33,14 +33,16 @@ class ReprString(str):
 
 
 def pack(value: object, use_repr: bool = False) -> bytes:
-    """Bytes of a plain value. Anything else is sent as its `repr` if `use_repr`, else raises `TypeError`."""
+    """Convert a plain value to bytes. If it isn't plain, `use_repr` packs its `repr` instead; otherwise, raises
+    `TypeError`.
+    """
     return _pack(_to_msgpack(value, "", use_repr, 0))
 
 
 def unpack(data: bytes | memoryview) -> Any:
     """The value of these bytes. Raises `BadMessage` for invalid bytes, and no other error.
 
-    The result can be walked recursively: it has at most `MAX_DEPTH` levels.
+    The result has at most `MAX_DEPTH` levels, so it is safe to traverse recursively.
     """
     try:
         value = _unpack(data, 0)
@@ -58,7 +60,11 @@ def _pack(value: object) -> bytes:
 
 
 def _to_msgpack(value: Any, where: str, use_repr: bool, depth: int) -> Any:
-    """The value in types that msgpack knows. Types are compared exactly, so that no subclass arrives as its base class."""
+    """Convert a value to types that msgpack knows. Types are compared exactly, so that no subclass arrives as its base
+    class.
+
+    `where` is the value's path in errors. Raises `TypeError` for a value that isn't plain, unless `use_repr`.
+    """
     if depth > MAX_DEPTH:
         raise TypeError(f"{where or 'value'}: expected at most {MAX_DEPTH} levels, got more")
     kind = type(value)
@@ -100,7 +106,7 @@ def _to_msgpack(value: Any, where: str, use_repr: bool, depth: int) -> Any:
 
 
 def _is_encodable(text: str) -> bool:
-    """Whether UTF-8 can encode it."""
+    """Whether UTF-8 can encode the text."""
     if text.isascii():
         return True
     try:
@@ -111,7 +117,7 @@ def _is_encodable(text: str) -> bool:
 
 
 def _digits(value: int) -> bytes | None:
-    """The decimal digits; None if there are more than Python converts (`sys.set_int_max_str_digits`)."""
+    """The decimal digits of an integer; None if it has more than Python converts (`sys.set_int_max_str_digits`)."""
     try:
         return str(value).encode()
     except ValueError:
@@ -188,7 +194,7 @@ def _dtype(name: object) -> np.dtype[Any]:
 
 
 def _check_characters(raw: bytes, kind: np.dtype[Any]) -> None:
-    """Numpy takes any four bytes for a character, and fails only when the text is used."""
+    """Raise `BadMessage` for text with invalid characters: numpy accepts any four bytes, and fails when the text is used."""
     if kind.kind == "U" and raw and (last := int(np.frombuffer(raw, f"{kind.str[0]}u4").max())) > sys.maxunicode:
         raise BadMessage(f"text of {kind.str}: expected characters up to {sys.maxunicode}, got {last}")
 

@@ -1,9 +1,9 @@
 """Memory that a learner shares with worker processes of the same machine, for the steps of a vector environment.
 
-Rule: each counter of a lane has one writer. The learner writes the actions and then raises `ordered`; the worker writes
-the results of the step and then raises `answered` to the same number; only then does the other side read. The memory is an
+Rule: each counter of a lane has one writer. The learner writes the actions and then increments `ordered`; the worker writes
+the results of the step and then sets `answered` to the same number. The other side reads only after that. The memory is an
 unlinked file and the wake-up pipes have no names: child processes inherit the descriptors, so nothing is left behind when a
-process dies. Linux only; elsewhere everything is sent as messages.
+process dies. This works only on Linux; elsewhere, everything is sent as messages.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from millrace.protocol.specs import StepSpec
 SUPPORTED = hasattr(os, "memfd_create") and hasattr(os, "pipe2")
 CACHE_LINE_BYTES = 64  # each counter of a lane has its own cache line
 WORDS = CACHE_LINE_BYTES // 8
-MIN_INFO_BYTES = 1 << 20  # least space for the infos of a lane; longer infos are sent as a message
-INFOS_IN_MESSAGE = -1  # in place of the number of bytes: the infos of this step are sent as a message
+MIN_INFO_BYTES = 1 << 20  # minimum space for the infos of a lane; infos that don't fit are sent as a message
+INFOS_IN_MESSAGE = -1  # stands in place of the number of bytes if the infos of this step are sent as a message
 
 
 class InheritedDescriptors(NamedTuple):
@@ -56,9 +56,9 @@ class SharedMemory:
     """The shared memory of one vector environment, as one side sees it."""
 
     def __init__(self, spec: StepSpec, fd: int, *, resize: bool = False) -> None:
-        """Map the memory. With `resize` (the learner) it gets the size that the spec needs.
+        """Map the memory. With `resize`, which the learner uses, first give it the size that the spec needs.
 
-        Raises ValueError if it has another size.
+        Raises `ValueError` if it has another size.
         """
         lanes = [spec.rows(lane) for lane in range(len(spec.lanes))]
         N = lanes[-1].stop
@@ -86,7 +86,7 @@ class SharedMemory:
         ]
         self.actions = tuple(arrays[: len(spec.action)])
         self.obs = tuple(arrays[len(spec.action) : -3])
-        """[N, *leaf] each, all lanes together"""
+        """[N, *leaf] each, where N counts the rows of all lanes"""
         self.reward, self.terminated, self.truncated = arrays[-3:]
         self.lanes = []
         for lane, rows in enumerate(lanes):
@@ -105,13 +105,13 @@ class SharedMemory:
         return at, shape, dtype
 
     def ordered(self, lane: int) -> int:
-        """Number of the lane's newest order."""
+        """The number of the lane's newest order."""
         return self._words[2 * WORDS * lane]
 
     def order(self, lanes: Iterable[int], *, wake: bool = False) -> dict[int, int]:
-        """Order a step of these lanes, after the actions were written. Returns the number of each lane's order.
+        """Order a step of these lanes. Write the actions first. Returns the number of the order for each lane.
 
-        `wake`: the worker wakes the learner when a lane is done, even if others are not.
+        With `wake`, a worker wakes the learner as soon as one of these lanes is done, even if others are not.
         """
         words = self._words
         numbers = dict[int, int]()
@@ -126,11 +126,14 @@ class SharedMemory:
         return bool(self._words[2 * WORDS * lane + 1])
 
     def answered(self, lane: int) -> int:
-        """Number of the lane's newest finished order."""
+        """The number of the lane's newest finished order."""
         return self._words[2 * WORDS * lane + WORDS]
 
     def answer(self, lane: int, number: int, infos: bytes) -> bool:
-        """Mark the step as finished. False if the infos do not fit: the caller must send them as a message."""
+        """Mark the order with this number as finished. Write the results first.
+
+        Returns False if the infos do not fit, so that the caller must send them as a message.
+        """
         fits = len(infos) <= self.info_bytes[lane]
         if infos and fits:
             self.lanes[lane].infos[: len(infos)] = infos
@@ -139,10 +142,10 @@ class SharedMemory:
         return fits
 
     def unanswered_orders(self) -> int:
-        """How many lanes have an unfinished order. A worker asks after it finished one.
+        """The number of lanes with an unfinished order. A worker calls this after it has finished one.
 
-        Of workers that finish at the same moment, at least one gets 0: taking the lock makes the worker's own answer visible
-        before it reads those of the others. That does not hold on every processor: see `CAN_SPIN`.
+        If the last workers finish at the same moment, at least one of them gets 0: taking the lock makes the worker's own
+        answer visible before it reads those of the others. This does not hold on every processor: see `CAN_SPIN`.
         """
         with self._fence:
             return int(np.count_nonzero(self._ordered != self._answered))
@@ -154,7 +157,7 @@ class SharedMemory:
         return None if size == INFOS_IN_MESSAGE else bytes(self.lanes[lane].infos[:size])
 
     def close(self) -> None:
-        """Close the descriptor. The memory is freed with its last view."""
+        """Close the descriptor. The memory is freed when its last view is."""
         if self.fd >= 0:
             os.close(self.fd)
             self.fd = -1

@@ -1,7 +1,7 @@
 """Options of the sockets of both sides, and the routing id of a worker. Imports no numpy.
 
-Each option was found by an experiment. MAXMSGSIZE bounds a frame before a byte of it is read. TCP_MAXRT and keepalive close
-a connection whose other end has vanished; the worker makes a new one within seconds. There are no ZMTP heartbeats: while a
+Each option was found by experiment. MAXMSGSIZE bounds the size of a frame before any of it is read. TCP_MAXRT and keepalive
+close a connection whose other end has vanished; the worker makes a new one within seconds. ZMTP heartbeats are off: while a
 reader is stopped by its high-water mark, they lose and reorder messages. Our own heartbeats detect silence, and tickets keep
 queues short.
 """
@@ -19,24 +19,27 @@ from millrace.protocol.keys.keys import Token
 from millrace.protocol.wire.message_sizes import MAX_FRAME_BYTES
 
 LINGER_MS = 2000
-UNACKNOWLEDGED_MS = 5000  # TCP doubles its retry interval: after an outage it may need as long again as the outage lasted
-QUEUE = 1000  # messages that wait for a peer that does not read
+UNACKNOWLEDGED_MS = 5000  # short, because TCP doubles its retry interval: recovery may take as long as the outage
+QUEUE = 1000  # messages that may wait for a peer that does not read
 RECONNECT_MS = 100
 RECONNECT_MOST_MS = 2000
-CURVE_BYTES = 33  # what encryption adds to a frame
+CURVE_BYTES = 33  # bytes that encryption adds to a frame
 TAG_CHARACTERS = 32
 
 
 class Limits(NamedTuple):
-    """Limits of what this end keeps for the other end."""
+    """Limits on what this end accepts from the other end and queues for it."""
 
     frame_bytes: int
     messages: int
-    """messages that wait to be read or sent"""
+    """number of messages that may wait to be read or sent"""
 
 
 def set_options(socket: zmq.Socket[bytes], address: str, curve: bool, limits: Limits | None = None) -> None:
-    """Set the options that both sides need, before the socket binds or connects. `limits`: if not those of a worker."""
+    """Set the options that both sides need, before the socket binds or connects.
+
+    If `limits` is None, they are those of workers and learners.
+    """
     limits = limits or Limits(MAX_FRAME_BYTES, QUEUE)
     socket.linger = LINGER_MS
     socket.maxmsgsize = limits.frame_bytes + (CURVE_BYTES if curve else 0)
@@ -49,12 +52,12 @@ def set_options(socket: zmq.Socket[bytes], address: str, curve: bool, limits: Li
     socket.tcp_keepalive_intvl = 5
     socket.tcp_keepalive_cnt = 3
     socket.ipv6 = needs_ipv6(address)
-    # A worker never reaches its limit: at most one Weights message, a few tickets and their rollouts are on their way.
+    # A worker never reaches its limit: at most one Weights message, a few tickets and their rollouts are in transit.
     socket.sndhwm = socket.rcvhwm = limits.messages
 
 
 def routing_id(name: str, token: Token | None) -> bytes:  # rule ROUTING_ID
-    """The worker's name; with a key, followed by a tag that nobody else can compute."""
+    """The worker's name; with a token, it is followed by a tag that only the holder of the token can compute."""
     if token is None:
         return name.encode()
     tag = hashlib.blake2b(name.encode(), key=token.client.secret, digest_size=TAG_CHARACTERS // 2)

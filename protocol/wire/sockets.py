@@ -10,7 +10,7 @@ import zmq
 from millrace.protocol.wire.codec import Buffer
 from millrace.protocol.wire.message_sizes import MAX_FRAMES
 
-COPY_BELOW_BYTES = 65536  # copying a smaller frame is cheaper than tracking it
+COPY_BELOW_BYTES = 65536  # copying a smaller frame is cheaper than having ZeroMQ track it
 NOT_WAITING = int(zmq.NOBLOCK)
 AND_MORE = int(zmq.NOBLOCK | zmq.SNDMORE)
 
@@ -29,7 +29,7 @@ def receive_frames(socket: zmq.Socket[bytes], sender_keys: list[str] | None = No
             if sender_keys is not None and not frames:
                 sender_keys[:] = [_user(frame)]
             more = frame.more
-            if len(frames) < MAX_FRAMES + 2:  # + sender's name, + one that shows there were too many
+            if len(frames) < MAX_FRAMES + 2:  # 1 for the sender's name, 1 to show that there were too many
                 frames.append(frame.buffer if len(frame) >= COPY_BELOW_BYTES else frame.bytes)
     except zmq.Again:
         return None
@@ -37,7 +37,7 @@ def receive_frames(socket: zmq.Socket[bytes], sender_keys: list[str] | None = No
 
 
 def send_frames(socket: zmq.Socket[bytes], frames: Sequence[Buffer]) -> None:
-    """Faster `send_multipart`, whose checks of flags and types for each frame are half the cost of sending."""
+    """Like `send_multipart`, but faster, because it skips the checks of each frame, which are half the cost of sending."""
     for frame in frames[:-1]:
         socket.send(frame, AND_MORE, copy=False)
     socket.send(frames[-1], NOT_WAITING, copy=False)
@@ -46,13 +46,15 @@ def send_frames(socket: zmq.Socket[bytes], frames: Sequence[Buffer]) -> None:
 def _user(frame: zmq.Frame) -> str:
     try:
         return str(frame.get("User-Id"))
-    except zmq.ZMQError:  # no key is present, which should never happen; no client has this key
+    except zmq.ZMQError:  # there is no key, which should never happen; "" is not the key of any client
         return ""
 
 
 @dataclass
 class Traffic:
-    """Traffic in one direction. Bytes count all frames before encryption, including the worker's name."""
+    """Counts the traffic in one direction. The bytes are those of all frames before encryption, including the
+    worker's name.
+    """
 
     messages: int = 0
     bytes: int = 0

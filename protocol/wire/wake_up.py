@@ -1,6 +1,6 @@
-"""How a learner and its worker processes wait for each other's steps: a pipe that wakes a sleeper, and spinning before that.
+"""How a learner and its worker processes wait for each other's steps: they spin, and then sleep until a pipe wakes them.
 
-Linux only; elsewhere everything is sent as messages.
+This works only on Linux; elsewhere, everything is sent as messages.
 """
 
 from __future__ import annotations
@@ -13,11 +13,12 @@ from contextlib import suppress
 from enum import IntEnum
 from time import perf_counter
 
-# On x86 no core sees a later store before an earlier one. Elsewhere only a system call orders them, so there is no spinning.
+# On x86, no core sees a later store before an earlier one. Elsewhere, only a system call orders them, so we don't spin
+# there.
 CAN_SPIN = platform.machine() in {"x86_64", "AMD64", "i686"}
 SPIN_S = 0.0002  # a learner that only computes its next action is back by then; sleeping and waking costs 50 µs
-BUSY_CORE_S = 0.00005  # a spin turn that takes longer means that another process ran meanwhile and needs this core
-MAX_SKIPPED_SPINS = 63  # waits without spinning between two tries to spin
+BUSY_CORE_S = 0.00005  # if one turn of spinning takes longer, another process ran in between and needs this core
+MAX_SKIPPED_SPINS = 63  # largest number of waits without spinning between two attempts to spin
 
 
 class WakeReason(IntEnum):
@@ -29,15 +30,15 @@ class WakeReason(IntEnum):
 
 
 class WakePipe:
-    """A pipe by which one side wakes the other: one writes a byte, the other waits until it can read.
+    """A pipe by which one side wakes the other: one side writes a byte, and the other sleeps until it can read it.
 
-    It is a pipe because Linux assumes that a process that writes to a pipe is about to wait: the woken process starts on the
-    same core as soon as the writer sleeps. A process woken by an eventfd or a semaphore may have to wait for a core on which
-    a third process spins.
+    It is a pipe because Linux assumes that a process that writes to a pipe is about to sleep: the woken process starts on
+    the same core as soon as the writer sleeps. A process woken by an eventfd or a semaphore may have to wait for a core on
+    which a third process spins.
     """
 
     def __init__(self, *, read_fd: int = -1, write_fd: int = -1) -> None:
-        """A new pipe, or one end of a pipe that this process inherited."""
+        """Create a pipe, or use the one or two ends of a pipe that this process inherited."""
         self.read_fd, self.write_fd = (
             os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC) if read_fd == write_fd == -1 else (read_fd, write_fd)
         )
@@ -47,13 +48,16 @@ class WakePipe:
 
     def wake(self, reason: WakeReason = WakeReason.STEP) -> None:
         """Wake the other side, now or when it next waits."""
-        with suppress(BlockingIOError, BrokenPipeError):  # full: the reader will wake anyway; broken: the reader is gone
+        with suppress(
+            BlockingIOError, BrokenPipeError
+        ):  # the pipe is full, so the reader wakes anyway; or the reader is gone
             os.write(self.write_fd, _BYTES[reason])
 
     def wait(self, timeout_s: float) -> WakeReason:
-        """Sleep until woken, at most `timeout_s`. If there are several reasons, `MESSAGE` takes precedence over `STEP`.
+        """Sleep until woken, at most `timeout_s` seconds. Returns the reason; `MESSAGE` takes precedence over `STEP`.
 
-        If the reader noticed a step without sleeping, its byte is still in the pipe, and the next `wait` returns at once.
+        If the reader has noticed a step without sleeping, the step's byte is still in the pipe, and the next `wait` returns
+        immediately.
         """
         if not self._poll.poll(timeout_s * 1000):
             return WakeReason.NONE
@@ -74,17 +78,17 @@ _BYTES = {reason: bytes([reason]) for reason in WakeReason}
 
 
 class SpinWait:
-    """Spins for a short time before a sleep. Each time that spinning fails, more of the next waits skip it.
+    """Spins for a short time before a sleep. Each time that spinning was in vain, more of the following waits skip it.
 
-    Linux may ignore `sched_yield` for a while; only a sleeping process surely frees its core. So spinning ends at the first
-    turn that takes long because another process wanted this core.
+    Linux may ignore `sched_yield` for a while; only a sleeping process is certain to free its core. So spinning stops after
+    the first turn that takes so long that another process must have run on this core.
     """
 
     def __init__(self) -> None:
         self._skipped = self._to_skip = 0
 
     def wait(self, seen: Callable[[], bool], seconds: float) -> bool:
-        """Spin until `seen` returns true, at most `seconds`. Returns whether it did."""
+        """Spin until `seen` returns True, for at most this many seconds. Returns whether it did."""
         if seen():
             return True
         if not CAN_SPIN or seconds <= 0:

@@ -1,8 +1,8 @@
-"""Dtypes in which weights are sent: float32, or rounded to bfloat16, two bytes each. Pure; imports no torch.
+"""The dtypes in which weights are sent: float32, or rounded to bfloat16, which has two bytes. Pure; imports no torch.
 
-`bfloat16` is the upper half of a float32, sent as uint16: the range of float32, and 8 bits of precision. It is rounded to
-nearest, ties to even. Rule: the policy acts with exactly the weights that were sent, so its log-probabilities are those of
-the rounded weights. A weight that would become infinite is not sent.
+A bfloat16 is the upper half of a float32, sent as uint16: it has the range of float32, and 8 bits of precision. Weights are
+rounded to the nearest, ties to even. Rule: the policy acts with exactly the weights that were sent, so its log-probabilities
+are those of the rounded weights. A weight that would become infinite is not sent.
 """
 
 from __future__ import annotations
@@ -16,12 +16,15 @@ from millrace.protocol.errors import RunError
 
 ActingDtype = Literal["float32", "bfloat16"]
 
-# From here on values round to infinity: halfway between the largest number and the next power of two.
+# Values from here on are rounded to infinity: this is halfway between the largest bfloat16 and the next power of two.
 BOUND = (2 - 2**-8) * 2.0**127
 
 
 def to_wire_dtype(parameters: Floats, dtype: ActingDtype) -> Array:
-    """Convert float32 parameters [P] to `dtype`; float32 is not copied. Raises `RunError` if one is out of range."""
+    """Convert float32 parameters [P] to `dtype`; if that is float32 too, they aren't copied.
+
+    Raises `RunError` if a parameter is out of range.
+    """
     if dtype == "float32" or parameters.size == 0:
         return parameters
     largest = max(float(parameters.max()), -float(parameters.min()))

@@ -1,4 +1,4 @@
-"""A worker's end of its connection: one DEALER socket. The address chooses the transport. A link belongs to one thread."""
+"""A worker's end of its connection: one DEALER socket. The address chooses the transport. Only one thread may use a link."""
 
 from __future__ import annotations
 
@@ -28,7 +28,9 @@ from millrace.protocol.wire.sockets import receive_frames, send_frames
 Decoded = TypeVar("Decoded")
 
 OF_OBSERVER = Limits(frame_bytes=MAX_HEAD_BYTES, messages=8)
-"""An observer's limits: an answer to it has no arrays. The address may be one that a stranger's run folder names."""
+"""The limits of an observer. They are low, because answers to it have no arrays, and its address may come from the run
+folder of a stranger.
+"""
 
 log = logging.getLogger("millrace.link")
 
@@ -44,21 +46,22 @@ class WorkerLink:
         token: Token | None = None,
         limits: Limits | None = None,
     ) -> None:
-        """With a token (only over tcp) the link connects only to the learner of that token. `limits`: if not a worker's.
+        """Connect to the address. With a token (only over tcp), the link connects only to the learner of that token.
 
-        `context`: over inproc, the learner's context; closing the link leaves it open.
+        Over inproc, `context` must be the learner's context; closing the link leaves it open. If `limits` is None, they are
+        those of a worker. Raises `UsageError` for an address or a name that is not valid.
         """
         check_address(address)
         check_worker_name(name)
         self.address = address
         self.token = token
         self.problem: ConnectionProblem | None = None
-        """why there is no connection, if known"""
+        """why there is no connection; None if that is not known"""
         self.connected = False
-        """whether there seems to be a connection; known only for tcp"""
+        """whether there seems to be a connection; always False for other transports than tcp"""
         far = token is not None or not is_local(address)
         self.packing = Packing(stack=far, zstd=far and has_zstd())
-        """how rollouts may be packed: only if the connection is encrypted or leaves this machine"""
+        """how rollouts may be packed; they aren't packed unless the connection is encrypted or leaves this machine"""
         self._log_limiter = LogRateLimiter()
         self._owns_context = context is None
         self.context: zmq.Context[zmq.Socket[bytes]] = context or zmq.Context()
@@ -84,12 +87,15 @@ class WorkerLink:
             self._report(ConnectionProblem(f"the host of {address} is not known here; is it spelled right?"))
 
     def watch(self, fd: int) -> None:
-        """From now on `poll` returns early when this file descriptor can be read."""
+        """From now on, let `poll` return early when this file descriptor can be read."""
         self._poller.register(fd, zmq.POLLIN)
         self._beside = fd
 
     def poll(self, timeout_s: float) -> bool:
-        """Wait until something arrives, at most `timeout_s`. Returns early if the learner refuses our key."""
+        """Wait until a message arrives, at most `timeout_s` seconds. Returns whether one has arrived.
+
+        Returns early if the learner refuses our key, or the file descriptor of `watch` can be read.
+        """
         deadline_s = time.monotonic() + timeout_s
         while True:
             left_s = max(0.0, deadline_s - time.monotonic())
@@ -105,12 +111,12 @@ class WorkerLink:
         self._socket.monitor(name, WORKER_EVENTS)
         self._monitor = self.context.socket(zmq.PAIR)
         self._monitor.linger = 0
-        self._monitor.rcvhwm = 0  # no limit: libzmq blocks while nobody reads, and an environment's step may take minutes
+        self._monitor.rcvhwm = 0  # no limit: libzmq blocks if nobody reads, and an environment's step may take minutes
         self._monitor.connect(name)
         self._poller.register(self._monitor, zmq.POLLIN)
 
     def _read_events(self) -> None:
-        """Handle events of the connection."""
+        """Handle the events that libzmq's monitor has reported about the connection."""
         assert self._monitor is not None
         with suppress(zmq.Again):
             while True:
@@ -133,11 +139,11 @@ class WorkerLink:
             log.warning("%s%s", problem.line, suppressed_note(kept_back))
 
     def receive(self) -> Iterator[ToWorker | BadMessage]:
-        """All messages that have arrived. An unreadable message comes as its error."""
+        """All messages that have arrived. In place of an unreadable message, yields the error."""
         return self._received(decode_to_worker)
 
     def answers(self) -> Iterator[ToObserver | BadMessage]:
-        """All answers to `Inquire` that have arrived, for an observer that is not a worker."""
+        """All answers to `Inquire` that have arrived; for observers, which are not workers."""
         return self._received(decode_to_observer)
 
     def _received(self, decode: Callable[[Sequence[Buffer]], Decoded]) -> Iterator[Decoded | BadMessage]:
@@ -148,22 +154,23 @@ class WorkerLink:
                 yield error
 
     def send(self, frames: Sequence[Buffer]) -> None:
-        """Send, or queue while the learner is out of reach (the conversation repairs losses)."""
+        """Send a message, or queue it while the learner can't be reached. If it is lost, heartbeats repair that."""
         with suppress(zmq.Again):
             send_frames(self._socket, frames)
 
     def connect_again(self) -> None:
-        """Give up the connection and make another. Queued messages are lost (the conversation repairs that)."""
+        """Drop the connection and make another. Queued messages are lost; heartbeats repair that."""
         self._socket.disconnect(self.address)
         self._socket.connect(self.address)
 
     def close(self, linger_s: float = LINGER_MS / 1000) -> None:
-        """Send what is queued, at most `linger_s`, and close.
+        """Send queued messages, for at most `linger_s` seconds, and close the socket.
 
-        A process whose context is still sending when it ends aborts: Python frees the frames that libzmq sends.
+        Call this before the process ends: if its context were still sending, the process would abort, because Python frees
+        the frames that libzmq sends.
         """
         if self._monitor is not None and not self._socket.closed:
-            self._socket.disable_monitor()  # before its reader is closed: libzmq blocks without one
+            self._socket.disable_monitor()  # before the monitor's reader is closed: libzmq blocks without a reader
             self._monitor.close(linger=0)
         self._socket.close(linger=int(linger_s * 1000))
         if self._owns_context:
