@@ -1,10 +1,10 @@
-"""What a worker is doing, in a page of memory that it shares with its supervisor.
+"""A worker's current activity, in a page of memory that the worker shares with its supervisor.
 
-Rule: each number has one writer. The worker writes what it is doing, since when, and how many calls of the environment have
-returned; when a learner welcomes it, how long a call may take; before it leaves on purpose, its exit code. The supervisor
-only reads. So it sees what a worker is doing even while a C extension holds the worker's interpreter lock. The memory is an
-unlinked file that a child process inherits. The worker's stacks are written behind the page when the supervisor asks for
-them by a signal.
+Rule: only the worker writes to the page, and the supervisor only reads it. The worker writes what it is doing, since when,
+and how many calls of the environment have returned; when a learner welcomes it, how long a call may take; before it leaves
+on purpose, its exit code. So the supervisor sees what a worker is doing even while a C extension holds the worker's
+interpreter lock. The memory is an unlinked file that a child process inherits. When the supervisor sends a signal, the
+worker writes the stacks of its threads after the page, into the same file.
 
 A worker in a thread has its own page, which isn't shared.
 """
@@ -27,7 +27,7 @@ from millrace.protocol.call_timeouts import OF_POLICY, OUR_CODE, CallTimeouts, D
 
 PAGE_BYTES = 4096
 MAX_STACK_BYTES = 64_000
-STACK_SIGNAL = getattr(signal, "SIGQUIT", None)  # by convention: write the stack of each thread
+STACK_SIGNAL = getattr(signal, "SIGQUIT", None)  # by convention, a program that gets it writes the stack of each thread
 DOINGS: tuple[Doing, ...] = get_args(Doing)
 (
     STARTING,
@@ -42,16 +42,16 @@ DOINGS: tuple[Doing, ...] = get_args(Doing)
     EVALUATING,
     CLOSING,
 ) = range(len(DOINGS))
-# Places of the numbers in the page.
+# The index of each number in the page.
 DOING, SINCE_S, ENV_CALLS, LEAVES, LEAVES_SINCE_S, START_TIMEOUT_S, STEP_TIMEOUT_S = range(7)
 MOST_CALLS = 2**53
 
 
 class Activity:
-    """The worker's side of the page. perf_counter and the supervisor's clock are the same clock."""
+    """The worker's side of the page. Times are those of `perf_counter`, a clock that worker and supervisor share."""
 
     def __init__(self, fd: int | None = None) -> None:
-        """`fd`: the page that the supervisor made. None: a page of this thread alone."""
+        """`fd` is the file of a page that the supervisor made; if it is None, the page belongs to this process alone."""
         page = memoryview(mmap.mmap(-1 if fd is None else fd, PAGE_BYTES))
         self.numbers = page.cast("q")
         self.seconds = page.cast("d")
@@ -61,8 +61,9 @@ class Activity:
             faulthandler.register(STACK_SIGNAL, file=fd, all_threads=True)
 
     def begin(self, doing: int) -> None:
-        """Record that the worker now does this. The time is written first, so that no reader sees the new activity with the
-        time of the old one.
+        """Record that the worker begins this activity, one of the constants above.
+
+        The time is written first, so that no reader sees the new activity with the time of the old one.
         """
         self.seconds[SINCE_S] = perf_counter()
         self.numbers[DOING] = doing
@@ -74,7 +75,7 @@ class Activity:
 
     @contextmanager
     def during(self, doing: int) -> Iterator[None]:
-        """While it is entered, the worker makes one call of the environment or of a policy; may be nested."""
+        """A context in which the worker makes one call of the environment or of a policy. Contexts may be nested."""
         before = self.numbers[DOING]
         self.begin(doing)
         try:
@@ -85,7 +86,7 @@ class Activity:
                 self.begin(before)
 
     def limit(self, timeouts: CallTimeouts) -> None:
-        """Set how long a call of user code may take from now on. Before, it may take any time."""
+        """Set how long a call of user code may take from now on. Until the first call of this, there is no limit."""
         self.seconds[START_TIMEOUT_S] = timeouts.start_s
         self.seconds[STEP_TIMEOUT_S] = timeouts.step_s
 
@@ -118,18 +119,20 @@ class Reading(NamedTuple):
     for_s: float
     env_calls: int
     exit_code: int | None
-    """exit code with which the worker leaves on purpose; None if it doesn't"""
+    """exit code with which the worker leaves on purpose; None if it isn't leaving"""
     leaves_for_s: float
-    """seconds since it began to leave"""
+    """seconds since the worker began to leave"""
     timeouts: CallTimeouts
-    """the timeouts of its run"""
+    """the timeouts of the worker's run"""
 
 
 class ActivityReader:
     """The supervisor's side of the page."""
 
     def __init__(self, page: Activity | None = None) -> None:
-        """`page`: the page of a thread. None: make one for a child process, which inherits `fd`."""
+        """`page` is the page of a worker in a thread; if it is None, make a page for a child process, which
+        inherits `fd`.
+        """
         self.fd = -1
         if page is None:
             self.fd = _anonymous_file()
@@ -142,9 +145,9 @@ class ActivityReader:
             self._seconds = page.seconds
 
     def read(self, now: float) -> Reading:
-        """What the worker is doing. Environment code can write to the page, so every value is forced into its bounds."""
+        """Read the page. Environment code could write to it too, so every value is forced into its bounds."""
         timeouts = self.timeouts()  # read before the activity, so that a call is never judged by the limits of a later run
-        code = self._numbers[DOING]  # before the time: see `Activity.begin`
+        code = self._numbers[DOING]  # read before the time: see `Activity.begin`
         doing = DOINGS[code] if 0 <= code < len(DOINGS) else "waiting"
         leaves = self._numbers[LEAVES]
         return Reading(
@@ -157,7 +160,7 @@ class ActivityReader:
         )
 
     def timeouts(self) -> CallTimeouts:
-        """How long a call may take in the worker's run; without limit before it is welcomed to a run."""
+        """How long a call may take in the worker's run. There is no limit until a learner has welcomed the worker."""
         return CallTimeouts(_limit_s(self._seconds[START_TIMEOUT_S]), _limit_s(self._seconds[STEP_TIMEOUT_S]))
 
     def stacks(self) -> str:

@@ -1,6 +1,6 @@
-"""What acts in the env copies of a run: the collector and the evaluator of a worker, which share a policy.
+"""The collector and the evaluator of a worker, which share a policy that acts in the env copies of a run.
 
-Rule: the policy has the weights of the current task. They are loaded when a task has other weights.
+Rule: the policy has the weights of the current task; they are loaded when a task needs other weights than the last one.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class Actors:
 
     @property
     def note(self) -> str:
-        """What the user should know about the environment; empty if nothing."""
+        """What the user should know about the environment; empty if there is nothing to report."""
         return self._collector.note
 
     @property
@@ -80,6 +80,6 @@ MakeActors = Callable[[RunSpec], Actors]
 
 
 def make_local_actors(run: RunSpec) -> Actors:
-    """Actors with their own env copies."""
+    """Make the actors of a worker that has its own copy of the policy."""
     policy = make_policy(run.policy, run.images_dtype) if run.policy.own is None else CalledPolicy(run.policy, run.extras)
     return Actors(Collector(run, policy), Evaluator(run, policy))

@@ -185,9 +185,7 @@ def _decode(frames: Sequence[Buffer], kinds: MessageTypes, packed_bytes_limit: i
     except BadMessage as error:
         raise BadMessage(one_line(str(error), 500)) from error  # the error may quote text of the peer
     except Exception as error:  # msgpack and msgspec raise a dozen types for invalid bytes
-        reason = one_line(
-            " ".join(_explain_validation_error(str(error), head, by_position).split()), 200
-        )  # may quote the peer
+        reason = one_line(" ".join(_explain_validation_error(str(error), head, by_position).split()), 200)  # quotes the peer
         raise BadMessage(f"head is not a message of millrace: {type(error).__name__}: {reason}") from error
     if isinstance(message, Described):
         check_size(message.description)

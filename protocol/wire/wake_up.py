@@ -48,9 +48,7 @@ class WakePipe:
 
     def wake(self, reason: WakeReason = WakeReason.STEP) -> None:
         """Wake the other side, now or when it next waits."""
-        with suppress(
-            BlockingIOError, BrokenPipeError
-        ):  # the pipe is full, so the reader wakes anyway; or the reader is gone
+        with suppress(BlockingIOError, BrokenPipeError):  # full: the reader wakes anyway; broken: the reader is gone
             os.write(self.write_fd, _BYTES[reason])
 
     def wait(self, timeout_s: float) -> WakeReason:

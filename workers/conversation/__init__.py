@@ -1,1 +1,1 @@
-"""The worker's side of the conversation: its answers, what it holds, and when it leaves. Imports no environment code."""
+"""The worker's side of the conversation: what it answers, what it holds, and when it leaves. Imports no environment code."""

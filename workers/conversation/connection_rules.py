@@ -1,4 +1,4 @@
-"""Whether a worker connects with or without a token, and how long it waits: after that, `Session.tick` leaves.
+"""Whether a worker connects with or without a token, and how long it waits for a learner before `Session.tick` leaves.
 
 Rule: over TCP to another machine, a worker connects without a token only with --insecure. Pure; imports neither numpy nor
 gymnasium.
@@ -14,18 +14,23 @@ from millrace.protocol.keys.keys import Token
 from millrace.protocol.keys.worker_token import TOKEN_VARIABLE
 
 REJOIN_TIMEOUT_S = 600.0
-"""How long, at least, a worker that has joined waits for its learner to come back."""
+"""The minimum time for which a worker that has joined waits for its learner to come back."""
 LEARNER_STARTED_IT_S = math.inf
-"""How long a worker that its learner started waits: it ends with the learner, which may be stopped (Ctrl-Z) or busy."""
+"""How long a worker waits if its learner started it: without limit, because the learner may be stopped (Ctrl-Z) or busy, and
+the worker ends when the learner does.
+"""
 
 
 def wait_limits_s(join_timeout_s: float, *, stay: bool) -> tuple[float, float]:
-    """How long a worker waits for its first learner, and for one that it had joined. With `stay`, another one may follow."""
+    """How long a worker waits for its first learner, and for a learner that it had joined, in seconds.
+
+    With `stay`, it waits for the first without limit, and after the second time it waits for the next learner.
+    """
     return math.inf if stay else join_timeout_s, max(join_timeout_s, REJOIN_TIMEOUT_S)
 
 
 def checked_token(address: str, token: Token | None, *, insecure: bool) -> Token | None:
-    """The token with which to connect, or None to connect without. Raises `UsageError` if neither is allowed."""
+    """The token with which to connect, or None to connect without a token. Raises `UsageError` if neither is allowed."""
     check_address(address)
     if not address.startswith("tcp://"):
         return None  # the permissions of the socket decide who may open it

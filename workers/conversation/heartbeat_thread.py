@@ -1,11 +1,11 @@
 """Heartbeats from a second thread while the first thread runs the environment's code, where a step may take minutes.
 
 Rule: only one thread at a time uses the link and the session. The first thread holds their lock, and releases it only while
-it runs the environment's code; during that time the second thread acquires it now and then.
+it runs the environment's code; during that time, the second thread acquires it now and then.
 
-This file decides only how often the second thread checks. When a Heartbeat is due: `Session.heartbeat_if_due` (session.py).
-How many seconds lie between two: `RolloutConfig.heartbeat_s` (learner/config/rollout_config.py) for a run, and `HEARTBEAT_S`
-(protocol/specs.py) for a vector environment.
+This file determines only how often the second thread checks whether a Heartbeat is due. `Session.heartbeat_if_due`
+(session.py) determines when one is due. The interval between two is `RolloutConfig.heartbeat_s`
+(learner/config/rollout_config.py) for a run, and `HEARTBEAT_S` (protocol/specs.py) for a vector environment.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-CHECK_EVERY_S = 0.25  # how often the second thread checks: a Heartbeat is late by at most this time
+CHECK_EVERY_S = 0.25  # how often the second thread checks, and so the most by which a Heartbeat is late
 
 
 class HeartbeatThread:
@@ -23,7 +23,7 @@ class HeartbeatThread:
     def __init__(self, heartbeat: Callable[[], None]) -> None:
         """`heartbeat` sends a Heartbeat if one is due. The second thread calls it after `start`."""
         self._heartbeat = heartbeat
-        self._lock = threading.Lock()  # whoever holds it may use link and session
+        self._lock = threading.Lock()  # the thread that holds it may use the link and the session
         self._lock.acquire()
         self._stopped = threading.Event()
         self._thread = threading.Thread(target=self._run, name="heartbeat", daemon=True)
@@ -35,7 +35,7 @@ class HeartbeatThread:
 
     @contextmanager
     def lock_released(self) -> Iterator[None]:
-        """While it is entered, the first thread runs the environment's code and doesn't use the link or the session."""
+        """A context in which the first thread runs the environment's code, and doesn't use the link or the session."""
         self._lock.release()
         try:
             yield
@@ -44,7 +44,7 @@ class HeartbeatThread:
 
     @contextmanager
     def lock_reacquired(self) -> Iterator[None]:
-        """Within `lock_released`, the first thread uses the link and the session again for a moment."""
+        """A context within `lock_released` in which the first thread may use the link and the session again."""
         self._lock.acquire()
         try:
             yield

@@ -1,13 +1,14 @@
 """What a worker holds: requests that it has not finished, and answers that the learner may not have received. Pure.
 
-Rule: each request has a ticket, and is executed once. The answer is kept, and sent again if the learner repeats the request
-because the answer was lost. How long answers are kept bounds the memory of a worker:
+Rule: each request has a ticket, and is executed once. Its answer is kept, and sent again if the learner repeats the request
+because the answer was lost. To limit the memory of a worker, answers are kept only for a time:
 
-- a rollout: until the learner says that it has received it. So a worker holds at most what the learner has outstanding.
-- the result of an evaluation: until there are `KEPT_RESULTS` later ones. If its rows were sent too, it is not kept: rows are
-  large, and the evaluation can be executed again, with the same episodes.
-- the answer to an order (Reset, Step, Call) of a vector environment: until the next order of its lane.
-- a description of an environment: until the next one is asked for, or the run begins.
+- A rollout is kept until the learner says that it has received it. So a worker holds at most the rollouts that the learner
+  is waiting for.
+- The result of an evaluation is kept until there are `KEPT_RESULTS` later ones. It is not kept if its rows were sent too:
+  rows are large, and the evaluation can be executed again, with the same episodes.
+- The answer to an order (Reset, Step, Call) of a vector environment is kept until the next order for its lane.
+- A description of an environment is kept until the next one is requested, or the run begins.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from millrace.protocol.messages import (
     versions_of,
 )
 
-KEPT_RESULTS = 8  # a learner gives a worker at most two evaluations at a time, so only the last two results can be missing
+KEPT_RESULTS = 8  # more than enough: a learner gives a worker at most two evaluations at a time
 
 AskedT = TypeVar("AskedT")
 AnsweredT = TypeVar("AnsweredT", bound=Rollout | Evaluated | Described | Answer)
@@ -46,13 +47,13 @@ class Held(Generic[AskedT, AnsweredT]):
 
     # rules ROLLOUT_ONCE, ORDER_ONCE, EVALUATE_ONCE, DESCRIBE_AGAIN
     def take(self, ticket: int, asked: AskedT) -> AnsweredT | None:
-        """Take a request. Returns an answer to send again, if any."""
+        """Accept a request. If it has been executed already, returns the answer, which must be sent again."""
         if ticket not in self.answered:
             self.asked.setdefault(ticket, asked)
         return self.answered.get(ticket)
 
     def keep(self, answer: AnsweredT) -> bool:
-        """Keep an answer; False if it is not wanted any more."""
+        """Keep an answer. Returns False if it is no longer wanted."""
         if self.asked.pop(answer.ticket, None) is None:
             return False
         self.answered[answer.ticket] = answer
@@ -60,26 +61,30 @@ class Held(Generic[AskedT, AnsweredT]):
 
 
 class HeldEvaluations(Held[Evaluate, Evaluated]):
-    """Evaluations, which belong to no lane. One evaluation uses one version, and has higher tickets than earlier ones."""
+    """Orders to evaluate, which belong to no lane.
+
+    An evaluation consists of orders with one version of the weights. Its tickets are higher than those of earlier
+    evaluations.
+    """
 
     def take(self, ticket: int, asked: Evaluate) -> Evaluated | None:  # rule EVALUATE_ENDS
-        """Take an order. Earlier evaluations than that of the highest ticket are over: the rest of them is dropped."""
+        """Accept an order; see `Held.take`. Drops the orders of evaluations before the newest, which are over."""
         answer = super().take(ticket, asked)
         newest = max(self.asked, default=ticket)
         self.asked = {n: order for n, order in self.asked.items() if order.version == self.asked[newest].version}
         return answer
 
     def next(self, versions: Collection[int]) -> Evaluate | None:  # rules EVALUATE_VERSION, OPPONENTS
-        """The oldest order whose weights this worker has."""
+        """The oldest order for which this worker has the weights; None if there is none."""
         due = [ticket for ticket, order in self.asked.items() if order.versions.issubset(versions)]
         return self.asked[min(due)] if due else None
 
     def versions(self) -> set[int]:
-        """The requested versions."""
+        """The versions of the weights that unfinished orders need."""
         return {version for order in self.asked.values() for version in order.versions}
 
     def keep(self, answer: Evaluated) -> bool:
-        """Keep a result, unless it has rows; False if it is not wanted any more."""
+        """Keep a result, unless its rows were sent too. Returns False if it is no longer wanted."""
         order = self.asked.get(answer.ticket)
         kept = super().keep(answer)
         if order is not None and (order.send_rows or order.send_frames):
@@ -93,7 +98,7 @@ class HeldDescriptions(Held[Describe, Described]):
     """Orders to describe an environment. Only the newest counts: tickets rise with every order."""
 
     def take(self, ticket: int, asked: Describe) -> Described | None:
-        """Take an order. Returns the answer to send again, if any."""
+        """Accept an order, and drop older ones; see `Held.take`."""
         newest = max((*self.asked, *self.answered), default=-1)
         if ticket < newest:
             return None
@@ -103,7 +108,7 @@ class HeldDescriptions(Held[Describe, Described]):
         return super().take(ticket, asked)
 
     def next(self) -> Describe | None:
-        """The order that has not been executed yet."""
+        """The order that has not been executed yet; None if there is none."""
         return next(iter(self.asked.values()), None)
 
 
@@ -116,7 +121,7 @@ LaneT = TypeVar("LaneT", bound=_HeldLane[Any, Any])
 
 
 class _HeldLanes(Generic[LaneT]):
-    """What is held in one session, by lane. A later incarnation of a lane begins empty."""
+    """The requests and answers of one session, by lane. A later incarnation of a lane begins with none."""
 
     _kind: type[LaneT]
 
@@ -124,14 +129,14 @@ class _HeldLanes(Generic[LaneT]):
         self._lanes: dict[int, LaneT] = {}
 
     def _opened(self, number: int, incarnation: int) -> LaneT | None:  # rule INCARNATION
-        """The lane in this incarnation; None if it has a later one."""
+        """The lane in this incarnation, which begins here if it is new. None if the lane has a later incarnation."""
         lane = self._lanes.get(number)
         if lane is None or incarnation > lane.incarnation:
             lane = self._lanes[number] = self._kind(incarnation)
         return lane if lane.incarnation == incarnation else None
 
     def keep(self, answer: Rollout | Answer) -> bool:
-        """Keep an answer; False if its lane was released meanwhile, or it is not wanted any more."""
+        """Keep an answer. Returns False if its lane has been released in the meantime, or it is no longer wanted."""
         lane = self._lanes.get(answer.lane)
         return lane is not None and lane.keep(answer)
 
@@ -164,11 +169,11 @@ class Assignment:
     """If the worker has another incarnation of the lane, the lane starts on new env copies."""
     sequence: int
     round: int
-    """Decides the random numbers of the actions."""
+    """Determines the random numbers of the actions."""
     opponent: int | None = None
-    """The opponent that plays the other teams in the episodes that begin in it."""
+    """The opponent that plays the other teams in the episodes that begin in this rollout."""
     past: LanePast | None = None
-    """The past that the lane continues if it isn't open in this incarnation; None: it begins its first episodes."""
+    """If the lane isn't open in this incarnation, the past from which it continues; None: it begins its first episodes."""
 
 
 class Permitted(NamedTuple):
@@ -176,30 +181,30 @@ class Permitted(NamedTuple):
 
     sequence: int
     version: int
-    """version of the weights to act with"""
+    """version of the weights with which to act"""
     round: int
     opponent: int | None
     past: LanePast | None
     """`round`, `opponent` and `past`: as in the `Permit`"""
 
     def assignment(self, ticket: int, lane: int, incarnation: int) -> Assignment:
-        """What to collect on this lane."""
+        """This rollout as an `Assignment` on a lane."""
         return Assignment(ticket, lane, incarnation, self.sequence, self.round, self.opponent, self.past)
 
     @property
     def versions(self) -> set[int]:
-        """The versions of the weights that it needs."""
+        """The versions of the weights that this rollout needs."""
         return versions_of(self.version, [self.opponent])
 
 
 @dataclass
 class RolloutLane(_HeldLane[Permitted, Rollout]):
-    """A ticket asks for a rollout. They are collected in the order of their sequence."""
+    """The tickets of a lane, each for one rollout, and its rollouts. They are collected in the order of their sequence."""
 
-    sequence: int = 0  # sequence number of the next rollout
+    sequence: int = 0  # sequence number of the next rollout to collect
 
     def keep(self, answer: Rollout) -> bool:
-        """Keep a collected rollout; False if its ticket was withdrawn in the meantime."""
+        """Keep a collected rollout. Returns False if its ticket was withdrawn in the meantime."""
         kept = super().keep(answer)
         self.sequence += kept
         return kept
@@ -211,19 +216,22 @@ class HeldRollouts(_HeldLanes[RolloutLane]):
     _kind = RolloutLane
 
     def take(self, permit: Permit, version: int) -> Rollout | None:  # rule RECEIVED
-        """Take a ticket to collect with this version. Returns a rollout to send again, if any."""
+        """Accept a ticket to collect a rollout with this version of the weights.
+
+        If the rollout was collected already and may be lost, returns it, so that it is sent again.
+        """
         lane = self._opened(permit.lane, permit.incarnation)
         if lane is None or (permit.sequence < lane.sequence and permit.ticket not in lane.answered):
-            return None  # a late repeat: the learner has this rollout
+            return None  # a late copy of the ticket: the learner has this rollout
         permitted = Permitted(permit.sequence, version, permit.round, permit.opponent, permit.past)
         return lane.take(permit.ticket, permitted)
 
     # rules IN_ORDER, VERSION, LOWEST_VERSION_FIRST
     def startable(self, versions: Collection[int]) -> tuple[int, tuple[Assignment, ...]]:
-        """The next rollouts of lanes whose weights are available.
+        """The next rollouts to collect, among those whose weights are available.
 
-        Returns the lowest version among them, and the rollouts with this version in lane order; none if nothing can be
-        collected.
+        Returns the lowest of their versions, and the rollouts with this version, in lane order. If nothing can be collected,
+        returns -1 and no rollouts.
         """
         startable: dict[int, list[Assignment]] = {}
         for number, lane in sorted(self._lanes.items()):
@@ -234,7 +242,7 @@ class HeldRollouts(_HeldLanes[RolloutLane]):
         return version, tuple(startable.get(version, ()))
 
     def versions(self) -> set[int]:
-        """The requested versions."""
+        """The versions of the weights that unfinished tickets need."""
         return {version for lane in self._lanes.values() for asked in lane.asked.values() for version in asked.versions}
 
     def forget_received(self, received: Sequence[Received]) -> None:  # rule ROLLOUT_ONCE
@@ -250,18 +258,20 @@ class HeldRollouts(_HeldLanes[RolloutLane]):
 
 @dataclass
 class OrderLane(_HeldLane[Order, Answer]):
-    """Only the newest order counts: tickets rise with every order of a lane."""
+    """The order of a lane, or the answer to it. Only the newest order counts: tickets rise with every order of a lane."""
 
     newest: int = -1  # ticket
 
 
 class HeldOrders(_HeldLanes[OrderLane]):
-    """Orders to execute, and the answers to the newest."""
+    """Orders to execute, and the answer to the newest order of each lane."""
 
     _kind = OrderLane
 
     def take(self, order: Order) -> Answer | None:  # rules ORDER_OLD, ORDER_ONCE
-        """Take an order that has arrived. Returns an answer to send again, if any."""
+        """Accept an order that has arrived. If it has been executed already, returns the answer, which must be
+        sent again.
+        """
         lane = self._opened(order.lane, order.incarnation)
         if lane is None or order.ticket < lane.newest:
             return None
@@ -270,6 +280,6 @@ class HeldOrders(_HeldLanes[OrderLane]):
         return lane.take(order.ticket, order)
 
     def next(self) -> Order | None:
-        """The oldest order that has not been executed yet."""
+        """The oldest order that has not been executed yet; None if there is none."""
         waiting = [order for lane in self._lanes.values() for order in lane.asked.values()]
         return min(waiting, key=lambda order: order.ticket, default=None)

@@ -1,10 +1,10 @@
 """The worker's side of the conversation. Pure: messages and `now` in, effects out; no socket, clock, thread or environment.
 
-Rule: a rollout or an evaluation starts only with the weights that it names. A lost message does no harm, because the next
-Heartbeat lists all tickets and versions that this worker holds, and the learner sends what is missing again. `held.py` keeps
-what a worker holds. A worker that was welcomed before there is a run waits in its session: it describes environments on
-order, and a second Welcome brings the run. Each order lists the weights to keep: others are dropped, unless a ticket names
-them.
+Rule: a rollout or an evaluation starts only when the worker has the weights that its ticket names. A lost message does no
+harm, because the next Heartbeat lists all tickets and versions that this worker holds, and the learner sends what is missing
+again. `held.py` stores what a worker holds. A worker that is welcomed before there is a run waits in its session: it
+describes environments on order, until a second Welcome contains the run. Each order lists the weights to keep; the worker
+drops all others, except those that unfinished tickets name.
 """
 
 from __future__ import annotations
@@ -71,14 +71,14 @@ class SendMessage:
 
 @dataclass(frozen=True)
 class StartSession:
-    """Effect: a new session starts; close every env copy of the last one."""
+    """Effect: a new session starts; close every env copy of the previous one."""
 
     run: WaitSpec | RunSpec | StepSpec
 
 
 @dataclass(frozen=True)
 class BeginRun:
-    """Effect: begin the run that this session has waited for."""
+    """Effect: begin the run for which this session has waited."""
 
     run: RunSpec | StepSpec
 
@@ -92,7 +92,7 @@ class CloseLanes:
 
 @dataclass(frozen=True)
 class Leave:
-    """Effect: the conversation is over; end with this exit code."""
+    """Effect: the conversation is over; end the worker with this exit code."""
 
     exit_code: int
     reason: str
@@ -149,12 +149,12 @@ class WorkerIdentity:
     """random number that distinguishes this process, or thread, from any other with the same name"""
     software: str
     evaluates: bool = False
-    """whether it only plays evaluations"""
+    """whether the worker only plays evaluations"""
 
     def hello(self, attempt: int) -> Hello:  # rules HELLO, PROTOCOL
-        """The Hello of this attempt to join.
+        """The Hello for this attempt to join.
 
-        Attempts are counted from the nonce, so that no two processes have the same number.
+        Attempts are counted from the nonce, so that no two processes use the same number.
         """
         return Hello(
             PROTOCOL_VERSION,
@@ -171,12 +171,12 @@ class WorkerIdentity:
 
 @dataclass(frozen=True)
 class Statistics:
-    """Figures that a Heartbeat reports."""
+    """Figures about the worker that a Heartbeat reports."""
 
     steps: int = 0
     """env steps since the worker started"""
     stages: Mapping[Stage, float] = field(default_factory=dict)
-    """seconds in each stage"""
+    """seconds spent in each stage since the worker started"""
     resident_bytes: int = 0
     """resident memory of this process"""
     note: str = ""
@@ -191,9 +191,9 @@ class _SessionState:
     rollouts: HeldRollouts = field(default_factory=HeldRollouts)
     evaluations: HeldEvaluations = field(default_factory=HeldEvaluations)
     orders: HeldOrders = field(default_factory=HeldOrders)
-    weights: dict[int, Weights] = field(default_factory=dict)  # by version
+    weights: dict[int, Weights] = field(default_factory=dict)  # keys are versions
     in_progress: bool = False  # whether a piece of work is in progress
-    replies: int = 0  # number of the last HeartbeatReply
+    replies: int = 0  # number of the last HeartbeatReply received
 
     def unfinished(self) -> tuple[int, ...]:  # rule HEARTBEAT_TICKETS
         """Tickets that have not been collected or executed yet."""
@@ -204,7 +204,9 @@ class _SessionState:
         return (*self.rollouts.lanes(), *self.orders.lanes())
 
     def next_work(self, session: int) -> Work | None:  # rule EVALUATIONS_FIRST
-        """The next piece of work: a description, else an evaluation, else rollouts to collect together, else an order."""
+        """The next piece of work: a description; if none is due, an evaluation; then rollouts to collect together; then an
+        order. None if there is none.
+        """
         if (description := self.descriptions.next()) is not None:
             return description
         if (evaluation := self.evaluations.next(self.weights)) is not None:
@@ -215,20 +217,25 @@ class _SessionState:
         return RolloutTask(session, self.weights[version], assignments, self.weights)
 
     def asked_versions(self) -> set[int]:
-        """Versions that unfinished tickets name."""
+        """Versions of the weights that unfinished tickets name."""
         return self.rollouts.versions() | self.evaluations.versions()
 
     def missing_versions(self) -> set[int]:
-        """Versions that are requested but not available."""
+        """Versions of the weights that unfinished tickets name, and that this worker doesn't have."""
         return self.asked_versions().difference(self.weights)
 
     def keep_weights(self, listed: Sequence[int]) -> None:  # rule HOLDS_WEIGHTS
-        """Drop the weights that an order does not list. A late copy of an order doesn't drop requested ones."""
+        """Drop the weights that an order does not list, unless unfinished tickets name them.
+
+        The exception matters if a late copy of an old order arrives.
+        """
         kept = self.asked_versions().union(listed)
         self.weights = {version: weights for version, weights in self.weights.items() if version in kept}
 
     def keep(self, answer: WorkAnswer) -> bool:
-        """Keep the answer that work produced; False if it isn't wanted any more, such as after the release of its lane."""
+        """Keep the answer to a piece of work. Returns False if it is no longer wanted, for example because its lane has been
+        released.
+        """
         match answer:
             case Rollout():
                 return self.rollouts.keep(answer)
@@ -239,14 +246,14 @@ class _SessionState:
         return self.orders.keep(answer)
 
     def release(self, lanes: Sequence[LaneIncarnation]) -> list[WorkerEffect]:  # rule RELEASE
-        """Drop these lanes."""
+        """Drop these lanes. Returns the effect that closes their env copies, if any lane was open."""
         released = (*self.rollouts.release(lanes), *self.orders.release(lanes))
         return [CloseLanes(released)] if released else []
 
     def release_unlisted(self, received: Sequence[Received]) -> list[WorkerEffect]:  # rule UNLISTED
-        """Drop the lanes that the learner does not list: their Release was lost.
+        """Drop the lanes that the learner does not list, because their Release was lost.
 
-        Only a new HeartbeatReply may do so: a copy of an old message doesn't list lanes that were added later.
+        Call this only for a new HeartbeatReply: a copy of an old one doesn't list lanes that were added later.
         """
         listed = {of_lane.lane for of_lane in received}
         return self.release([lane for lane in self.lanes() if lane.lane not in listed])
@@ -271,7 +278,7 @@ class Session:
         self._join_timeout_s = join_timeout_s
         self._rejoin_timeout_s = rejoin_timeout_s
         self._attempt = identity.process_nonce
-        self._unanswered_s = math.inf  # time of the first Heartbeat since the learner was last heard
+        self._unanswered_s = math.inf  # time of the first Heartbeat after the learner's last message
         self.due_s = self._joining_s = now
         self._backoff_s = HELLO_FIRST_S
         self._reason = ""
@@ -287,7 +294,7 @@ class Session:
         if type(message) not in TABLE[self.state]:
             return []
         if not isinstance(message, Welcome) and getattr(message, "session", self.session) != self.session:
-            return []  # it belongs to an earlier session of this worker
+            return []  # the message is for an earlier session of this worker
         match message:
             case Welcome():
                 return self._welcome(message, now)
@@ -323,7 +330,7 @@ class Session:
         return [SendMessage(answer) for answer in again if answer is not None]
 
     def tick(self, now: float) -> list[WorkerEffect]:
-        """Do what is due: Hello, Heartbeat, or giving up on a silent learner."""
+        """Do whatever is due now: send a Hello or a Heartbeat, or give up on a silent learner."""
         match self.state:
             case WorkerState.LEFT:
                 return []
@@ -341,7 +348,7 @@ class Session:
         return self.heartbeat_if_due(now)
 
     def heartbeat_if_due(self, now: float) -> list[WorkerEffect]:  # rule HEARTBEAT
-        """A Heartbeat, if one is due. This changes nothing else, so it is allowed at any moment."""
+        """The effect that sends a Heartbeat, if one is due. Nothing else changes, so this may be called at any moment."""
         if self.run is None or self.state not in (WorkerState.READY, WorkerState.DRAINING) or now < self.due_s:
             return []
         self.due_s = now + self.run.heartbeat_s
@@ -368,17 +375,19 @@ class Session:
     # ---------------------------------------------------------------- leaving
 
     def stop(self) -> list[WorkerEffect]:
-        """Leave: after the work in progress, or at once when called twice."""
+        """Leave after the work in progress, or, if this is the second call, immediately."""
         return [] if self.state is WorkerState.LEFT else self._drain(StopRequested(), TOLD_TO_STOP)
 
     def fail(self, error: str, traceback: str, lane: int | None, *, of_policy: bool = False) -> list[WorkerEffect]:
-        """The environment, the user's policy (`of_policy`), or this worker raised: report it to the learner, and leave."""
+        """Report to the learner that the environment, a user-defined policy (`of_policy`), or this worker
+        raised, and leave.
+        """
         error = one_line(error)
         failure = Failure(self.session, error, last_text(traceback), lane, of_policy)
         return self._leave(WorkerFailed(), 1, error, failure)
 
     def decline(self, reason: str, exit_code: int = EXIT_UNSUITABLE) -> list[WorkerEffect]:  # rule DECLINED
-        """Leave a run in which this worker can't take part at all, or, with another exit code, not now."""
+        """Leave a run in which this worker can't take part. Another exit code than the default means: not now."""
         return self._leave(WorkerFailed(), exit_code, reason, Goodbye(self.session, one_line(reason), ()))
 
     def refused(self, reason: str) -> list[WorkerEffect]:  # rules REFUSE, AFTER_REFUSE
@@ -388,7 +397,10 @@ class Session:
     # ---------------------------------------------------------------- working
 
     def next_work(self) -> Work | None:
-        """The next piece of work, which is in progress until `work_ended`. None if there is none, or one is in progress."""
+        """The next piece of work, which is in progress until `work_ended` is called.
+
+        None if there is no work, or a piece of work is in progress.
+        """
         if self.state is not WorkerState.READY or self._current.in_progress:
             return None
         work = self._current.next_work(self.session)
@@ -396,29 +408,29 @@ class Session:
         return work
 
     def missing_versions(self) -> set[int]:
-        """Versions of the weights that this worker should act with, and doesn't have."""
+        """Versions of the weights that this worker needs for its tickets, and doesn't have."""
         return self._current.missing_versions()
 
     def work_ended(self, answers: Sequence[WorkAnswer]) -> list[WorkerEffect]:
-        """Take the answers of the work in progress, which has ended; none: it was abandoned.
+        """End the work in progress, and send its answers; there are none if the work was abandoned.
 
         A draining worker then leaves.
         """
         current = self._current
-        # The session may have ended, or the lane may have been released, in the meantime.
+        # In the meantime, the session may have ended, or the lane may have been released.
         kept = [each for each in answers if each.session == self.session and current.keep(each)]
         current.in_progress = False
         return [*map(SendMessage, kept), *self._leave_if_drained()]
 
     def is_unwanted(self, work: Work | SharedOrders) -> bool:
-        """True if this work is not wanted any more. A draining worker finishes a rollout, but not an evaluation."""
+        """Whether this work is no longer wanted. A draining worker finishes its rollouts, but not an evaluation."""
         goes_on = (WorkerState.READY,) if isinstance(work, EvaluationTask) else (WorkerState.READY, WorkerState.DRAINING)
         return self.state not in goes_on or work.session != self.session
 
     # ---------------------------------------------------------------- inside
 
     def _join(self, now: float) -> None:  # rules REJOIN, FORGETS
-        """Start to join, as if for the first time."""
+        """Start to join, with nothing held, as if for the first time."""
         self._attempt += 1
         self._joining_s = self.due_s = now
         self._backoff_s = HELLO_FIRST_S
@@ -440,13 +452,15 @@ class Session:
 
     # rules REPEATED_WELCOME, BEGINS
     def _welcome_again(self, run: WaitSpec | RunSpec | StepSpec, now: float) -> list[WorkerEffect]:
-        """Handle another Welcome of this session: the run that this worker waits for has begun, or it is a repeat."""
+        """Handle another Welcome of this session: either the run for which this worker waits has begun, or the Welcome is a
+        repeat, which is ignored.
+        """
         if not isinstance(self.run, WaitSpec) or isinstance(run, WaitSpec):
             return []
         self.run = run
         self._unanswered_s = math.inf
         self.due_s = min(self.due_s, now + run.heartbeat_s)
-        self._current.descriptions = HeldDescriptions()  # unfinished descriptions are not wanted any more
+        self._current.descriptions = HeldDescriptions()  # unfinished descriptions are no longer wanted
         return [BeginRun(run)]
 
     def _rejoin(self, event: object, reason: str, now: float) -> list[WorkerEffect]:
@@ -470,7 +484,7 @@ class Session:
 
     # rule AFTER_GOODBYE
     def _leave(self, event: object, exit_code: int, reason: str, last: ToLearner | None = None) -> list[WorkerEffect]:
-        """Leave, once. The last message is sent only within a session."""
+        """Leave, unless the worker has left already. The message `last` is sent only if there is a session."""
         if self.state is WorkerState.LEFT:
             return []
         said = [] if last is None or self.state is WorkerState.JOINING else [SendMessage(last)]

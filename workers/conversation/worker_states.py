@@ -1,4 +1,4 @@
-"""A worker's states in the conversation, and a table of the next state for each state and message or event. Plain data."""
+"""A worker's states in the conversation, and a table with the next state for each state and message or event. Plain data."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class WorkerState(Enum):
 
 
 class LearnerSilent:
-    """Event: no message of the learner followed a Heartbeat for `learner_timeout_s` (or, while joining, for too long)."""
+    """Event: the learner has sent nothing for `learner_timeout_s` after a Heartbeat, or, while joining, for too long."""
 
 
 class StopRequested:
@@ -75,7 +75,7 @@ TABLE: dict[WorkerState, dict[type, WorkerState]] = {
         WorkerFailed: WorkerState.LEFT,
     },
     WorkerState.DRAINING: {  # rule DRAINING_IGNORES
-        Weights: WorkerState.DRAINING,  # the next Heartbeat lists them; else the learner would send them after each
+        Weights: WorkerState.DRAINING,  # if Heartbeats didn't list them, the learner would send them again
         HeartbeatReply: WorkerState.DRAINING,
         Rejoin: WorkerState.LEFT,  # rule DRAINING_LEAVES
         Refuse: WorkerState.LEFT,

@@ -1,1 +1,1 @@
-"""Env copies: N environments behind one interface, and what they return, read and checked."""
+"""Env copies: N environments behind one interface, and the code that reads and checks what they return."""

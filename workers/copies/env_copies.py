@@ -1,7 +1,7 @@
 """The env copies of a lane, or of an evaluation, behind one interface: a loop over environments, or any vector environment.
 
-Autoreset is gymnasium's NextStep: the step after an episode's end ignores the action and resets that copy. In an evaluation
-no step resets a copy. What a step returns is stored at once, so copies may return the same buffers again and again.
+Autoreset is gymnasium's NextStep: the step after an episode's end ignores the action and resets that copy. In an evaluation,
+no step resets a copy. The result of a step is stored immediately, so copies may return the same buffers again and again.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from millrace.workers.copies.reset_ahead import ResetAhead
 from millrace.workers.copies.row_writers import read_leaves
 from millrace.workers.copies.saved_state import CannotSave, SavedCopy, load, save, saver
 
-# For each leaf of the observation: an array [N, *leaf], or a sequence of N observations. In a masked run the masks follow.
+# For each leaf of the observation, an array [N, *leaf] or a sequence of N observations. In a masked run, masks come last.
 Leaves = Sequence[Any]
 
 
@@ -46,7 +46,7 @@ CANNOT_RESTART = (
 
 
 class SeatColumns(NamedTuple):
-    """What a step of N copies means for their N · A columns."""
+    """The result of a step of N copies with A seats each, as far as it exists only with seats."""
 
     complete: Bools
     """[N · A] whether a row of the seat is complete"""
@@ -55,7 +55,7 @@ class SeatColumns(NamedTuple):
     outside: Doubles
     """[N · A] rewards outside of any row"""
     over: Bools
-    """[N] whether the copy's episode is over: its next step only resets it"""
+    """[N] whether the copy's episode is over, so that its next step only resets it"""
 
     def first(self, copies: int, columns: int) -> SeatColumns:
         """The columns of the first copies."""
@@ -68,23 +68,23 @@ class SeatColumns(NamedTuple):
 
 
 class StepResult(NamedTuple):
-    """Result of one step of N copies; `workers/copies/row_writers.py` writes each part into an array [N, …]."""
+    """The result of one step of N copies. `workers/copies/row_writers.py` writes each part of it into an array [N, …]."""
 
     leaves: Leaves
     reward: Any
     terminated: Any
     truncated: Any
     lost: Array | None = None
-    """[N] bool, copies that were lost with their worker: this step was not made on them, and the next one starts an episode
-    on new copies
+    """[N] bool, True for copies that were lost with their worker: this step was not made on them, and the next one begins an
+    episode on new copies
     """
     facts: Facts = {}
     """facts of the episodes that ended in this step, if the run has facts"""
     columns: SeatColumns | None = None
-    """with seats; the arrays above then have N · A entries"""
+    """None without seats; with seats, the arrays above have N · A entries"""
 
     def first(self, copies: int, columns: int) -> StepResult:
-        """The result of the first copies alone, which have the first columns."""
+        """The result for only the first copies, which have the first columns."""
         return self._replace(
             leaves=[leaf[:columns] for leaf in self.leaves],
             reward=self.reward[:columns],
@@ -96,17 +96,19 @@ class StepResult(NamedTuple):
 
 
 class EnvCopies(Protocol):
-    """N env copies. Whatever the environment raises arrives as `CopyFailed`; what `pulse` raises passes through."""
+    """N env copies. Any exception of the environment is raised as `CopyFailed`; exceptions of `pulse` are
+    raised unchanged.
+    """
 
     observation_space: gymnasium.Space[Any]
     """Observation space of one copy."""
     action_space: gymnasium.Space[Any]
     """Action space of one copy."""
     note: str
-    """What the user should know about the environment after its first reset; empty if nothing."""
+    """What the user should know about the environment after its first reset; empty if there is nothing to report."""
 
     def reset(self, seeds: Sequence[int], pulse: Pulse) -> Leaves:
-        """Start episodes in all copies, with a seed for each."""
+        """Begin episodes in all copies, with a seed for each."""
         ...
 
     def step(self, actions: Array, pulse: Pulse) -> StepResult:
@@ -118,7 +120,7 @@ class EnvCopies(Protocol):
         ...
 
     def close(self) -> None:
-        """Close the copies. Raises nothing."""
+        """Close the copies. Never raises."""
         ...
 
 
@@ -135,7 +137,7 @@ class EvaluationCopies(EnvCopies, Protocol):
         ...
 
     def render(self, copy: int) -> Any:
-        """The rendered frame of this copy. Raises `ValueError` if it can't be rendered."""
+        """The rendered frame of this copy. Raises `ValueError` if the copy can't be rendered."""
         ...
 
 
@@ -150,7 +152,7 @@ def check_spaces(run: RunSpec, copies: EnvCopies) -> None:  # rule OTHER_AGENTS
             "install the version of the environment that the policy was made for"
         )
     seats, takes_turns = agents_of(copies.envs[0]) if isinstance(copies, LoopedCopies) else ((), False)
-    if seats != run.seats or (takes_turns and not run.takes_turns):  # if seats may wait, they need not
+    if seats != run.seats or (takes_turns and not run.takes_turns):  # takes_turns says only that seats may wait
         raise UsageError(
             f"environment {run.env.id}: expected {agents_in_words(run.seats, run.takes_turns)}, got "
             f"{agents_in_words(seats, takes_turns)}; install the version of the environment that the run was started with"
@@ -158,12 +160,12 @@ def check_spaces(run: RunSpec, copies: EnvCopies) -> None:  # rule OTHER_AGENTS
 
 
 def copy_seed(seed: int, lane: int, start: int, copy: int) -> int:  # rule INDEPENDENT
-    """The reset seed of a lane's copy, at the start with this number."""
+    """The reset seed of a copy of a lane, for the copy's start with this number."""
     return env_seed(seed, Purpose.COPIES, lane, start, copy)
 
 
 class LoopedCopies:
-    """A loop over N environments."""
+    """N environments that are stepped one after another, in a loop."""
 
     def __init__(
         self,
@@ -176,18 +178,18 @@ class LoopedCopies:
         first: EnvCopy = FIRST_COPY,
         restart_episodes: int = 0,
     ) -> None:
-        """`facts`: names of the numbers in `info` that belong to an episode. `masked`: read masks of the allowed actions.
+        """Make the copies. If `masked`, read masks of the allowed actions. In an evaluation, no step resets a copy.
 
-        `critic_keys`: keys of a Dict observation whose arrays come last. `first`: identifies the first copy. In an
-        evaluation, no step resets a copy.
-        `restart_episodes`: after this many episodes, a copy is closed and created again; 0: never.
+        `facts` are names of numbers in `info` that describe an episode. `critic_keys` are keys of a Dict observation whose
+        arrays come last. `first` identifies the first copy. After `restart_episodes` episodes, a copy is closed and created
+        again; 0 means never.
         """
         self._facts = facts
         self._activity = activity()
         evaluates = first.evaluation
         autoreset: Autoreset = "Disabled" if evaluates else "NextStep"
         stepping = EVALUATING if evaluates else STEPPING
-        self._attributes: dict[str, bytes] = {}  # that each copy has, packed
+        self._attributes: dict[str, bytes] = {}  # attributes that were set on every copy, by name; the values are packed
         self._restart_episodes = restart_episodes
         self._loop = EnvLoop(
             makes, pulse, autoreset, first=first, stepping=stepping, dress=self._dressed, restart_episodes=restart_episodes
@@ -209,7 +211,7 @@ class LoopedCopies:
         self._observations: list[Any] = [None] * self.count
 
     def reset(self, seeds: Sequence[int], pulse: Pulse) -> Leaves:
-        """Start episodes in all copies, or in the first ones, with a seed for each."""
+        """Begin episodes in all copies, or in the first ones, with a seed for each."""
         copies = range(len(seeds))
         infos = self._loop.reset(copies, seeds, self._observations, pulse)
         leaves = self._after_reset(copies, infos).leaves
@@ -221,7 +223,7 @@ class LoopedCopies:
     def step(self, actions: Array, pulse: Pulse, copies: Sequence[int] | None = None) -> StepResult:
         """Step each copy, or reset it if its episode has ended.
 
-        `copies`: step only these, with these actions. A copy that isn't stepped keeps its last row in the result.
+        With `copies`, step only these, with an action for each. A copy that isn't stepped keeps its last row in the result.
         """
         copies = None if copies is not None and len(copies) == self.count else copies  # stepping all is faster
         loop = self._loop
@@ -235,26 +237,28 @@ class LoopedCopies:
         return StepResult(leaves, loop.reward, loop.terminated, loop.truncated, facts=facts)
 
     def reset_some(self, copies: Sequence[int], seeds: Sequence[int | None], pulse: Pulse) -> StepResult:
-        """Begin episodes in only these copies, with or without a seed for each. The result has a row for each copy."""
+        """Begin episodes in these copies only, with a seed, or None, for each. The result has a row for every copy."""
         infos = self._loop.reset(copies, seeds, self._observations, pulse)
         self._fill_in(copies)
         return self._after_reset(copies, infos)
 
     def _dressed(self, env: gymnasium.Env[Any, Any], which: EnvCopy) -> gymnasium.Env[Any, Any]:
-        """The copy as it is stepped. One that is made anew has the attributes of the old one."""
+        """Prepare a new copy to be stepped. If it replaces an old copy, it gets the attributes that were set on that one."""
         env = without_order_check(env, which)
         for name, packed in self._attributes.items():
             set_attribute(which.copy, env, name, unpack(packed))
         return env
 
     def _never_anew(self) -> str:
-        """Why no copy is made anew although the run asks for it; empty if that is not so."""
+        """Why copies are never recreated although the run asks for it; empty if they are, or the run doesn't ask for it."""
         if not self._restart_episodes or self._loop.random_state(0) is not None:
             return ""
         return CANNOT_RESTART
 
     def _fill_in(self, copies: Sequence[int]) -> None:
-        """Fill the row of a copy that was never reset with another copy's observation, because no row may be empty."""
+        """Fill the row of each copy that was never reset with the observation of another copy, because no row
+        may be empty.
+        """
         for n, observation in enumerate(self._observations):
             if observation is None:
                 self._observations[n] = self._observations[copies[0]]
@@ -267,7 +271,7 @@ class LoopedCopies:
 
     @contextmanager
     def repeating(self) -> Iterator[None]:
-        """While it is entered, steps count as replayed ones."""
+        """A context in which steps are recorded as replayed steps of an earlier episode."""
         stepping = self._loop.stepping
         self._loop.stepping = REPEATING
         try:
@@ -276,16 +280,16 @@ class LoopedCopies:
             self._loop.stepping = stepping
 
     def end(self, copies: Sequence[int]) -> None:
-        """End the episodes of these copies: the next step resets them."""
+        """End the episodes of these copies, so that the next step resets them."""
         for n in copies:
             self._loop.truncated[n] = True
 
     def set_random_state(self, copy: int, packed: bytes) -> bool:
-        """Set the state of a copy's random generator. False if it has no generator that this state fits."""
+        """Set the state of a copy's random generator. Returns False if the copy has no generator with such a state."""
         return self._loop.set_random_state(copy, packed)
 
     def save(self) -> list[SavedCopy]:
-        """The state of each copy. Raises `CopyFailed`, and `CannotSave` for a state that can't be kept."""
+        """Save the state of each copy. Raises `CopyFailed` if a copy raises, and `CannotSave` if a state can't be kept."""
         states = []
         with self._activity.during(STEPPING):
             for n, env in enumerate(self.envs):
@@ -307,8 +311,11 @@ class LoopedCopies:
         return ""
 
     def begun(self, over: Sequence[int]) -> dict[int, bytes | None]:
-        """For each copy that a step has reset since the last call, the random state from which its newest episode began; for
-        copies that are `over`, the state from which the next one will begin. None: the copy has no readable generator.
+        """The random states from which episodes begin, by copy.
+
+        For each copy that a step has reset since the last call of this, it is the state from which its newest episode began.
+        For copies that are `over`, it is the state from which the next one will begin. It is None if the copy has no
+        readable generator.
         """
         loop = self._loop
         states = loop.random_states | {n: loop.random_state(n) for n in over}
@@ -323,7 +330,7 @@ class LoopedCopies:
                 set_attribute(n, env, name, unpack(packed))  # a separate value for each, because they may change it
 
     def render(self, copy: int) -> Any:
-        """What this copy renders."""
+        """The frame that this copy renders. Raises `CopyFailed`."""
         try:
             with self._activity.during(EVALUATING):
                 return self.envs[copy].render()
@@ -339,14 +346,14 @@ class LoopedCopies:
         return (self._observations,)
 
     def close(self) -> None:
-        """Close every copy. What a copy raises is ignored."""
+        """Close every copy. Exceptions of the copies are ignored."""
         self._loop.close()
 
 
 def without_order_check(env: gymnasium.Env[Any, Any], which: EnvCopy = FIRST_COPY) -> gymnasium.Env[Any, Any]:
     """The environment without `OrderEnforcing`, which only checks that the first step follows a reset.
 
-    The collector always resets first, and the wrapper costs a twentieth of a CartPole step.
+    The collector always resets first, and the wrapper adds a twentieth to the time of a CartPole step.
     """
     while type(env) is OrderEnforcing:
         env = env.env
@@ -356,7 +363,7 @@ def without_order_check(env: gymnasium.Env[Any, Any], which: EnvCopy = FIRST_COP
 
 
 def set_attribute(copy: int | None, env: Any, name: str, value: Any) -> None:
-    """Set a public attribute that the environment, or one of its wrappers, has. Raises `CopyFailed`."""
+    """Set a public attribute of the environment or of one of its wrappers. Raises `CopyFailed` if none has it."""
     owner = env.owner(name) if isinstance(env, SeatedEnv) else env
     while not hasattr(owner, name) and isinstance(owner, gymnasium.Wrapper | VectorWrapper):
         if isinstance(owner, ResetAhead):

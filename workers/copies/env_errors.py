@@ -1,6 +1,7 @@
-"""Errors of an environment, in a worker's words: the lane and copy, and what the copy did. Pure.
+"""Errors of an environment, as a worker reports them: the lane and the copy, and what the copy did. Pure.
 
-Rule: the line of an error names the lane, or the evaluation, once, at its beginning. The learner puts the worker before it.
+Rule: the line of an error names the lane, or the evaluation, once, at its beginning. The learner puts the worker's name
+before it.
 """
 
 from __future__ import annotations
@@ -15,10 +16,11 @@ from millrace.protocol.errors import EnvironmentFailed, first_line
 
 
 class CopyFailed(Exception):
-    """An env copy raised (the environment's own exception is the cause), or returned something invalid.
+    """An env copy raised (the environment's own exception is the `__cause__`), or returned something invalid.
 
-    `copy` is its number within the lane, or None if a vector environment doesn't say which one it was. `doing` says what it
-    did: "make", "reset" or a step. `line` says what was expected and what it returned, if it did not raise.
+    `copy` is its number within the lane, or None if a vector environment doesn't say which copy it was. `doing` is the call
+    that failed, such as "make", "reset" or a step. If the copy did not raise, `line` says what was expected and what it
+    returned.
     """
 
     def __init__(self, copy: int | None, doing: str = "reset", line: str = "") -> None:
@@ -29,9 +31,10 @@ class CopyFailed(Exception):
 
 
 def environment_failed(lane: int | None, what: CopyFailed | str, doing: str = "") -> EnvironmentFailed:
-    """The error of a lane, or of an evaluation (None): one line, with the traceback as its detail if an env copy raised.
+    """The error for a lane, or for an evaluation if `lane` is None: one line, and the traceback as its detail if a copy
+    raised.
 
-    `doing`: what the copy did, if the caller knows it better than the copy.
+    `doing` is the call that failed, if the caller knows it more precisely than the `CopyFailed`.
     """
     whose = "while the policy was evaluated: " if lane is None else f"lane {lane}, "
     detail = ""
@@ -47,7 +50,9 @@ def environment_failed(lane: int | None, what: CopyFailed | str, doing: str = ""
 
 @contextmanager
 def environment_failures(lane: int | None, doing: str = "") -> Iterator[None]:
-    """While it is entered, errors of env copies of this lane, or of an evaluation, become `environment_failed`."""
+    """A context in which a `CopyFailed` of this lane, or of an evaluation, is raised as the error of
+    `environment_failed`.
+    """
     try:
         yield
     except CopyFailed as error:
@@ -55,7 +60,7 @@ def environment_failures(lane: int | None, doing: str = "") -> Iterator[None]:
 
 
 def _what_it_did(cause: BaseException) -> str:
-    """What the environment did, in one line: it raised an exception, in some cases with advice."""
+    """What the environment did wrong, in one line; for some exceptions, with advice."""
     if isinstance(cause, WrongAnswer):
         return str(cause)
     frames = extract_tb(cause.__traceback__)
@@ -68,7 +73,7 @@ def _what_it_did(cause: BaseException) -> str:
 def _about_action(says: str, raised_by: str) -> str:
     """The end of a line: what to write if the environment needs a Python int as its action; else empty.
 
-    It gets a numpy integer, as from gymnasium's vector environments and from `Discrete.sample`.
+    Environments get a numpy integer as the action, just as from gymnasium's vector environments and `Discrete.sample`.
     """
     if not re.search(r"isinstance\(.*\bint\b", raised_by) and "np.int64(" not in says:
         return ""
@@ -79,7 +84,9 @@ def _about_action(says: str, raised_by: str) -> str:
 
 
 def _about_answer(says: str, raised_by: str) -> str:
-    """The end of a line: what a wrapper expected if it could not unpack the result of `reset` or `step`; else empty."""
+    """The end of a line: the form that a wrapper expected, if it could not unpack the result of `reset` or `step`; else
+    empty.
+    """
     called = re.search(r"= .*\b(reset|step)\(", raised_by) if "unpack" in says else None
     if called is None:
         return ""
