@@ -292,7 +292,7 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 def _why_not(env_id: str) -> str:
     """Why a registered environment, which may be the one that the user meant, can't be made; empty if it can.
 
-    Doesn't look into ids with a module, and so calls no function that isn't registered.
+    For an id with a module, returns an empty string, so that no function is called.
     """
     if ":" in env_id:
         return ""

@@ -132,7 +132,9 @@ class Permit(msgspec.Struct, frozen=True, array_like=True):
     starts (rule PAST)"""
 
     def of_new_episodes(self, copies: int) -> Permit:
-        """The same ticket, for a lane whose copies are replaced: each of the new ones begins with an episode of its own."""
+        """The same ticket for a lane of `copies` copies that can't be continued: each begins a new episode, unlike its
+        first.
+        """
         return msgspec.structs.replace(self, past=LanePast.unknown(self.lane, copies))
 
 

@@ -51,7 +51,7 @@ class Activity:
     """The worker's side of the page. Times are those of `perf_counter`, a clock that worker and supervisor share."""
 
     def __init__(self, fd: int | None = None) -> None:
-        """`fd` is the file of a page that the supervisor made; if it is None, the page belongs to this process alone."""
+        """`fd` is the file of a page that the supervisor made; if it is None, the page belongs to this thread alone."""
         page = memoryview(mmap.mmap(-1 if fd is None else fd, PAGE_BYTES))
         self.numbers = page.cast("q")
         self.seconds = page.cast("d")

@@ -80,6 +80,6 @@ MakeActors = Callable[[RunSpec], Actors]
 
 
 def make_local_actors(run: RunSpec) -> Actors:
-    """Make the actors of a worker that has its own copy of the policy."""
+    """Make actors that act with a policy in this process, on env copies of their own."""
     policy = make_policy(run.policy, run.images_dtype) if run.policy.own is None else CalledPolicy(run.policy, run.extras)
     return Actors(Collector(run, policy), Evaluator(run, policy))

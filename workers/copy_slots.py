@@ -1,11 +1,12 @@
 """The env copies that this process makes: which one is being made now, and their slots.
 
-Rule: a copy holds its slot from before it is made until after it was closed, so no two live copies have the same one. If its
-constructor raises, it may have started a process: then the slot is free only when this process and its children have ended.
+Rule: a copy holds its slot from before it is made until after it was closed, so no two live copies have the same slot. If
+the constructor of a copy raises, it may have started a process; so the slot then becomes free only when this process and its
+children have ended.
 
-Rule: a copy that was only described is reused as the next copy that its thread makes, if that one would be the same. If not,
-it is closed first. A worker also closes it if it has not made a copy for `UNUSED_S` of a run, because it may be spare. So no
-worker keeps a copy for long that it doesn't need.
+Rule: a copy that was only described is reused as the next copy that its thread makes, if the new one would be the same. If
+not, it is closed before. A worker also closes it if it has not made a copy within `UNUSED_S` seconds of a run, because the
+worker may be spare. So no worker keeps a copy for long that it doesn't need.
 """
 
 from __future__ import annotations
@@ -26,23 +27,23 @@ from millrace.protocol.errors import UsageError
 from millrace.workers.activity import CLOSING, activity
 from millrace.workers.machine_slots import slots
 
-UNUSED_S = 60.0  # since the run began: more workers may have to join before the first order arrives
+UNUSED_S = 60.0  # counted from the beginning of the run; long enough for other workers to join before the first order
 
 _slots: dict[int, int] = {}  # slots of this process's open copies and the one being made, by id
 Made = TypeVar("Made")
 Dress = Callable[[Made, EnvCopy], Made]
-"""Takes a copy and its identity. Returns what to use in its place, or raises."""
+"""Takes a copy and its identity, and returns the object to use in place of the copy. May raise."""
 
 
 @dataclass(frozen=True)
 class EnvMaker:
-    """Makes copies of an environment. Equal makers make equal copies, unless a copy asks which one it is."""
+    """Makes copies of an environment. Equal makers make equal copies, unless the environment asks which copy it is."""
 
     env: EnvSpec
     render_mode: str | None = None
 
     def __call__(self) -> gymnasium.Env[Any, Any]:
-        """Make one copy. Raises `UsageError`."""
+        """Make one copy. Raises `UsageError` if it can't be made."""
         return self.env.make(self.render_mode)
 
 
@@ -53,15 +54,15 @@ class DescribedCopy:
     copy: gymnasium.Env[Any, Any]
     maker: EnvMaker
     asked: bool
-    """Whether it asked which copy it is, and was told that it is the first."""
+    """Whether the environment asked which copy it is, and was told that it is the first."""
 
     def is_as_new(self, which: EnvCopy, make: Callable[[], Any]) -> bool:
-        """Whether making this copy now would give the same."""
+        """Whether calling `make` for the copy `which` would give an equal copy."""
         return make == self.maker and (which == FIRST_COPY or not self.asked)
 
 
 class _OfThread(threading.local):
-    described: DescribedCopy | None = None  # if not used yet
+    described: DescribedCopy | None = None  # the copy that this thread has described, if it is still unused
 
 
 _of_thread = _OfThread()
@@ -93,9 +94,9 @@ def as_made(copy: Made, which: EnvCopy) -> Made:
 
 
 def make_copy(which: EnvCopy, make: Callable[[], Made], dress: Dress[Made] = as_made) -> Made:
-    """The copy, dressed, with its own slot: what `make` returns, or the described copy in its place.
+    """Make a copy with a slot of its own: call `make`, or reuse the described copy, and apply `dress` to it.
 
-    If `dress` raises, the copy is closed. `give_back` frees the slot after the copy was closed.
+    If `dress` raises, the copy is closed. After you have closed the copy, `give_back` frees its slot.
     """
     described = _of_thread.described
     if described is not None and described.is_as_new(which, make):
@@ -114,7 +115,7 @@ def make_copy(which: EnvCopy, make: Callable[[], Made], dress: Dress[Made] = as_
 
 
 def _made(which: EnvCopy, make: Callable[[], Made]) -> tuple[Made, bool]:
-    """What `make` returns, registered with its slot; and whether it asked which copy it is."""
+    """Call `make` with a slot taken for it. Returns the copy, and whether its environment asked which copy it is."""
     slot = slots().take()
     with making(replace(which, slot=slot)) as under_way:
         _slots[id(under_way)] = slot
@@ -123,11 +124,11 @@ def _made(which: EnvCopy, make: Callable[[], Made]) -> tuple[Made, bool]:
             _slots[id(made)] = _slots.pop(id(under_way))
             return made, under_way.asked
         finally:
-            _slots.pop(id(under_way), None)  # if making it failed, its slot stays taken
+            _slots.pop(id(under_way), None)  # if `make` has raised, the slot stays taken
 
 
 def give_back(copy: object) -> None:
-    """Free the slot of a copy that was closed."""
+    """Free the slot of a copy that was closed. Does nothing if the copy has no slot."""
     if (slot := _slots.pop(id(copy), None)) is not None:
         slots().give_back(slot)
 
@@ -140,10 +141,10 @@ def close_copy(copy: Any) -> None:
 
 
 def env_copy() -> EnvCopy:
-    """The copy that is being made now, for the constructor of an environment or a wrapper: ask there, and keep it.
+    """The env copy that is being made now. Call this in the constructor of an environment or a wrapper, and keep the result.
 
     In a program that makes an environment itself, it is copy 0, with a slot that the process holds until it ends. In a
-    worker, and in a thread that the constructor starts, raises `UsageError` if this thread isn't making a copy.
+    worker, raises `UsageError` if the calling thread isn't making a copy, for example because the constructor started it.
 
     >>> import millrace
     >>> millrace.env_copy().number
@@ -160,5 +161,5 @@ def env_copy() -> EnvCopy:
 
 @cache
 def _of_process(pid: int) -> EnvCopy:
-    """The copy of a process that makes its environment itself; a fork has a different one."""
+    """The `EnvCopy` for a process that makes its environment itself. A fork of the process has another slot."""
     return EnvCopy(slot=slots().take())

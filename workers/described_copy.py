@@ -1,7 +1,7 @@
 """Makes an env copy for a learner that does not know the environment yet, and describes it.
 
-Rule: the environment's code runs here and not in the learner. The copy is only made, and its attributes are read; then it is
-kept for later use (`copy_slots.py`).
+Rule: the environment's code runs here and not in the learner. A copy is made and its attributes are read, nothing more. Then
+the copy is kept for later use (`copy_slots.py`).
 """
 
 from __future__ import annotations
@@ -26,11 +26,10 @@ from millrace.workers.copy_slots import EnvMaker, close_copy, keep_described, ma
 
 
 def describe(order: Describe) -> EnvDescription:
-    """The description of the environment. Its copy is kept for the next one that this thread makes.
+    """Make a copy of the environment, and describe it. The copy is kept, to be used as the next one that this thread makes.
 
-    Raises `UsageError`, with advice, if the environment doesn't meet the learner's request: its id is unknown, a package
-    is missing, or its spaces are not supported. Raises `EnvironmentFailed` for any exception of its own code, and if its
-    code tries to exit the process.
+    Raises `UsageError`, with advice, if the order can't be fulfilled: the id is unknown, a package is missing, or the spaces
+    are not supported. Raises `EnvironmentFailed` if the environment's own code raises, or tries to exit the process.
     """
     with _failures_of(order.env), activity().during(DESCRIBING):
         made = make_to_describe(EnvMaker(order.env, order.render_mode))
@@ -49,7 +48,7 @@ def _failures_of(env: EnvSpec) -> Iterator[None]:
     try:
         yield
     except UsageError as error:
-        if error.detail:  # its constructor raised
+        if error.detail:  # a traceback: the environment's constructor has raised
             raise EnvironmentFailed(str(error), error.detail) from error
         raise
     except BaseException as error:
@@ -58,9 +57,11 @@ def _failures_of(env: EnvSpec) -> Iterator[None]:
 
 
 def _check_kind(order: Describe, env: gymnasium.Env[object, object]) -> None:
-    """Raise `UsageError` unless the env copies that the learner asks for have the spaces of this single copy."""
+    """Raise `UsageError` unless env copies of the kind that the learner asks for have the same spaces as this
+    single copy.
+    """
     if isinstance(env, SeatedEnv):
-        return  # the learner refuses anything but a loop
+        return  # with seats, the learner refuses all kinds but a loop
     spaces_of = copies_kind(order.vector).spaces
     if spaces_of is None:
         return

@@ -1,11 +1,12 @@
-"""Exit codes that say why a worker left, besides 0 and 1. Only its supervisor sees the last two: others get 1 and 2.
+"""Exit codes, besides 0 and 1, that say why a worker left. Only the worker's supervisor sees the last two, and itself exits
+with 1 or 2 instead.
 
-The supervisor decides which ends are final, and which workers are restarted (`supervise/supervisor.py`).
+The supervisor decides after which exit codes a worker is restarted (`supervise/supervisor.py`).
 """
 
 EXIT_REFUSED = 2
-"""The learner refuses it, or bad usage."""
+"""The learner refused the worker, or the command was wrong."""
 EXIT_NO_LEARNER = 69
-"""No learner answered; as in sysexits."""
+"""No learner answered. The number is that of EX_UNAVAILABLE in sysexits.h."""
 EXIT_UNSUITABLE = 65
-"""It cannot take part in this run; as in sysexits."""
+"""The worker cannot take part in this run. The number is that of EX_DATAERR in sysexits.h."""

@@ -1,15 +1,15 @@
 """The slots of this machine: each env copy holds the lowest free number, for its port, folder or display.
 
-Rule: no two live env copies that use one file of slots have the same slot. A slot is a lock on one byte of this file, which
-stays empty. The lock belongs to an open file and not to a process, so a worker and its supervisor hold it together, and the
-kernel frees it when both are gone.
+Rule: no two live env copies that use the same slots file have the same slot. A slot is a lock on one byte of this file,
+which stays empty. The lock belongs to an open file and not to a process, so a worker and its supervisor hold it together,
+and the kernel frees it when both are gone.
 
-Rule: each user of the machine has their own file, because anyone who can write the file can lock all of it. Users who trust
-one another can share one by setting `FILE_VARIABLE` to the same path. A search for a slot ends after `MOST`.
+Rule: each user of the machine has their own file, because anyone who can write to the file can lock all of it. Users who
+trust one another can share a file by setting `FILE_VARIABLE` to the same path. A file has `MOST` slots.
 
-Rule: with a limit K of this machine (`LIMIT_VARIABLE`), the slots are 0 to K - 1. A copy that finds none free waits for
-`WAIT_S`; then its worker leaves the run, so that the learner can place its lanes elsewhere, and is restarted when a slot is
-free.
+Rule: if the machine has a limit of K copies (`LIMIT_VARIABLE`), the slots are 0 to K - 1. A copy that finds no free slot
+waits for `WAIT_S` seconds. Then its worker leaves the run, so that the learner can place the worker's lanes elsewhere, and
+is restarted when a slot is free.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ log = logging.getLogger("millrace.worker")
 FILE_VARIABLE = "MILLRACE_SLOTS"
 LIMIT_VARIABLE = "MILLRACE_COPIES_PER_MACHINE"
 FILE = "/tmp/millrace-slots-{user}"  # not in $TMPDIR, which may differ between the processes of a user
-FLAGS = os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC  # a link is not followed, a FIFO does not block
-OWN = 0o600  # a mode
-SHARED = 0o666  # a mode
-MOST = 1 << 16  # slots of a file, as many as there are ports
+FLAGS = os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC  # doesn't follow links, nor block on a FIFO
+OWN = 0o600  # mode of a user's own file
+SHARED = 0o666  # mode of a file that users share
+MOST = 1 << 16  # number of slots in a file, as many as there are ports
 FLOCK = "hhqqi4x"  # struct flock on Linux: type, whence, start, length, process
 
 TOUCH_EVERY_S = 3600.0
-WAIT_S = 30.0  # for a slot; the copies of another worker may take long to close
+WAIT_S = 30.0  # how long to wait for a slot, because the copies of another worker may take long to close
 POLL_S = 0.2
 
 
@@ -54,20 +54,21 @@ class Slots:
     """The slots that one process holds. Thread-safe."""
 
     def __init__(self, fd: int | None = None, most: int = 0) -> None:
-        """`fd`: the file that the supervisor opened. None: open it. Raises `UsageError` if that fails.
+        """`fd` is the slots file if the supervisor has opened it; if it is None, open it.
 
-        `most`: how many slots the machine has; 0: no limit.
+        `most` is the number of slots of the machine; 0 means no limit. Raises `UsageError` if the file can't be opened.
         """
         self.most = most
-        """How many slots the machine has; 0: no limit."""
+        """Number of slots of the machine; 0: no limit."""
         self.fd = open_slots() if fd is None else fd
         self._taken: set[int] = set()
         self._lock = threading.Lock()
 
     def take(self) -> int:
-        """Hold the lowest free number on this machine, from 0. Give it back when the env copy is closed.
+        """Take the lowest free slot of this machine, and return its number. Give it back when the env copy is closed.
 
-        Raises `NoSlot` if none becomes free within `WAIT_S`, and `UsageError` if there is no limit and all are locked.
+        Raises `NoSlot` if no slot becomes free within `WAIT_S` seconds, and `UsageError` if there is no limit and all slots
+        are locked.
         """
         until_s = time.monotonic() + WAIT_S
         said = False
@@ -88,7 +89,7 @@ class Slots:
         return slot
 
     def have_room(self, copies: int) -> bool:
-        """Whether this many slots are free now."""
+        """Whether at least this many slots are free now."""
         taken = [slot for _ in range(copies) if (slot := self._take_now()) is not None]
         for slot in taken:
             self.give_back(slot)
@@ -111,7 +112,9 @@ class Slots:
 
 
 _of_processes: dict[int, Slots] = {}
-"""By process: a fork needs its own, because it shares the open file, and so the locks."""
+"""The keys are process ids: a fork needs its own `Slots`, because it shares the open file of its parent, and so
+the locks.
+"""
 
 
 def slots() -> Slots:
@@ -124,15 +127,15 @@ def slots() -> Slots:
 
 
 def share_slots(fd: int) -> None:
-    """Hold the slots of this process, a worker, together with its supervisor, which has opened the file."""
+    """Let this process, a worker, hold its slots together with its supervisor, which has opened the file `fd`."""
     os.set_inheritable(fd, False)
     _of_processes[os.getpid()] = Slots(fd, copies_per_machine())
 
 
 def copies_per_machine() -> int:
-    """How many env copies may live on this machine, in all processes that have this limit; 0: any number.
+    """How many env copies may live on this machine, in all processes with this limit; 0 means any number.
 
-    Raises `UsageError`.
+    Raises `UsageError` if the environment variable is not a valid number.
     """
     text = os.environ.get(LIMIT_VARIABLE) or "0"
     if not (text.isascii() and text.isdecimal() and len(text) < 10 and int(text) <= MOST):
@@ -141,20 +144,23 @@ def copies_per_machine() -> int:
 
 
 def slots_path() -> Path:
-    """The file with the slots of this process: one that several users share on purpose, or this user's own."""
+    """The slots file of this process: the one that `FILE_VARIABLE` names, or this user's own."""
     return Path(os.environ.get(FILE_VARIABLE) or FILE.format(user=os.geteuid()))
 
 
 def open_slots() -> int:
-    """A descriptor whose locks belong to it and its copies. Raises `UsageError` if the file or the limit cannot be used."""
-    copies_per_machine()  # before any worker starts
+    """Open the slots file. Locks belong to the returned descriptor and its duplicates.
+
+    Raises `UsageError` if the file or the limit cannot be used.
+    """
+    copies_per_machine()  # checks the limit before any worker starts
     path = slots_path()
     shared = bool(os.environ.get(FILE_VARIABLE))
     mode = SHARED if shared else OWN
     try:
         with suppress(FileExistsError):
             fd = os.open(path, FLAGS | os.O_CREAT | os.O_EXCL, mode)
-            os.fchmod(fd, mode)  # whatever the umask
+            os.fchmod(fd, mode)  # whatever the umask is
             return fd
         fd = os.open(path, FLAGS)
         status = os.fstat(fd)
@@ -170,13 +176,13 @@ def open_slots() -> int:
 
 
 def free_all(fd: int) -> None:
-    """Free every slot that is held through this descriptor, also for processes that share it, and close it."""
+    """Free every slot that is held through this descriptor, including those of processes that share it, and close it."""
     _lock(fd, fcntl.F_UNLCK, 0, 0)
     os.close(fd)
 
 
 def touch(fd: int) -> None:
-    """Mark the file as used: otherwise a cleaner of /tmp might delete it, and new processes would see no slot taken."""
+    """Mark the file as used. Otherwise, a cleaner of /tmp might delete it, and new processes would find all slots free."""
     with suppress(OSError):
         if time.time() - os.fstat(fd).st_mtime > TOUCH_EVERY_S:
             os.utime(fd)
@@ -188,7 +194,7 @@ def _owner(fd: int) -> str:
 
 
 def _name(user: int) -> str:
-    """A user, by name if the system knows one."""
+    """A user in words: by name if the system knows it, else by number."""
     try:
         return f"user {pwd.getpwuid(user).pw_name}"
     except KeyError:
@@ -196,7 +202,7 @@ def _name(user: int) -> str:
 
 
 def _is_locked_by(fd: int, slot: int) -> bool:
-    """Lock this slot. False if another process holds it."""
+    """Try to lock this slot. Returns False if another process holds it."""
     with suppress(BlockingIOError, PermissionError):
         _lock(fd, fcntl.F_WRLCK, slot, 1)
         return True
@@ -204,7 +210,10 @@ def _is_locked_by(fd: int, slot: int) -> bool:
 
 
 def _lock(fd: int, kind: int, start: int, length: int) -> None:
-    """Lock or free this range without waiting. Without open file locks (macOS, gVisor), the locks belong to the process."""
+    """Lock or free this range of bytes without waiting.
+
+    On systems without open file description locks (macOS, gVisor), the locks belong to the process.
+    """
     if hasattr(fcntl, "F_OFD_SETLK"):
         try:
             fcntl.fcntl(fd, fcntl.F_OFD_SETLK, struct.pack(FLOCK, kind, os.SEEK_SET, start, length, 0))

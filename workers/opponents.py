@@ -1,8 +1,8 @@
 """The players of the other teams' seats: earlier weights of the policy, or a user-defined program.
 
-Rule: in each env copy the policy plays one team, and one opponent all others, for whole episodes: the opponent changes when
-the copy is reset. So a lane keeps its opponents from rollout to rollout, even if no ticket names their weights any more. An
-opponent samples its actions with random numbers of the lane that nothing else uses.
+Rule: in each env copy, the policy plays one team, and one opponent plays all others, for whole episodes: the opponent
+changes only when the copy is reset. So a lane keeps its opponents from rollout to rollout, even if tickets no longer name
+their weights. An opponent samples its actions with random numbers of the lane that nothing else uses.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ from millrace.workers.activity import PREPARING, activity
 
 
 class Opponent:
-    """One opponent: a policy that acts, and the number that tickets have for it."""
+    """One opponent: a policy that acts, and the number by which tickets name it."""
 
     def __init__(self, run: RunSpec, number: int, weights: Weights | None) -> None:
-        """`weights`: the weights of this version; None for a user-defined program."""
+        """`weights` are those of version `number`, or None if the opponent is a user-defined program."""
         self.number = number
         if weights is None:
             spec = msgspec.structs.replace(run.policy, own=OwnPolicySpec(run.scripted[-1 - number], ()))
@@ -46,19 +46,22 @@ class Opponent:
 
 
 Opponents = Callable[[int], Opponent]
-"""Finds the opponent with a number."""
+"""Finds an opponent by its number."""
 
 
 class KnownOpponents:
-    """The opponents of one session. Weights are kept while an episode is played against them."""
+    """The opponents of one session. An opponent with weights is kept for as long as an episode is played against it."""
 
     def __init__(self, run: RunSpec) -> None:
         self._run = run
         self._known = WeakValueDictionary[int, Opponent]()
-        self._programs: list[Opponent] = []  # they are kept, because making one may take long
+        self._programs: list[Opponent] = []  # kept, because making one may take long
 
     def among(self, weights: Mapping[int, Weights]) -> Opponents:
-        """A function that finds an opponent. `weights`: available weights by version, among them those of new opponents."""
+        """Return a function that finds an opponent by its number.
+
+        `weights` are the available weights by version, which must include those of opponents that aren't known yet.
+        """
 
         def find(number: int) -> Opponent:
             if (found := self._known.get(number)) is None:
@@ -73,7 +76,7 @@ class KnownOpponents:
 
 
 class Match(NamedTuple):
-    """Which team the policy plays in a copy, and against whom."""
+    """Which team the policy plays in a copy, and against which opponent."""
 
     team: int
     """the policy's team"""
@@ -81,10 +84,10 @@ class Match(NamedTuple):
 
 
 class OtherTeams:
-    """The other teams in some env copies."""
+    """The teams that opponents play in the env copies of a lane."""
 
     generator: np.random.Generator
-    """draws the actions of opponents"""
+    """the generator with which opponents sample their actions"""
 
     def __init__(self, run: RunSpec, matches: Sequence[Match]) -> None:
         self._run = run
@@ -97,7 +100,10 @@ class OtherTeams:
         self._state = zero_state(run.opponent or run.policy, len(self.mine))  # [N · A, S]
 
     def act(self, obs: Sequence[Array], acts: Bools, taken: Array) -> None:
-        """Replace the actions `taken` [N · A, *action] of acting seats of other teams."""
+        """In `taken` [N · A, *action], replace the actions of acting seats of other teams by those of their opponents.
+
+        `obs` are [N · A, *leaf] each, and `acts` [N · A] says which seats act.
+        """
         theirs = acts & ~self.mine
         for opponent in dict.fromkeys(match.opponent for match in self._matches):
             playing = np.repeat([match.opponent is opponent for match in self._matches], self._run.seats_of_copy)
@@ -109,13 +115,16 @@ class OtherTeams:
                 taken[columns] = opponent.to_env_action(chosen)
 
     def begin(self, copies: Collection[int], opponent: Opponent) -> None:
-        """Begin episodes of these copies against this opponent."""
+        """Begin episodes against this opponent in these copies."""
         for n in copies:
             self._matches[n] = self._matches[n]._replace(opponent=opponent)
             self._state[n * self._run.seats_of_copy : (n + 1) * self._run.seats_of_copy] = 0.0
 
     def result(self, n: int, returns: Sequence[float]) -> tuple[float, float, int]:
-        """The result of an episode of copy n, from its seats' returns: the return of the policy's team, score, opponent."""
+        """The result of an episode of copy n, given the returns of its seats.
+
+        Returns the return of the policy's team, its score, and the number of the opponent.
+        """
         of_teams = [sum(returns[seat] for seat in team) for team in self._run.teams]
         own = of_teams[self._matches[n].team]
         best = max(of_teams)
@@ -132,7 +141,9 @@ def whole_episode(
     seconds: float,
     of_info: tuple[float, ...],
 ) -> Episode:
-    """An episode of copy n that has ended, with the returns of its seats. `of_info`: facts that the environment reports."""
+    """The `Episode` that has ended in copy n, given the returns of its seats and the facts `of_info` from the
+    environment.
+    """
     if others is None:
         counted = returns if run.has_seat_returns else ()
         return Episode(sum(returns), length, seconds, (*of_info, *counted))

@@ -1,8 +1,8 @@
-"""One worker in this process. Its supervisor starts it. Imports torch only for an image policy.
+"""Runs one worker in this process, which a supervisor has started. Imports torch only if the policy needs it.
 
-Exit codes: 0 drained, asked to leave, or its supervisor has ended; EXIT_NO_LEARNER if no learner answered, EXIT_UNSUITABLE
-if it cannot take part in this run; 1 failed; 2 refused, or bad usage. The code is also written to the page that the
-supervisor reads: an exit without it counts as a failure.
+Exit codes: 0 if the worker was drained or asked to leave, or its supervisor has ended; EXIT_NO_LEARNER if no learner
+answered; EXIT_UNSUITABLE if it cannot take part in this run; 1 if it failed; 2 if it was refused or used wrongly. The code
+is also written to the page that the supervisor reads: an exit without this counts as a failure.
 """
 
 from __future__ import annotations
@@ -35,15 +35,18 @@ from millrace.workers.supervise.worker_process import KILLED_WITHIN_S, NONCE_VAR
 from millrace.workers.watchdog import Watchdog
 from millrace.workers.worker import Worker, WorkerOptions, identity, parent_is_gone
 
-LEAVE_AT_ONCE = 2  # requests to leave: the rollout in progress is abandoned
+LEAVE_AT_ONCE = 2  # number of requests to leave after which the rollout in progress is abandoned
 LOOK_FOR_PARENT_S = 0.5
-LEAVE_ORPHANED_WITHIN_S = 2.0  # after the supervisor's death
-CLOSED_WITHIN_S = 1.0  # until the sockets of a killed process are closed
-AFTER_SUPERVISOR_S = 60.0  # how much later than the supervisor the watchdog ends a worker that hangs
+LEAVE_ORPHANED_WITHIN_S = 2.0  # seconds after the supervisor's death
+CLOSED_WITHIN_S = 1.0  # seconds within which the sockets of a killed process are closed
+AFTER_SUPERVISOR_S = 60.0  # a worker that hangs is ended by the watchdog this long after the supervisor should have done so
 
 
 def work(flags: WorkerFlags, token: Token | None, signals: list[int]) -> int:
-    """Run one worker in this process until it leaves. `signals` grows with each request to leave. Returns the exit code."""
+    """Run one worker in this process until it leaves. Returns the exit code.
+
+    Each request to leave appends an entry to `signals`.
+    """
     nonce = int(os.environ.pop(NONCE_VARIABLE, "0")) or None
     if flags.activity is not None:
         share_activity(Activity(flags.activity))
@@ -85,7 +88,7 @@ def work(flags: WorkerFlags, token: Token | None, signals: list[int]) -> int:
 
 
 def _exit_code(code: int, reason: str) -> int:
-    """The exit code of this process: what the supervisor needs to know."""
+    """The exit code of this process, which tells the supervisor more than that of the conversation."""
     return EXIT_NO_LEARNER if reason.startswith(NO_LEARNER) else code
 
 
@@ -99,7 +102,7 @@ def _end_after_supervisor(parent: int, address: str) -> None:
 
 
 def _kill_own_session() -> None:
-    """End everything that its environment has started, then this process, because the supervisor can't do it any more.
+    """End all processes that the environment has started, and then this one, because the supervisor can no longer do so.
 
     This process is ended last, because only it still holds the slots of its env copies.
     """
@@ -113,10 +116,11 @@ def _kill_own_session() -> None:
 
 
 def _remove_socket_of_killed_parent(address: str) -> None:
-    """Remove the socket, and the folder that the learner made for it, because a killed learner could not.
+    """Remove the learner's socket and the folder that the learner made for it, because a killed learner could not.
 
-    The parent may have been the supervisor of a `millrace worker`: then the learner lives, and the next worker needs it.
-    Linux reparents the children of a killed process before its last thread has freed the memory and closed the sockets.
+    If the parent was the supervisor of a `millrace worker`, the learner is alive, and the next worker needs the socket. So
+    it is removed only if nothing listens any more. This may take a moment: Linux reparents the children of a killed process
+    before the last thread of that process has freed the memory and closed the sockets.
     """
     scheme, _, path = address.partition("://")
     if scheme == "ipc" and Path(path).parent.name.startswith("millrace-"):
@@ -136,7 +140,7 @@ def _listens(path: str) -> bool:
 
 
 def _explained(reason: str, link: WorkerLink) -> str:
-    """The reason for leaving, and if no learner answered, the likely cause."""
+    """The reason for leaving; if no learner answered, followed by the likely cause."""
     if not reason.startswith(NO_LEARNER):
         return reason
     if link.problem is not None:

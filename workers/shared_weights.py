@@ -1,12 +1,13 @@
 """Weights that a supervisor receives once for all its workers, in an in-memory file that they inherit.
 
 Rule: the file has a few places, which the supervisor, its only writer, fills in turn. The table at its beginning says which
-version each place has, and of which learner, identified by the learner's first session. So no worker takes the weights of
-another run or of an earlier learner, although versions begin at 0 again. An entry is cleared before its place is filled, and
-written afterwards: a reader that finds the same entry before and after reading the place has all of it. If a worker doesn't
-find weights, the learner sends them to it directly.
+version each place has, and of which learner (identified by the learner's first session). So no worker uses the weights of
+another run or of an earlier learner, although versions begin at 0 again. An entry of the table is cleared before its place
+is filled, and written afterwards: if a reader finds the same entry before and after it reads the place, it has read all of
+the weights. If a worker doesn't find weights that it needs, the learner sends them to it directly.
 
-Linux only; elsewhere the learner sends the weights to every worker. This file imports neither numpy nor gymnasium.
+This works only on Linux; elsewhere, the learner sends the weights to every worker. This file imports neither numpy nor
+gymnasium.
 """
 
 from __future__ import annotations
@@ -19,10 +20,10 @@ from millrace.protocol.alive import SHARED_VERSIONS
 from millrace.protocol.wire.wake_up import WakePipe
 
 SUPPORTED = hasattr(os, "memfd_create") and hasattr(os, "pipe2")
-PLACE_BYTES = 1 << 33  # more than the largest message; only written pages take memory
-FRAMES = 4  # most frames of a message
-ENTRY = struct.Struct("<7Q")  # first session, version, number of frames, their lengths
-SESSIONS = 1 << 24  # a learner has fewer; it draws the first of 2**48
+PLACE_BYTES = 1 << 33  # more than the largest message; only pages that were written use memory
+FRAMES = 4  # largest number of frames of a message
+ENTRY = struct.Struct("<7Q")  # first session, version, number of frames, lengths of the frames
+SESSIONS = 1 << 24  # a learner has fewer sessions than this; the number of its first one is random, below 2**48
 
 
 def is_of_learner(session: int, first_session: int) -> bool:  # rule SHARED_OF_LEARNER
@@ -31,23 +32,23 @@ def is_of_learner(session: int, first_session: int) -> bool:  # rule SHARED_OF_L
 
 
 class SharedWeights:
-    """The supervisor's side."""
+    """The supervisor's side of the file: it writes weights."""
 
     def __init__(self) -> None:
         self._fd = os.memfd_create("millrace-weights", os.MFD_CLOEXEC)
         self._pipes: dict[str, WakePipe] = {}
-        self._next = 0  # place to fill
+        self._next = 0  # the place to fill next
 
     def descriptors(self, worker: str) -> tuple[int, int]:
-        """The descriptors that this worker inherits: the file, and the end of a pipe that signals new weights."""
+        """The descriptors that this worker inherits: the file, and the read end of a pipe that announces new weights."""
         if worker not in self._pipes:
             self._pipes[worker] = WakePipe()
         return self._fd, self._pipes[worker].read_fd
 
     def write(self, first_session: int, version: int, frames: Sequence[bytes | memoryview]) -> None:
-        """Share this message.
+        """Share the frames of a `Weights` message with all workers.
 
-        Raises `OSError` if there is no memory, and `struct.error` if this isn't a message of weights.
+        Raises `OSError` if there is no memory, and `struct.error` if this isn't such a message.
         """
         lengths = [*map(len, frames), *[0] * (FRAMES - len(frames))]
         entry = ENTRY.pack(first_session, version, len(frames), *lengths)
@@ -71,16 +72,16 @@ class SharedWeights:
 
 
 class SharedWeightsReader:
-    """A worker's side."""
+    """A worker's side of the file: it reads weights."""
 
     def __init__(self, fd: int, wake_fd: int) -> None:
         self._fd = fd
         self._wake = WakePipe(read_fd=wake_fd)
         self.wake_fd = wake_fd
-        """readable when weights have arrived"""
+        """descriptor that can be read when weights have arrived"""
 
     def find(self, session: int, versions: Collection[int]) -> Iterator[list[bytes]]:
-        """The available messages with these versions, from the learner of this session."""
+        """The frames of the available `Weights` messages with these versions, from the learner of this session."""
         self._wake.wait(0.0)
         if not versions:
             return
@@ -98,7 +99,7 @@ class SharedWeightsReader:
 
     def _table(self) -> list[tuple[int, ...]]:
         size = SHARED_VERSIONS * ENTRY.size
-        return list(ENTRY.iter_unpack(os.pread(self._fd, size, 0).ljust(size, b"\0")))  # nothing is written yet
+        return list(ENTRY.iter_unpack(os.pread(self._fd, size, 0).ljust(size, b"\0")))  # zeros if nothing was written yet
 
 
 def _begin(place: int) -> int:

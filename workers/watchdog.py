@@ -1,9 +1,11 @@
-"""The last resort against a hang: a process ends itself if its supervisor, which ends hung workers, could not.
+"""The last resort against a hang: a process ends itself if its supervisor, which normally ends hung workers, has not done
+so.
 
-Rule: when nobody calls `feed` for as long as the run allows, the process writes the stack of each of its threads to stderr
-and exits at once with exit code 1. Its supervisor ends it before that (`end_if_hung` in `supervise/worker_process.py`),
-unless the supervisor is dead or the worker hangs in millrace's own code. The timer is a C thread of Python's faulthandler:
-it works even while C code holds the interpreter's lock. Setting it takes about 50 µs, so `feed` does so only now and then.
+Rule: if `feed` has not been called for longer than the run allows, the process writes the stack of each of its threads to
+stderr and exits immediately with exit code 1. Its supervisor ends it before that (`end_if_hung` in
+`supervise/worker_process.py`), unless the supervisor is dead or the worker hangs in millrace's own code. The timer is a C
+thread of Python's faulthandler, which works even while C code holds the interpreter lock. Setting it takes about 50 µs, so
+`feed` does so only now and then.
 """
 
 from __future__ import annotations
@@ -15,24 +17,24 @@ import sysconfig
 from collections.abc import Callable
 from pathlib import Path
 
-FAULTHANDLER_HEADER = "Timeout ("  # first words of its output
-LONGEST_S = 1e9  # faulthandler refuses a longer time, such as infinity
+FAULTHANDLER_HEADER = "Timeout ("  # the beginning of faulthandler's output
+LONGEST_S = 1e9  # longest time for the timer; faulthandler doesn't accept infinity
 OURS = f"{Path(__file__).parents[1]}/"
 LIBRARIES = ("<", f"{sysconfig.get_path('stdlib')}/", OURS)  # beginnings of paths of code that isn't the user's
-INSTALLED = "-packages/"  # in the path of site-packages, and of Debian's dist-packages
+INSTALLED = "-packages/"  # part of the paths of site-packages, and of Debian's dist-packages
 
 
 class Watchdog:
-    """A watchdog timer. One for each process, because faulthandler has only one timer."""
+    """A watchdog timer. A process can have only one, because faulthandler has only one timer."""
 
     def __init__(self, timeout_s: Callable[[], float]) -> None:
-        """`timeout_s`: returns after how long it ends the process, which depends on the run; infinity: never."""
+        """`timeout_s` returns the time after which the process is ended, which depends on the run; infinity means never."""
         self._timeout_s = timeout_s
         self._set_to_s = math.inf
         self._due_s = -math.inf
 
     def feed(self, now: float) -> None:
-        """Restart the timer: a run or an env step begins, messages were read, or there was nothing to do."""
+        """Restart the timer. Call this regularly as long as the worker makes progress or has nothing to do."""
         timeout_s = self._timeout_s()
         if now < self._due_s and timeout_s == self._set_to_s:
             return
@@ -50,7 +52,7 @@ class Watchdog:
 
 
 def where_it_hung(log: str) -> str | None:
-    """The line in which the watchdog ended a process, from the output on stderr; None if the watchdog did not end it."""
+    """The line of code in which the watchdog ended a process, found in its output; None if the watchdog did not end it."""
     _, found, after = log.rpartition(FAULTHANDLER_HEADER)
     if not found:
         return None
@@ -58,11 +60,11 @@ def where_it_hung(log: str) -> str | None:
 
 
 def deepest_frame(stacks: str) -> str:
-    """Where the main thread is, from the stacks of all threads that faulthandler wrote; empty if it wrote none.
+    """Where the main thread is, found in the stacks that faulthandler wrote; empty if it wrote none.
 
-    This is the newest call in the user's own code, which may wait for a library; if there is none, the newest call.
+    This is the newest call in the user's own code, which may be waiting for a library; if there is none, the newest call.
     """
-    # In each stack the newest call comes first. The last stack is that of the main thread.
+    # In each stack, the newest call comes first. The last stack is that of the main thread.
     each = re.split(r"^(?:Current )?[Tt]hread .*$", stacks, flags=re.MULTILINE)
     frames = re.findall(r'File "(.*)", line (\d+) in (\S+)', each[-1])
     of_user = [each for each in frames if not _is_of_library(each[0])]

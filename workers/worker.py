@@ -1,9 +1,9 @@
-"""Runs a session: connects it with the link, the env copies and signals. The session makes all decisions.
+"""Runs a worker: connects its session with the link, the env copies and signals. The session makes all decisions.
 
 Rule: the worker reads all messages before a rollout or an evaluation starts, and again between env steps, so it answers
-while it works. Every failure of the environment is reported to the learner.
-A connection that only looks open is replaced.
-In a vector environment, where one step may take as long as the caller allows, a second thread sends the heartbeats.
+while it works. Every failure of the environment is reported to the learner. A connection that only seems to be open is
+replaced. In a vector environment, where one step may take as long as the caller allows, a second thread sends the
+heartbeats.
 """
 
 from __future__ import annotations
@@ -59,11 +59,11 @@ from millrace.workers.vector_env.stepper import Stepper
 
 log = logging.getLogger("millrace.worker")
 
-CONNECT_AGAIN_S = 20.0  # a learner that can be reached answers a Hello sooner
+CONNECT_AGAIN_S = 20.0  # a learner that can be reached answers a Hello before this
 PULSE_S = 0.05  # time between two checks for messages while environments are stepped
 IDLE_S = 0.5  # longest wait while idle, so that a signal or the end of the parent process is noticed
-AFTER_WAKE_UP_S = 0.02  # longest wait for a message after a wake-up, which is faster than the message
-STATM = Path("/proc/self/statm")  # pages: all, resident, …
+AFTER_WAKE_UP_S = 0.02  # longest wait for a message after a wake-up, which may arrive before the message does
+STATM = Path("/proc/self/statm")  # numbers of pages: all, resident, …
 
 
 class _Abandoned(Exception):
@@ -88,15 +88,15 @@ class WorkerOptions:
     code: AllowedCode = AllowedCode.MODULES
     """Which code the learner may make the worker run."""
     stop_requests: Callable[[], int] = _no_stop_requests
-    """Returns how often this worker was asked to leave."""
+    """Returns how many times this worker was asked to leave."""
     feed_watchdog: Callable[[float], None] = _no_watchdog
     """Called regularly with the time, unless the environment hangs."""
     shared_memory: InheritedDescriptors | None = None
     """Shared memory and wake pipes, for a vector environment on this machine."""
     shared_weights: SharedWeightsReader | None = None
-    """The weights that the supervisor receives for all its workers."""
+    """Reads the weights that the supervisor receives for all its workers."""
     exit_code: Callable[[int, str], int] = _same_exit_code
-    """The exit code of the process, from the conversation's exit code and the reason for leaving."""
+    """Converts the conversation's exit code and the reason for leaving to the exit code of the process."""
     make_actors: MakeActors = make_local_actors
     """Makes the actors of a run."""
 
@@ -122,16 +122,17 @@ class Worker:
         if self._options.shared_weights is not None:
             link.watch(self._options.shared_weights.wake_fd)
         self._pulse_due_s = 0.0
-        self._unused_from_s = math.inf  # from then on the described copy is not kept
+        self._unused_from_s = math.inf  # time at which the described copy is closed if it is still unused
         self._resident_bytes = 0
         self._left: Leave | None = None
         self._heartbeats = HeartbeatThread(lambda: self._do(self._session.heartbeat_if_due(self._clock())))
         self._waited_s = 0.0
-        self._statistics = self._earlier = Statistics()  # the newest, and those at the end of the session before
-        self._unheard_from_s = 0.0  # `_waited_s` when the learner was last heard, or when joining or the connection began
+        self._statistics = self._earlier = Statistics()  # the newest figures, and those at the end of the previous session
+        # The value of `_waited_s` when the last message of the learner arrived, or when joining or the connection began.
+        self._unheard_from_s = 0.0
 
     def run(self) -> Leave:
-        """Work until the conversation is over. Exceptions of the environment are never raised."""
+        """Work until the conversation is over. Exceptions of the environment are reported to the learner, never raised."""
         try:
             while self._left is None:
                 self._do(self._session.tick(self._clock()))
@@ -149,7 +150,7 @@ class Worker:
         return self._left
 
     def _work(self) -> bool:
-        """Do the next piece of work; False if there is none."""
+        """Do the next piece of work. Returns False if there is none."""
         work = self._session.next_work()
         if work is None:
             return False
@@ -184,7 +185,9 @@ class Worker:
             return [self._stepper.execute(work, lambda: self._pulse_from_env_code(work))]
 
     def _listen(self, timeout_s: float) -> None:
-        """Handle signals, then all messages that have arrived."""
+        """Wait for a message, at most `timeout_s` seconds. Then handle requests to stop, and all messages that
+        have arrived.
+        """
         began_s = self._clock()
         self._options.feed_watchdog(began_s)
         arrived = self._link.poll(timeout_s)
@@ -205,16 +208,16 @@ class Worker:
             self._take_shared_weights(self._options.shared_weights)
 
     def _take_shared_weights(self, shared: SharedWeightsReader) -> None:
-        """Handle the weights that the supervisor got, as if the learner had sent them to this worker."""
+        """Handle weights that the supervisor has received as if the learner had sent them to this worker."""
         for frames in shared.find(self._session.session, self._session.missing_versions()):
-            with suppress(BadMessage):  # the learner will send them to this worker, and learn of the error
+            with suppress(BadMessage):  # the learner will send them to this worker directly
                 self._do(self._session.handle(decode_to_worker(frames), self._clock()))
 
     def _connect_again_if_unheard(self) -> None:
-        """A proxy or a tunnel may keep a connection open whose other end is gone.
+        """Make a new connection if the learner has not answered for too long while this worker joins.
 
-        Without a connection, this drops the queued Hellos for a learner that isn't there yet. Only time spent listening
-        counts: while a simulator starts or is closed, nothing is read.
+        A proxy or a tunnel may keep a connection open whose other end is gone. If there is no connection yet, this drops the
+        queued Hellos. Only the time spent listening counts, because nothing is read while a simulator starts or is closed.
         """
         if self._session.state is not WorkerState.JOINING:
             self._unheard_from_s = self._waited_s
@@ -227,9 +230,9 @@ class Worker:
             self._link.connect_again()  # rule CONNECTION
 
     def _serve_shared_memory(self, timeout_s: float) -> float:
-        """Execute the orders in shared memory, if it is used, until a message may have arrived.
+        """If shared memory is used, execute the orders in it until a message may have arrived.
 
-        Returns how long to wait for it.
+        Returns for how many seconds to wait for a message.
         """
         stepper = self._stepper
         orders = SharedOrders(self._session.session)
@@ -255,7 +258,10 @@ class Worker:
         return AFTER_WAKE_UP_S if message_announced else 0.0
 
     def _pulse(self, work: Work | SharedOrders) -> None:
-        """Every `PULSE_S`, handle messages and send what is due. Raises `_Abandoned` once the work is no longer wanted."""
+        """Every `PULSE_S` seconds, handle messages and send what is due; otherwise, do nothing.
+
+        Raises `_Abandoned` once the work is no longer wanted.
+        """
         now = self._clock()
         if now >= self._pulse_due_s:
             self._pulse_due_s = now + PULSE_S
@@ -267,7 +273,7 @@ class Worker:
                 raise _Abandoned
 
     def _pulse_from_env_code(self, work: Work | SharedOrders) -> None:
-        """Like `_pulse`, but called by environment code while an order is executed."""
+        """Like `_pulse`, for calls during environment code, while the lock of the heartbeat thread is released."""
         if self._clock() >= self._pulse_due_s:
             with self._heartbeats.lock_reacquired():
                 self._pulse(work)
@@ -280,7 +286,10 @@ class Worker:
             self._do([SendMessage(answer)])
 
     def _fail(self, error: Exception) -> None:
-        """Report to the learner that the environment's or the user's code raised, or millrace's code on their data."""
+        """Report to the learner that the environment, a user-defined policy or millrace's own code raised, and leave.
+
+        If the error is that no slot was free, decline the run instead.
+        """
         if isinstance(error, NoSlot) and self._session.state is not WorkerState.LEFT:
             self._decline(error)
             return
@@ -290,13 +299,18 @@ class Worker:
         self._do(self._session.fail(_line(error), detail, lane, of_policy=isinstance(error, PolicyFailed)))
 
     def _cannot_take_part(self, error: Exception, work: Work) -> TypeGuard[UsageError]:
-        """Whether this worker lacks the environment, or has another one. If the environment's own code raised, it has it."""
+        """Whether the error means that this worker lacks the environment, or has another version of it.
+
+        If the environment's own code raised (`detail` is its traceback), the worker has it.
+        """
         if not isinstance(error, UsageError) or error.detail:
             return False
         return isinstance(work, Describe) or (isinstance(work, RolloutTask) and not self._statistics.steps)
 
     def _decline(self, error: UsageError) -> None:
-        """Leave the run. If it lacked a slot, this process ends when there is room for a lane, and is then restarted."""
+        """Leave the run. If no slot was free, end only when there is room for a lane: then the supervisor restarts the
+        worker.
+        """
         self._close_all()
         *said, leave = self._session.decline(_line(error), 1 if isinstance(error, NoSlot) else EXIT_UNSUITABLE)
         self._do(said)
@@ -345,7 +359,9 @@ class Worker:
             self._link.send(frames)
 
     def _begin(self, run: WaitSpec | RunSpec | StepSpec) -> None:
-        """Make the actors or the stepper of this run, unless it has yet to begin. Those of the last session were closed."""
+        """Make the actors or the stepper for this run, unless the run has yet to begin. Those of the last session were
+        closed.
+        """
         activity().begin(WAITING)
         activity().limit(run.call_timeouts)
         self._options.feed_watchdog(self._clock())
@@ -363,7 +379,7 @@ class Worker:
         try:
             match run:
                 case RunSpec():
-                    with activity().during(PREPARING):  # it may import torch and the user's modules, which takes long
+                    with activity().during(PREPARING):  # it may import torch and user modules, which takes long
                         self._actors = self._options.make_actors(run)
                     self._packing = replace(self._link.packing, zstd=run.zstd and self._link.packing.zstd)
                 case StepSpec():
@@ -377,7 +393,10 @@ class Worker:
             self._fail(error)
 
     def _describe(self, order: Describe) -> Described:
-        """Describe an environment. A second thread sends the heartbeats while its code runs. Raises as `describe` does."""
+        """Describe an environment. A second thread sends heartbeats while the environment's code runs.
+
+        Raises what `describe` raises, and `UsageError` if this worker isn't allowed to run the environment's code.
+        """
         if why := order.env.rejection_reason(self._options.code):
             raise UsageError(why)
         heartbeats = HeartbeatThread(lambda: self._do(self._session.heartbeat_if_due(self._clock())))
@@ -389,7 +408,7 @@ class Worker:
             heartbeats.stop()
 
     def _close_unused(self) -> None:
-        """Close the described copy if the worker has no lane."""
+        """Close the described copy if it has been unused for too long."""
         if self._clock() > self._unused_from_s:
             self._unused_from_s = math.inf
             close_described()
@@ -401,7 +420,7 @@ class Worker:
 
 
 def _resident_bytes() -> int:
-    """Resident memory of this process; 0 on a system without /proc. It takes as long as five steps of CartPole."""
+    """Resident memory of this process; 0 on a system without /proc. A call takes as long as five steps of CartPole."""
     try:
         return int(STATM.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
     except OSError:
@@ -415,9 +434,9 @@ def _line(error: Exception) -> str:
 
 
 def identity(name: str, process_nonce: int | None = None, *, evaluates: bool = False) -> WorkerIdentity:
-    """Identity of this process, or of one of its threads. `process_nonce`: its secret number; None: draw one.
+    """The identity of a worker in this process, or in one of its threads.
 
-    `evaluates`: whether it only plays evaluations.
+    `process_nonce` is its secret number; if it is None, one is drawn. `evaluates` says whether it only plays evaluations.
     """
     try:
         software = f"millrace {version('millrace-rl')}"
@@ -429,5 +448,5 @@ def identity(name: str, process_nonce: int | None = None, *, evaluates: bool = F
 
 
 def parent_is_gone(parent: int) -> bool:
-    """True when the process that started this one has ended."""
+    """Whether the process that started this one has ended."""
     return os.getppid() != parent

@@ -33,7 +33,7 @@ class WorkerThread:
         *,
         evaluates: bool = False,
     ) -> None:
-        """`evaluates`: whether it only plays evaluations."""
+        """Start the thread. `evaluates` says whether the worker only plays evaluations."""
         self.name = name
         self._identity = identity(name, evaluates=evaluates)
         self.process_nonce = self._identity.process_nonce
@@ -53,11 +53,11 @@ class WorkerThread:
         options = WorkerOptions(
             code=AllowedCode.CALLABLES, stop_requests=lambda: self._stop_requests, make_actors=self._make_actors
         )
-        with suppress(zmq.ContextTerminated):  # the run has ended, and a thread could not be killed
+        with suppress(zmq.ContextTerminated):  # the run ended without waiting for this thread
             self._left = Worker(link, session, options).run()
 
     def ended(self) -> Ending | None:
-        """How it ended, or None while it runs."""
+        """How the worker ended; None while it runs."""
         if self._thread.is_alive():
             return None
         if self._left is None:
@@ -65,14 +65,14 @@ class WorkerThread:
         return Ending(self._left.exit_code, one_line(self._left.reason), on_purpose=True)
 
     def activity(self, now: float) -> WorkerActivity | None:
-        """What it is doing; None if it has ended."""
+        """What the worker is doing; None if it has ended."""
         if not self._thread.is_alive():
             return None
         page = self._reader.read(now)
         return WorkerActivity(self.name, self.process_nonce, page.doing, page.for_s, page.env_calls)
 
     def last_line(self) -> str:
-        """Empty: a thread writes to this process's stderr."""
+        """Always empty, because a thread has no log of its own: it writes to this process's stderr."""
         return ""
 
     def end_if_hung(self, now: float) -> None:
@@ -82,13 +82,13 @@ class WorkerThread:
         """Do nothing: a thread keeps its priority."""
 
     def stop(self) -> None:
-        """Ask it to leave."""
+        """Ask the worker to leave after the rollout in progress."""
         self._stop_requests += 1
 
     def wait(self, timeout_s: float) -> None:
-        """Wait until it has ended. A thread cannot be killed."""
+        """Wait until the worker has ended, at most `timeout_s` seconds. A thread that still runs can't be killed."""
         self._thread.join(timeout_s)
 
     def kill(self) -> None:
-        """Ask it to leave at once."""
+        """Ask the worker to leave immediately, because a thread can't be killed."""
         self._stop_requests += 2

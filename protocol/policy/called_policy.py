@@ -71,7 +71,7 @@ class CalledPolicy:
                 raise self._wrong(f"{expected}, got {type(self._made).__name__} without {name}")
 
     def load(self, parameters: Floats, buffers: Floats) -> None:
-        """Load these weights. Call it only if the policy has arrays."""
+        """Load these weights. The policy must have been declared with arrays."""
         self._guarded("load", lambda: self._made.load(named_views(parameters.copy(), self._fields)))
 
     def act(

@@ -195,9 +195,7 @@ def _decode(frames: Sequence[Buffer], kinds: MessageTypes, packed_bytes_limit: i
 
 
 def _explain_validation_error(error: str, head: object, kinds: Any) -> str:
-    """msgspec's error text, with the names of fields in place of their positions, and not counting the type's name as a
-    field.
-    """
+    """The error text of msgspec, with names of fields in place of positions, and without the type's name in their number."""
     match head:
         case [str() as name, *given]:
             kind = next((kind for kind in get_args(kinds) or (kinds,) if kind.__name__ == name), None)

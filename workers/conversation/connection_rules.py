@@ -24,7 +24,7 @@ the worker ends when the learner does.
 def wait_limits_s(join_timeout_s: float, *, stay: bool) -> tuple[float, float]:
     """How long a worker waits for its first learner, and for a learner that it had joined, in seconds.
 
-    With `stay`, it waits for the first without limit, and after the second time it waits for the next learner.
+    With `stay`, the first time is unlimited, and after the second, the worker waits for another learner.
     """
     return math.inf if stay else join_timeout_s, max(join_timeout_s, REJOIN_TIMEOUT_S)
 

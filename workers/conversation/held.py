@@ -188,7 +188,7 @@ class Permitted(NamedTuple):
     """`round`, `opponent` and `past`: as in the `Permit`"""
 
     def assignment(self, ticket: int, lane: int, incarnation: int) -> Assignment:
-        """This rollout as an `Assignment` on a lane."""
+        """The `Assignment` of this rollout to a lane."""
         return Assignment(ticket, lane, incarnation, self.sequence, self.round, self.opponent, self.past)
 
     @property

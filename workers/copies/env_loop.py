@@ -1,11 +1,12 @@
-"""The loop that calls `env.step`, for rollouts and evaluations (`LoopedCopies`) and vector environments (`SteppedLane`).
+"""The loop that calls `env.step`, for rollouts and evaluations (`LoopedCopies`) and for vector environments (`SteppedLane`).
 
 Autoreset is gymnasium's (`gymnasium.vector.AutoresetMode`). NextStep: the step after an episode's end ignores the action and
 resets that copy. SameStep: the step that ends an episode resets the copy, and returns the last observation and info inside
 the new info, as `final_obs` and `final_info`. Disabled: the caller resets.
 
-Rule: a copy that is made anew after some episodes (`restart_episodes`) goes on as it would have done otherwise: it is reset
-with the seed that the copy began with, gets the random numbers that the old environment had, and is reset again.
+Rule: a copy that is recreated after some episodes (`restart_episodes`) continues exactly as it would have otherwise: the new
+environment is reset with the seed with which the copy began, gets the random state of the old environment, and is reset
+again.
 """
 
 from __future__ import annotations
@@ -41,12 +42,12 @@ from millrace.workers.copy_slots import Dress, as_made, close_copy, make_copy
 
 Autoreset = Literal["NextStep", "SameStep", "Disabled"]
 CopyInfos = list[tuple[int, dict[str, Any]]]
-"""(number of the copy, its info) for each info that isn't empty, with copies of its dicts and arrays, see `_kept`"""
+"""Pairs of a copy's number and its info, for each info that isn't empty. Dicts and arrays in it are copied; see `_kept`."""
 Pulse = Callable[[], None]
-"""Called now and then during long work, so that the worker can answer the learner. It may raise to end the work."""
+"""Called regularly during long work, so that the worker can answer the learner. It may raise to end the work."""
 
-CHECKED_STEPS = 2  # the first steps, in which the returned numbers are checked; the first one may be a reset
-PULSE_S = 0.05  # a loop over slow copies calls `pulse` this often
+CHECKED_STEPS = 2  # number of first steps in which the returned numbers are checked; two, because one may be a reset
+PULSE_S = 0.05  # a loop over slow copies calls `pulse` at this interval
 
 
 class EnvLoop:
@@ -64,12 +65,12 @@ class EnvLoop:
         dress: Dress[gymnasium.Env[Any, Any]] = as_made,
         restart_episodes: int = 0,
     ) -> None:
-        """Make the copies, without a reset.
+        """Make the copies, without resetting them.
 
-        `ended`: they count as truncated, so the first step with NextStep resets them. `first` identifies the first copy; the
-        others follow it. `stepping`: the worker's activity during a step. `dress`: takes each copy, and returns what to step
-        in its place; see `make_copy`. `restart_episodes`: after this many resets,
-        each copy is closed and created again before the next one; 0: never.
+        If `ended`, they count as truncated, so that with NextStep the first step resets them. `first` identifies the first
+        copy; the others follow it. `stepping` is the worker's activity during a step. `dress` takes each copy, and returns
+        the environment to step in its place; see `make_copy`. After `restart_episodes` resets, each copy is closed and
+        created again before the next reset; 0 means never.
         """
         self.envs: list[gymnasium.Env[Any, Any]] = []
         self._activity = activity()
@@ -83,24 +84,24 @@ class EnvLoop:
             except UsageError:
                 self.close()
                 raise
-            except BaseException as error:  # also SystemExit: the environment must not silently end the worker
+            except BaseException as error:  # including SystemExit: the environment must not silently end the worker
                 self.close()
                 raise CopyFailed(n, "make") from error
         self.steps = 0
-        """how often `step` stepped the copies"""
+        """number of calls of `step`"""
         self.reward: list[Any] = [0.0] * len(self.envs)
-        """[N] of the last step"""
+        """[N] as returned by the last step"""
         self.terminated: list[Any] = [False] * len(self.envs)
-        """[N] of the last step"""
+        """[N] as returned by the last step"""
         self.truncated: list[Any] = [ended] * len(self.envs)
-        """[N] of the last step"""
+        """[N] as returned by the last step"""
         self.random_states: dict[int, dict[str, Any] | None] = {}
-        """by copy: state of its environment's random generator before the last reset in a step"""
+        """for each copy that a step has reset, the state of its random generator before the last such reset"""
         self._step_functions = [env.step for env in self.envs]
         self._inner = [repeatable(env) for env in self.envs]
         self._restart_episodes = restart_episodes
-        self._resets = [0] * len(self.envs)  # of the environments that there are now
-        self._seeds: list[int | None] = [None] * len(self.envs)  # with which the copies began
+        self._resets = [0] * len(self.envs)  # number of resets of each current environment
+        self._seeds: list[int | None] = [None] * len(self.envs)  # the last seed with which each copy was reset
         self.stepping = stepping
         """the worker's activity during a step"""
         self._all = range(len(self.envs))
@@ -116,7 +117,10 @@ class EnvLoop:
         pulse: Pulse,
         options: Sequence[Any] = (),
     ) -> CopyInfos:
-        """Start episodes in these copies, with a seed for each, and options for each if any are given."""
+        """Begin episodes in these copies, with a seed for each, and options for each if any are given.
+
+        Writes the observation of copy n into `into[n]`, and returns the infos.
+        """
         infos: CopyInfos = []
         keywords: Iterable[Mapping[str, Any]] = [{"options": each} for each in options] or repeat({}, len(seeds))
         for n, seed, further in zip(copies, seeds, keywords, strict=True):  # rule SEEDED
@@ -134,9 +138,10 @@ class EnvLoop:
         return infos
 
     def step(self, actions: Iterable[Any], into: list[Any], pulse: Pulse, copies: Sequence[int] | None = None) -> CopyInfos:
-        """Step, or reset, every copy or only these, each with its action.
+        """Step every copy, or only `copies`, with an action for each; with NextStep, reset those whose episodes have ended.
 
-        The rest of the result is in `reward`, `terminated`, `truncated`.
+        Writes the observation of copy n into `into[n]`, and returns the infos. The rest of the result is in `reward`,
+        `terminated` and `truncated`.
         """
         chosen: Sequence[int] = self._all
         steps = self._step_functions
@@ -150,8 +155,8 @@ class EnvLoop:
         next_step = self._next_step
         same_step = self._same_step
         infos: CopyInfos = []
-        # The worker's activity is written inline, because this loop must be fast: once per step of the lane, at each reset
-        # of a copy, and every `PULSE_S`.
+        # The worker's activity is written inline, because this loop must be fast: once per call of this method, at each
+        # reset of a copy, and every `PULSE_S` seconds.
         numbers = self._activity.numbers
         seconds = self._activity.seconds
         begin = self._activity.begin
@@ -180,7 +185,7 @@ class EnvLoop:
                         raise wrong_step(answer)
                     if same_step and (terminated[n] or truncated[n]):
                         resets = True
-                        # Copies, because the reset may overwrite them.
+                        # Copied, because the reset may overwrite them.
                         last = {"final_obs": deepcopy(observation), "final_info": _kept(info)}
                         begin(RESETTING)
                         observation, info = reset_answer(self.envs[n].reset())
@@ -191,7 +196,7 @@ class EnvLoop:
                 begin(WAITING)
                 raise CopyFailed(n, "reset" if resets else f"step {self.steps}") from error
             if info:
-                infos.append((n, _kept(info)))  # before the next copy may change the same dict
+                infos.append((n, _kept(info)))  # now, because the next copy may change the same dict
             if (now_s := perf_counter()) > pulse_due_s:
                 numbers[ENV_CALLS] += (done := chosen.index(n) + 1) - counted
                 counted = done
@@ -209,13 +214,13 @@ class EnvLoop:
         return infos
 
     def _made(self, n: int) -> gymnasium.Env[Any, Any]:
-        """Make copy n."""
+        """Make copy n, and return it."""
         first = self._first
         with self._activity.during(MAKING):
             return make_copy(replace(first, number=first.number + n, copy=first.copy + n), self._makes[n], self._dress)
 
     def _reset(self, n: int, seed: int | None, **further: Any) -> tuple[Any, Any]:
-        """Reset copy n, which is made anew first if its turn has come."""
+        """Reset copy n. If it has had `restart_episodes` resets, it is recreated first."""
         if self._restart_episodes:
             if self._resets[n] >= self._restart_episodes:
                 self._make_anew(n, seed)
@@ -224,10 +229,10 @@ class EnvLoop:
         return reset_answer(self.envs[n].reset(seed=seed, **further))
 
     def _make_anew(self, n: int, seed: int | None) -> None:
-        """Close copy n, and make it again. Without a seed, the next reset does what the old one would have done."""
+        """Close copy n, and recreate it. If `seed` is None, its next reset does what the old copy's would have done."""
         state = state_of(self._inner[n])
         if seed is None and state is None:
-            return  # nobody could go on where it was
+            return  # a new environment could not continue where this one is
         close_copy(self.envs[n])
         env = self.envs[n] = self._made(n)
         self._step_functions[n] = env.step
@@ -239,15 +244,15 @@ class EnvLoop:
             set_state(self._inner[n], pack(state) or b"")
 
     def random_state(self, copy: int) -> dict[str, Any] | None:
-        """The current state of the copy's random generator; None if it has no readable one."""
+        """The current state of the copy's random generator; None if it can't be read."""
         return state_of(self._inner[copy])
 
     def set_random_state(self, copy: int, packed: bytes) -> bool:
-        """Set that state. False if the copy has no generator that it fits."""
+        """Set the state of the copy's random generator. Returns False if the copy has no generator with such a state."""
         return set_state(self._inner[copy], packed)
 
     def _check_numbers(self, copies: Iterable[int]) -> None:
-        """Raise `CopyFailed` for text and for a missing reward, which numpy would read as True, 1 or NaN."""
+        """Raise `CopyFailed` for text, or a reward of None, which numpy would silently read as True, 1 or NaN."""
         for n in copies:
             if why := self._rewards_of_agents(n):
                 raise CopyFailed(n, f"step {self.steps}", why)
@@ -261,7 +266,7 @@ class EnvLoop:
                     raise CopyFailed(n, f"step {self.steps}", f"{wrong}; its step must return ({STEP})")
 
     def _rewards_of_agents(self, n: int) -> str:
-        """Advice, in one line, if copy `n` returns a reward for each element of its Tuple spaces; else empty."""
+        """Advice, in one line, if copy `n` has returned a reward for each element of its Tuple spaces; else empty."""
         reward = self.reward[n]
         if not isinstance(reward, list | tuple | np.ndarray):
             return ""
@@ -274,13 +279,15 @@ class EnvLoop:
         )
 
     def close(self) -> None:
-        """Close every copy. What a copy raises is ignored."""
+        """Close every copy. Exceptions of the copies are ignored."""
         for env in self.envs:
             close_copy(env)
 
 
 def _kept(info: Any) -> Any:
-    """The info with copies of its dicts and arrays, as gymnasium keeps it. Other values may not be copyable."""
+    """The info, in which dicts and arrays are copied, as gymnasium does. Other values aren't, because some
+    can't be copied.
+    """
     if isinstance(info, dict):
         return {key: value if type(value) in _IMMUTABLE else _kept(value) for key, value in info.items()}
     return info.copy() if isinstance(info, np.ndarray) else info

@@ -1,7 +1,7 @@
 """Facts of episodes: the numbers that an environment reports in `info` at an episode's last step (`RunSpec.facts`).
 
-Rule: a number that is absent, or not finite, is missing: it is NaN, not 0. Anything that isn't a number is an error of the
-environment that names the key.
+Rule: a number that is absent or not finite is missing, and is stored as NaN, not 0. A value that isn't a number is an error
+of the environment, and the error's message names the key.
 """
 
 from __future__ import annotations
@@ -18,16 +18,19 @@ from millrace.protocol.errors import safe_repr
 from millrace.workers.copies.env_errors import CopyFailed
 
 Facts = Mapping[int, tuple[float, ...]]
-"""By env copy: the facts of the episode that ended in this step."""
+"""For each env copy whose episode ended in this step, the facts of that episode."""
 
 
 def facts_of_info(names: Sequence[str], info: Mapping[str, Any], copy: int | None = None) -> tuple[float, ...]:
-    """A number for each name. Raises `CopyFailed` for values that aren't numbers."""
+    """The facts with these names in an info. Raises `CopyFailed`, which names the copy, for values that aren't numbers."""
     return tuple(_number(name, info.get(name, math.nan), copy) for name in names)
 
 
 def facts_of_copies(names: Sequence[str], infos: Mapping[str, Any], count: int) -> Array:
-    """The facts [count, names] float64 of each copy of a vector environment, from its infos in gymnasium's form."""
+    """The facts [count, names] float64 of all copies of a vector environment, read from its infos in gymnasium's form.
+
+    Raises `CopyFailed` for values that aren't numbers, or if there isn't one for each copy.
+    """
     table = np.full((count, len(names)), np.nan)
     for k, name in enumerate(names):
         if name not in infos:
@@ -44,7 +47,7 @@ def facts_of_copies(names: Sequence[str], infos: Mapping[str, Any], count: int) 
 
 
 def of_ended(table: Array, ended: Array) -> Facts:
-    """The rows of a table [N, names] for the copies that `ended` [N]."""
+    """The rows of a table [N, names] for those copies whose episodes have `ended` [N]."""
     return {int(n): tuple(table[n].tolist()) for n in np.flatnonzero(ended)}
 
 
@@ -54,7 +57,7 @@ def _number(name: str, value: Any, copy: int | None) -> float:
         if array.size == 1 and array.dtype.kind in "biuf":
             number = float(array.reshape(()))
             return number if math.isfinite(number) else math.nan
-    except Exception:  # rows of different lengths, a number too large for a float, a user-defined object
+    except Exception:  # nested lists of different lengths, a number too large for a float, or a user-defined object
         pass
     if value is None:
         return math.nan

@@ -24,7 +24,7 @@ def open_loop(run: RunSpec, first: EnvCopy, pulse: Pulse) -> LoopedCopies:
 def loop_over(
     run: RunSpec, make: Callable[[], gymnasium.Env[Any, Any]], count: int, first: EnvCopy, pulse: Pulse
 ) -> LoopedCopies:
-    """Make this number of copies for a run."""
+    """Make `count` copies for a run."""
     makes = [make] * count
     keys = run.policy.critic_keys
     anew = run.restart_episodes

@@ -1,9 +1,9 @@
 """Reads the masks of allowed actions that env copies report, in their observations or in `info`.
 
-Rule: wherever an action will be chosen, there must be a mask with a bit for each choice that allows at least one choice of
-each entry of the action; otherwise the environment is wrong (`CopyFailed`). No action is chosen after an episode's end. If
-the episode was truncated, its mask is kept, because the value of the last observation is used; if it has none, all actions
-are allowed.
+Rule: wherever an action will be chosen, there must be a mask. It has a bit for each choice, and allows at least one choice
+of each entry of the action; otherwise, the environment is wrong (`CopyFailed`). After an episode's end, no action is chosen.
+If the episode was truncated, its last mask is kept nevertheless, because learning uses the value of the last observation; if
+there is none, all actions are allowed.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _NONE: Mapping[str, Any] = {}
 
 
 def unused_mask(infos: Iterable[Mapping[str, Any]], action: gymnasium.Space[Any]) -> str:
-    """A line for the user if one of these infos of resets contains a mask that the run does not use."""
+    """A line for the user if one of these infos contains a mask that the run does not use; else empty."""
     if not any(isinstance(info, Mapping) and MASK in info for info in infos) or not action_spec(action).choices:
         return ""
     return f"the environment's info has an {MASK}, which this run does not use; --action-masks info does"
@@ -45,7 +45,7 @@ class MaskReader:
         self._where = "its observation" if self._in_observation else "info"
 
     def read(self, n: int, observation: Any, info: Mapping[str, Any], terminated: Any, truncated: Any) -> Bools:
-        """The mask [choices] of copy `n` after a step or a reset. Raises `CopyFailed`."""
+        """The mask [choices] of copy `n` after a step or a reset. Raises `CopyFailed` if there is no valid one."""
         if terminated:
             return self.everything
         source = observation if self._in_observation else info
@@ -53,9 +53,9 @@ class MaskReader:
         return self._mask(n, value, bool(truncated))
 
     def read_all(self, observation: Any, infos: Mapping[str, Any], terminated: Bools, truncated: Bools) -> Bools:
-        """The masks [N, choices] of all copies of a vector environment. Raises `CopyFailed`.
+        """The masks [N, choices] of all copies of a vector environment. Raises `CopyFailed` if one has no valid mask.
 
-        A copy that gets no action, as `terminated` says, needs no mask.
+        A copy that is `terminated` gets no action, and so needs no mask.
         """
         count = len(terminated)
         given = (observation if self._in_observation else infos).get(MASK)
@@ -74,7 +74,9 @@ class MaskReader:
         truncated: Sequence[Any],
         stepped: Sequence[int] | None = None,
     ) -> list[Bools]:
-        """The masks of all copies of a loop. `stepped`: only these copies have new masks, and the others need none."""
+        """The mask of every copy of a loop. If `stepped` is given, only these copies need one; the others'
+        allow everything.
+        """
         by_copy = dict(infos)
         of = range(len(observations)) if stepped is None else stepped
         return [
@@ -106,17 +108,17 @@ class MaskReader:
 
 
 def _as_array(value: Any) -> Array | None:
-    """A mask as one array: the masks of several entries are concatenated."""
+    """A mask as one array; a list or tuple of masks for several entries is concatenated. None if numpy can't read it."""
     try:
         if isinstance(value, tuple | list) and value and np.ndim(value[0]):
             return np.concatenate([np.asarray(part).reshape(-1) for part in value])
         return np.asarray(value)
-    except Exception:  # rows of different lengths, or a user-defined object
+    except Exception:  # nested lists of different lengths, or a user-defined object
         return None
 
 
 def _rows(given: Any, count: int) -> Sequence[Any]:
-    """The value of each copy of a vector environment's array; a Tuple space gives a tuple of arrays [N, …]."""
+    """Split a vector environment's masks into one value per copy. From a Tuple space, they are a tuple of arrays [N, …]."""
     if isinstance(given, tuple) and all(len(part) == count for part in given):
         return list(zip(*given, strict=True))
     if isinstance(given, np.ndarray | list) and len(given) == count:

@@ -17,7 +17,7 @@ class OpenLane(Protocol):
     incarnation: int
 
     def close(self) -> None:
-        """Close the copies. Raises nothing."""
+        """Close the copies. Never raises."""
         ...
 
 
@@ -29,13 +29,13 @@ class OpenLanes(dict[int, L]):
 
     def __init__(self) -> None:
         super().__init__()
-        self._opening: int | None = None  # lane whose copies are being made, until it is closed
+        self._opening: int | None = None  # number of the lane whose copies are being made; None if it was closed meanwhile
         self._to_close: list[L] = []
         self._in_use = False
 
     @contextmanager
     def in_use(self) -> Iterator[None]:
-        """While it is entered, environment code runs, and closing lanes is postponed to its end."""
+        """A context in which environment code runs, and whose end is when lanes closed in the meantime are really closed."""
         self._in_use = True
         try:
             yield
@@ -44,12 +44,12 @@ class OpenLanes(dict[int, L]):
             self.close(())
 
     def here(self, number: int, incarnation: int) -> L | None:
-        """The lane, if it is open in this incarnation."""
+        """The lane with this number if it is open in this incarnation, else None."""
         lane = self.get(number)
         return lane if lane is not None and lane.incarnation == incarnation else None
 
     def open(self, number: int, make: Callable[[], L]) -> L:
-        """Make a lane, after closing its earlier incarnation."""
+        """Close the lane's earlier incarnation, make the lane, and return it."""
         self.close([number])
         self._opening = number
         lane = make()
@@ -60,7 +60,7 @@ class OpenLanes(dict[int, L]):
         return lane
 
     def close(self, lanes: Iterable[int]) -> None:
-        """Close those of these lanes that are open: at once, or at the end of `in_use`."""
+        """Close those of these lanes that are open: immediately, or, within `in_use`, at its end."""
         for number in lanes:
             if number == self._opening:
                 self._opening = None

@@ -1,7 +1,7 @@
-"""The state of an environment's own random generator, on which a reset without a seed depends in deterministic environments.
+"""The state of an environment's own random generator, which determines a reset without a seed in deterministic environments.
 
-Rule: it is read only from gymnasium's `np_random`, which `super().reset(seed=...)` makes. If an environment draws from
-anything else, or has no generator, its state cannot be read.
+Rule: it is read only from gymnasium's `np_random`, which `super().reset(seed=...)` creates. If an environment draws from
+another generator, or has none, the state cannot be read.
 """
 
 from __future__ import annotations
@@ -15,13 +15,16 @@ from millrace.protocol.envs.seats import SeatedEnv
 from millrace.workers.copies.reset_ahead import ResetAhead
 
 BYTES = 16 + 16 + 4 + 1
-"""size of a packed state: PCG64's state and increment, and a buffered half of the last number that it drew"""
+"""size of a packed state: PCG64's state, its increment, the half of a drawn number that is left over, and whether there is
+one
+"""
 ATTRIBUTES = ("_np_random", "np_random")
-"""Where environments keep their generator: those of gymnasium, and those of PettingZoo by convention."""
+"""The attributes in which environments keep their generator: the first in gymnasium, the second in PettingZoo by convention.
+"""
 
 
 def repeatable(env: gymnasium.Env[Any, Any]) -> Any | None:
-    """The environment inside all wrappers, if its generator alone decides what a reset without a seed does; else None."""
+    """The environment inside all wrappers, if its generator alone determines a reset without a seed; else None."""
     inner: Any = env
     while isinstance(inner, gymnasium.Wrapper):
         if isinstance(inner, ResetAhead):
@@ -33,13 +36,13 @@ def repeatable(env: gymnasium.Env[Any, Any]) -> Any | None:
 
 
 def state_of(inner: Any | None) -> dict[str, Any] | None:
-    """The state of the generator of an environment inside all wrappers; None if it has no readable one."""
+    """The state of the generator of `inner`, an environment without wrappers; None if it can't be read."""
     generator = _generator(inner)
     return None if generator is None else generator.bit_generator.state  # type: ignore[return-value]  # a new dict
 
 
 def pack(state: dict[str, Any] | None) -> bytes | None:
-    """The state in `BYTES` bytes."""
+    """The state as `BYTES` bytes; None if there is none."""
     if state is None:
         return None
     of_pcg64 = state["state"]
@@ -48,9 +51,9 @@ def pack(state: dict[str, Any] | None) -> bytes | None:
 
 
 def set_state(inner: Any | None, packed: bytes) -> bool:
-    """Set a packed state. False if the environment has no generator that it fits."""
+    """Set a packed state. Returns False if the environment has no readable generator, or the state isn't a valid one."""
     generator = _generator(inner)
-    if generator is None or len(packed) != BYTES or not packed[16] & 1:  # PCG64 adds an odd number
+    if generator is None or len(packed) != BYTES or not packed[16] & 1:  # the increment of PCG64 is odd
         return False
     generator.bit_generator.state = {
         "bit_generator": "PCG64",
@@ -62,7 +65,7 @@ def set_state(inner: Any | None, packed: bytes) -> bool:
 
 
 def _generator(inner: Any | None) -> np.random.Generator | None:
-    """The environment's generator, unless it is a property of the class: reading it would create one."""
+    """The environment's generator; None if it has none yet. It isn't read through a property, which would create one."""
     own = getattr(inner, "__dict__", {})
     for name in ATTRIBUTES:
         generator = own.get(name)

@@ -1,8 +1,8 @@
 """`millrace:ResetAhead`, a wrapper for environments whose reset is slow: the next episode is prepared while this one runs.
 
-Rule: which instance plays an episode, and with which random numbers, depends on the resets before it and never on time. The
-instance that plays handles a reset with a seed or options at once. The first reset without them makes a second instance in a
-thread. From then on the two take turns: one plays, and the thread resets the other.
+Rule: which instance plays an episode, and with which random numbers, depends on the resets before it and never on time. A
+reset with a seed or options is done immediately, by the instance that plays. The first reset without them makes a second
+instance in a thread. From then on, the two take turns: one plays while the thread resets the other.
 """
 
 from __future__ import annotations
@@ -25,13 +25,14 @@ Prepared = tuple[gymnasium.Env[Any, Any], Any, dict[str, Any]]  # an instance, i
 class ResetAhead(gymnasium.Wrapper[Any, Any, Any, Any]):
     """An environment that resets a second instance of itself while an episode runs.
 
-    Use it as the innermost wrapper, so that other wrappers see one environment. It takes the memory of two instances. A
+    Use it as the innermost wrapper, so that other wrappers see one environment. It needs the memory of two instances. A
     reset overlaps with steps if either of them waits or releases Python's global interpreter lock, as most simulators do.
 
-    Both are made with the same arguments. For a port or a folder, let the constructor ask `millrace.env_copy()`: the second
-    instance has its own slot.
+    Both instances are made with the same arguments. If the constructor needs a port or a folder, let it call
+    `millrace.env_copy()`: the second instance has its own slot.
 
-    Attributes that a run sets in its environment reach both instances, but the next episode may already have been reset.
+    Attributes that a run sets on its environment are set on both instances, but by then the next episode's reset may already
+    be done.
 
     >>> import gymnasium, millrace
     >>> env = millrace.ResetAhead(gymnasium.make("CartPole-v1"))
@@ -41,7 +42,9 @@ class ResetAhead(gymnasium.Wrapper[Any, Any, Any, Any]):
     """
 
     def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
-        """Raises `UsageError` unless `gymnasium.make` made the environment: otherwise no second instance can be made."""
+        """Wrap an environment. Raises `UsageError` unless `gymnasium.make` made it, because the second instance is made in
+        the same way.
+        """
         super().__init__(env)
         if env.spec is None:
             raise UsageError(
@@ -50,11 +53,11 @@ class ResetAhead(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._spec = env.spec
         self._copy = being_made() or FIRST_COPY
         self._second: gymnasium.Env[Any, Any] | None = None
-        self._second_seed: int | None = None  # of the second instance's next reset
+        self._second_seed: int | None = None  # seed for the second instance's next reset
         self._prepared: Future[Prepared] | None = None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """See `gymnasium.Env.reset`. Raises what the prepared reset raised."""
+        """See `gymnasium.Env.reset`. If the prepared reset has raised, raises its exception."""
         if seed is not None or options is not None:
             self._finish()
             self._second_seed = None if seed is None else env_seed(seed, Purpose.SECOND_INSTANCE)
@@ -74,7 +77,7 @@ class ResetAhead(gymnasium.Wrapper[Any, Any, Any, Any]):
         return make_copy(self._copy, lambda: gymnasium.make(self._spec))
 
     def _prepare(self, instance: gymnasium.Env[Any, Any] | None) -> None:
-        """Reset the second instance in a thread; make it first if there is none."""
+        """Reset the second instance in a thread. If it is None, make it first."""
         prepared: Future[Prepared] = Future()
         seed = self._second_seed
         self._second_seed = None
@@ -91,16 +94,16 @@ class ResetAhead(gymnasium.Wrapper[Any, Any, Any, Any]):
         threading.Thread(target=prepare, name="reset-ahead", daemon=True).start()
 
     def instances(self) -> tuple[gymnasium.Env[Any, Any], gymnasium.Env[Any, Any]]:
-        """The instance that plays, and the other one, which is not being reset now."""
+        """The instance that plays, and the other one. Waits until the latter's reset, if any, is finished."""
         if self._prepared is not None:
-            with suppress(BaseException):  # the next `reset` raises it
+            with suppress(BaseException):  # the next call of `reset` raises it
                 self._prepared.result()
         if self._second is None:
             self._second = self._make()
         return self.env, self._second
 
     def _finish(self) -> None:
-        """Wait until the reset in progress has ended. Its episode will not be played."""
+        """Wait until the reset in progress, if any, is finished, and discard its result."""
         prepared = self._prepared
         self._prepared = None
         if prepared is not None:
@@ -116,5 +119,5 @@ class ResetAhead(gymnasium.Wrapper[Any, Any, Any, Any]):
         try:
             super().close()
         finally:
-            give_back(self.env)  # the two have taken turns
+            give_back(self.env)  # both, because they have taken turns
             give_back(self._second)

@@ -1,10 +1,10 @@
 """Writes what N env copies returned into arrays, and refuses values that an array would silently change (`CopyFailed`).
 
 numpy's assignment broadcasts an observation of another shape, reads None as NaN and text as a number, and truncates
-fractions in a space of integers. Here every observation must have the shape of its space, and its dtype is cast only within
-its kind; integers keep their value. This is checked at every step, in calls that treat all copies at once; the loop over the
-copies runs only to find which of them is wrong. Rewards and flags are converted by numpy's assignment: None becomes NaN,
-which the check of a rollout's values refuses.
+fractions in a space of integers. Here, every observation must have the shape of its space. Its dtype may be cast only within
+the same kind, and integers must keep their values. This is checked at every step, by calls that handle all copies at once;
+the loop over the copies runs only to find out which of them is wrong. Rewards and flags are converted by numpy's assignment:
+None becomes NaN, which is refused when the values of the rollout are checked.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from millrace.protocol.specs import Leaf
 from millrace.workers.copies.env_errors import CopyFailed
 
 Numbers = tuple[Any, Any, Any]
-"""Reward, terminated and truncated of N copies: each an array or a sequence."""
+"""Reward, terminated and truncated of N copies, each as an array or a sequence."""
 
 
 class LeafWriter:
@@ -34,10 +34,10 @@ class LeafWriter:
         self._dtype = np.dtype(leaf.dtype)
         self._is_whole = self._dtype.kind in "iu"
         self._shape = (copies, *leaf.shape)
-        # Observations of one dimension or more are joined along their first one, which is the fastest way.
+        # The fastest way to write observations with at least one dimension is to join them along the first.
         self._lengths = [leaf.shape[0]] * copies if leaf.shape else None
         self._joined_shape = (copies * leaf.shape[0], *leaf.shape[1:]) if leaf.shape else (copies,)
-        # "same_kind" is the default, and passing it explicitly would cost a tenth of the time.
+        # "same_kind" is the default, and passing it explicitly would add about a tenth to the time of the call.
         self._join: Callable[..., Any] = partial(np.concatenate, casting="safe") if self._is_whole else np.concatenate
 
     def joined(self, array: Array) -> Array:
@@ -45,9 +45,9 @@ class LeafWriter:
         return array.reshape(array.shape[: array.ndim - len(self._shape)] + self._joined_shape)
 
     def write(self, joined: Array, values: Any) -> None:
-        """Write into one row of a `joined` array. `values`: an array [N, *leaf], or N observations in order.
+        """Write `values`, an array [N, *leaf] or N observations in order, into one row of a `joined` array.
 
-        If it raises `CopyFailed`, some copies may already be written.
+        Raises `CopyFailed` for an observation that doesn't fit; some of the others may have been written by then.
         """
         try:
             if self._lengths is not None and isinstance(values, (list, tuple)):
@@ -59,7 +59,7 @@ class LeafWriter:
                 if array.shape == self._shape and (array.dtype == self._dtype or self._keeps_values(array)):
                     joined[...] = array.reshape(self._joined_shape)
                     return
-        except Exception:  # the loop below finds what is wrong, if anything is: a user-defined object may raise anything
+        except Exception:  # user-defined objects may raise anything; the loop below finds what is wrong, if anything is
             pass
         row = joined.reshape(self._shape)
         if len(values) != len(row):
@@ -68,12 +68,12 @@ class LeafWriter:
             self.write_one(row, n, value)
 
     def write_one(self, row: Array, n: int, value: Any) -> None:
-        """Write the observation of copy `n` into `row` [N, *leaf]. Raises `CopyFailed`."""
+        """Write the observation of copy `n` into `row` [N, *leaf]. Raises `CopyFailed` if it doesn't fit."""
         try:
             array = np.asarray(value)
-        except ValueError:  # rows of different lengths
+        except ValueError:  # nested lists of different lengths
             array = np.asarray(None)
-        except Exception as error:  # such as a tensor of PyTorch that requires a gradient
+        except Exception as error:  # for example, for a PyTorch tensor that requires a gradient
             got = f"a {type(value).__name__} that numpy cannot read: {first_line(error)}"
             raise CopyFailed(n, line=f"{self._leaf.name}: expected an array, got {got}") from error
         if array.shape != self._leaf.shape or not self._keeps_values(array):
@@ -81,7 +81,7 @@ class LeafWriter:
         row[n] = array
 
     def _keeps_values(self, array: Array) -> bool:
-        """Whether a cast to the leaf's dtype keeps the kind, and the value of each integer."""
+        """Whether a cast to the leaf's dtype keeps the kind of number, and the value of each integer."""
         if array.dtype == self._dtype:
             return True
         if self._is_whole:
@@ -97,10 +97,12 @@ class LeafWriter:
 
 
 class ObservationWriter:
-    """Writes the observations of N columns, which have these leaves. Each method raises `CopyFailed`."""
+    """Writes the observations of N columns, which have these leaves. Each method raises `CopyFailed` for a value that
+    doesn't fit.
+    """
 
     def __init__(self, leaves: Iterable[Leaf], columns: int, seats: Sequence[str] = ()) -> None:
-        """`seats`: names of the seats of a copy, for errors; none: a column is a copy."""
+        """`seats` are the names of a copy's seats, for errors. If there are none, each column is a copy."""
         self._writers = [LeafWriter(leaf, columns) for leaf in leaves]
         self._seats = seats
 
@@ -117,7 +119,7 @@ class ObservationWriter:
                 raise of_seat(error, self._seats) from error
 
     def write_some(self, arrays: Iterable[Array], columns: Sequence[int], leaves: Iterable[Any]) -> None:
-        """Write the observations of these columns into arrays [N, *leaf]. `leaves`: values, indexed by column."""
+        """Write the observations of these columns into arrays [N, *leaf]. The values in `leaves` are indexed by column."""
         for writer, array, values in zip(self._writers, arrays, leaves, strict=True):
             for n in columns:
                 try:
@@ -127,7 +129,7 @@ class ObservationWriter:
 
 
 def of_seat(error: CopyFailed, seats: Sequence[str]) -> CopyFailed:
-    """The error of a column, which names its copy and its seat."""
+    """The error of a column as an error that names the copy and the seat. Without seats, it is returned as it is."""
     if not seats or error.copy is None:
         return error
     copy, seat = divmod(error.copy, len(seats))
@@ -137,7 +139,10 @@ def of_seat(error: CopyFailed, seats: Sequence[str]) -> CopyFailed:
 def read_leaves(
     read: Callable[[Any], tuple[Any, ...]], observations: Sequence[Any], seats: Sequence[str] = ()
 ) -> tuple[Sequence[Any], ...]:
-    """For each leaf of a Dict or Tuple observation, the values of N columns. Raises `CopyFailed` where a leaf is missing."""
+    """Split the Dict or Tuple observations of N columns into leaves: for each leaf, returns its N values.
+
+    Raises `CopyFailed` if a leaf is missing.
+    """
     try:
         return tuple(zip(*map(read, observations), strict=True))
     except (LookupError, TypeError):
@@ -162,25 +167,26 @@ def missing_leaf(n: int | None, observation: Any, error: Exception) -> CopyFaile
 def write_numbers(arrays: Numbers, row: int | slice, values: Numbers) -> None:
     """Write reward, terminated and truncated of N copies into this row of three arrays: `array[row]` has the shape [N].
 
-    An array of one element counts as a number, as in gymnasium. Raises `CopyFailed`, which names the copy.
+    As in gymnasium, an array with one element counts as a number. Raises `CopyFailed`, which names the copy, for anything
+    else that isn't a number.
     """
     reward, terminated, truncated = arrays
     try:
         reward[row], terminated[row], truncated[row] = values
-    except Exception:  # the loop finds what is wrong: an int may be too large, and a user-defined object may raise anything
+    except Exception:  # user-defined objects may raise anything, and an int may be too large; the loop finds what is wrong
         for name, array, of_copies in zip(("reward", "terminated", "truncated"), arrays, values, strict=True):
             for n, value in enumerate(of_copies):
                 array[row][n] = one_number(name, n, value)
 
 
 def one_number(name: str, n: int, value: Any) -> Any:
-    """Reward, terminated or truncated (`name`) of copy `n`, as a number.
+    """The reward, terminated or truncated (`name`) that copy `n` returned, as a number.
 
-    Raises `CopyFailed`, with advice if it is a vector.
+    Raises `CopyFailed` if it isn't one; for a vector of rewards, the error gives advice.
     """
     try:
         array = np.asarray(value)
-    except Exception:  # rows of different lengths, or a user-defined object
+    except Exception:  # nested lists of different lengths, or a user-defined object
         array = np.asarray(None)
     if array.size == 1 and array.dtype.kind in "biuf":
         return array.item()

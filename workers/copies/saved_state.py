@@ -1,8 +1,9 @@
-"""Environments that can save their state: `save_state() -> bytes` and `load_state(bytes)`, of the environment or a wrapper.
+"""Environments that can save their state, with methods `save_state() -> bytes` and `load_state(bytes)`.
 
-Rule: wrappers outside of the object that saves must be stateless, or have a state that is known here: `TimeLimit` counts
-steps. With any other wrapper outside, the environment counts as one that cannot save. The state of `np_random` is kept in
-addition to the saved state. Nothing is unpickled here; what `load_state` does with its bytes is up to the environment.
+Rule: the environment or one of its wrappers may have these methods. Wrappers outside of it must be stateless, or have a
+state that is known here: `TimeLimit` counts steps. With any other wrapper outside, the environment counts as one that cannot
+save. The state of `np_random` is kept in addition to the saved state. Nothing is unpickled here; what `load_state` does with
+its bytes is up to the environment.
 """
 
 from __future__ import annotations
@@ -25,18 +26,18 @@ from millrace.protocol.bounds import MAX_SAVED_BYTES
 from millrace.workers.copies.random_state import pack, repeatable, set_state, state_of
 
 WITHOUT_STATE = (ClipAction, FlattenObservation, OrderEnforcing, PassiveEnvChecker, RescaleAction)
-"""Wrappers without state of an episode, by their exact types."""
+"""Wrappers that keep no state during an episode. Types are compared exactly, because a subclass may keep one."""
 
 
 class SavedCopy(msgspec.Struct, frozen=True, array_like=True):
     """The state of one env copy."""
 
     state: bytes
-    """the bytes that its environment saved"""
+    """the bytes that the environment saved"""
     random: bytes | None
-    """state of its `np_random`; None if that cannot be read"""
+    """state of the environment's `np_random`; None if it cannot be read"""
     elapsed: tuple[int, ...]
-    """steps that each `TimeLimit` outside has counted, the outermost first"""
+    """number of steps that each `TimeLimit` outside has counted, the outermost first"""
 
 
 class CannotSave(Exception):
@@ -55,7 +56,9 @@ def saver(env: gymnasium.Env[Any, Any]) -> Any | None:
 
 
 def save(env: gymnasium.Env[Any, Any]) -> SavedCopy:
-    """The state of an environment that can save it. Raises what its code raises, and `CannotSave`."""
+    """Save the state of an environment that can do so. Raises whatever its code raises, and `CannotSave` if the state isn't
+    bytes, or has too many.
+    """
     outermost = _saver(env)
     state = outermost.save_state()
     if not isinstance(state, bytes | bytearray | memoryview):
@@ -68,7 +71,7 @@ def save(env: gymnasium.Env[Any, Any]) -> SavedCopy:
 
 
 def load(env: gymnasium.Env[Any, Any], saved: SavedCopy) -> None:
-    """Load this state into an environment that was reset. Raises what its code raises."""
+    """Load this state into an environment that has been reset. Raises whatever the environment's code raises."""
     outermost = _saver(env)
     outermost.load_state(saved.state)
     if saved.random is not None:
@@ -78,12 +81,12 @@ def load(env: gymnasium.Env[Any, Any], saved: SavedCopy) -> None:
 
 
 def packed(states: list[SavedCopy]) -> bytes:
-    """The states of several copies as bytes."""
+    """Encode the states of several copies as bytes."""
     return msgspec.msgpack.encode(states)
 
 
 def unpacked(data: Bytes) -> list[SavedCopy]:
-    """The states of several copies, from bytes. Raises `msgspec.ValidationError` or `msgspec.DecodeError`."""
+    """Decode the states of several copies. Raises `msgspec.ValidationError` or `msgspec.DecodeError` if that fails."""
     return msgspec.msgpack.decode(data.tobytes(), type=list[SavedCopy])
 
 

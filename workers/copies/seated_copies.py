@@ -1,7 +1,7 @@
-"""A loop over N env copies with A seats each: N · A columns, those of a copy side by side.
+"""A loop over N env copies with A seats each. They have N · A columns, where those of a copy are adjacent.
 
-Rule: a column shows the mask of the last observation of its episode in which its seat acts; until there is one, all actions
-are allowed.
+Rule: the mask of a column is that of the last observation in the episode in which its seat acts. Until there is one, all
+actions are allowed.
 """
 
 from __future__ import annotations
@@ -38,17 +38,19 @@ class SeatedCopies(LoopedCopies):
         first: EnvCopy = FIRST_COPY,
         restart_episodes: int = 0,
     ) -> None:
-        """`seats`: the names of the A agents. `facts`: without the returns of seats. For the rest, see `LoopedCopies`."""
+        """`seats` are the names of the A agents. `facts` don't include the returns of seats. For the others, see
+        `LoopedCopies`.
+        """
         super().__init__(
             makes, pulse, facts, masked=masked, critic_keys=critic_keys, first=first, restart_episodes=restart_episodes
         )
         self._names = seats
         self._seats = len(seats)
-        self._allowed: list[Bools | None] = [None] * (self.count * len(seats))  # None: every action
+        self._allowed: list[Bools | None] = [None] * (self.count * len(seats))  # None: all actions are allowed
         self.columns: SeatColumns
 
     def reset(self, seeds: Sequence[int], pulse: Pulse) -> Leaves:
-        """Start episodes in all copies, or in the first ones, with a seed for each. `columns` says which seats act."""
+        """Begin episodes in all copies, or in the first ones, with a seed for each. `columns` then says which seats act."""
         copies = range(len(seeds))
         self._allowed = [None] * (self.count * self._seats)
         self._loop.reset(copies, seeds, self._observations, pulse)
@@ -59,11 +61,14 @@ class SeatedCopies(LoopedCopies):
         return self._result(copies).leaves
 
     def step(self, actions: Array, pulse: Pulse, copies: Sequence[int] | None = None) -> StepResult:
-        """Step with actions [N · A, *action], or only some copies with theirs. The result has a row for each column."""
+        """Step all copies with actions [N · A, *action], or only `copies`, with A actions for each.
+
+        The result has an entry for every column.
+        """
         of_copies = actions.reshape(-1, self._seats, *actions.shape[1:])
         stepped = range(self.count) if copies is None else copies
         loop = self._loop
-        self._forget_masks(n for n in stepped if loop.terminated[n] or loop.truncated[n])  # they are reset
+        self._forget_masks(n for n in stepped if loop.terminated[n] or loop.truncated[n])  # this step resets them
         loop.step(of_copies, self._observations, pulse, copies)
         return self._result(stepped)
 
@@ -77,9 +82,9 @@ class SeatedCopies(LoopedCopies):
             self._allowed[n * self._seats : (n + 1) * self._seats] = [None] * self._seats
 
     def _result(self, stepped: Sequence[int]) -> StepResult:
-        """The result of the last step of these copies.
+        """The result of a step of the copies `stepped`.
 
-        Others keep their last rows; copies that were never reset are left out.
+        The others keep their last rows; copies that were never reset are left out.
         """
         steps: list[SeatStep] = [step for step in self._observations if step is not None]
         columns = side_by_side(steps)
@@ -113,7 +118,7 @@ class SeatedCopies(LoopedCopies):
         return StepResult(leaves, columns.reward, columns.terminated, columns.truncated, facts=facts, columns=self.columns)
 
     def pending(self, copy: int) -> Array:
-        """[A] rewards of this copy's seats that no step has returned yet."""
+        """[A] rewards that this copy's seats have earned, and that no step has returned yet."""
         env = self.envs[copy]
         assert isinstance(env, SeatedEnv)
         return np.array(env.pending(), np.float64)

@@ -1,6 +1,6 @@
-"""The rows of the episodes of one evaluation, cut into messages of bounded size.
+"""Sends the rows of the episodes of one evaluation, in messages of bounded size.
 
-Rule: a message holds consecutive rows of one episode. It is sent when it has `CHUNK_BYTES`, and when the episode ends.
+Rule: a message contains consecutive rows of one episode. It is sent when it has `CHUNK_BYTES`, and when the episode ends.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ SendRows = Callable[[EpisodeRows], None]
 
 
 class RowsOfEpisode(NamedTuple):
-    """L consecutive rows of one episode. With seats, an observation and an action have an entry for each seat."""
+    """L consecutive rows of one episode. With seats, each observation and each action has an entry for each seat."""
 
     obs: tuple[Array, ...]
-    """[L, *leaf] each, the observation after each row"""
+    """[L, *leaf] each: the observations that follow the actions"""
     action: Array
     """[L, *action]"""
     reward: Array
@@ -40,10 +40,10 @@ class RowsOfEpisode(NamedTuple):
 
 
 class RowSender:
-    """Collects the rows of one episode and sends them."""
+    """Gathers the rows of one episode, and sends them."""
 
     def __init__(self, order: Evaluate, episode: int, send: SendRows) -> None:
-        """`episode` is the index of its seed."""
+        """`episode` is the index of the episode's seed in the order."""
         self.episode = episode
         self._order = order
         self._send = send
@@ -56,11 +56,13 @@ class RowSender:
 
     @property
     def wants_frame(self) -> bool:
-        """Whether the next observation should come with a frame."""
+        """Whether `show` should be called with the frame of the next observation, before that observation is added."""
         return self._order.send_frames and self._frames_so_far < MOST_FRAMES
 
     def show(self, frame: Array) -> None:
-        """Take the frame of the next observation. Raises `ValueError` if its size differs from the frame before."""
+        """Add the frame of the next observation. Raises `ValueError` if its size differs from that of the frame
+        before it.
+        """
         if self._frames and frame.shape != self._frames[-1].shape:
             before = list(self._frames[-1].shape)
             now = list(frame.shape)
@@ -70,12 +72,12 @@ class RowSender:
         self._bytes += frame.nbytes
 
     def begin(self, obs: Sequence[Array]) -> None:
-        """Take the first observation, whose arrays [1, *leaf] are copied."""
+        """Add the first observation of the episode. Its arrays [1, *leaf] are copied."""
         self._before = tuple(leaf.copy() for leaf in obs)
         self._bytes += sum(leaf.nbytes for leaf in obs)
 
     def add(self, rows: RowsOfEpisode) -> None:
-        """Add rows, which are copied. While frames are wanted, there is one row at a time."""
+        """Add rows, which are copied. While frames are wanted, add one row at a time."""
         was_last_frame = bool(self._frames) and self._frames_so_far == MOST_FRAMES
         ends = was_last_frame or bool(rows.terminated[-1] or rows.truncated[-1])
         L = len(rows.reward)
@@ -118,7 +120,7 @@ class RowSender:
 
 
 def as_frame(rendered: Any) -> Array:
-    """A copy of a rendered picture [H, W, 3] uint8. Raises `ValueError` for anything else."""
+    """A copy of a rendered frame [H, W, 3] uint8. Raises `ValueError` for anything else."""
     frame = np.asarray(rendered)
     if frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3 or not frame.size:
         raise ValueError(f"render: expected an array [H, W, 3] of uint8, got {frame.dtype}{list(frame.shape)}")

@@ -1,9 +1,9 @@
 """Plays the episodes of an Evaluate order. The result depends on the order and the weights, and on nothing else.
 
-Rule: an order has k seeds, and is played on one lane of k env copies. The policy always sees a batch [1, k · A, ...], where
-A is the number of seats of a copy: a copy whose episode has ended stays in the batch and is not stepped. Rows are played in
-small groups, and then checked and sent; one by one if the environment has to render between them. The copies are apart from
-the lanes of training. They are opened once, and reset with a seed before each episode.
+Rule: an order has k seeds, and is played on one lane of k env copies. The policy always gets a batch [1, k · A, ...], where
+A is the number of seats of a copy: a copy whose episode has ended stays in the batch, but is not stepped. Rows are played in
+small groups, each of which is then checked and sent; if the environment has to render, a group is a single row. The copies
+don't belong to the lanes of training. They are opened once, and reset with a seed before each episode.
 """
 
 from __future__ import annotations
@@ -40,20 +40,20 @@ from millrace.workers.lanes.running_episodes import EndedEpisode
 from millrace.workers.opponents import KnownOpponents, Match, OtherTeams
 
 ROWS_AT_ONCE = 16
-"""Rows played before a check: enough to amortize its cost, and few enough that wrong values are found soon."""
+"""Number of rows that are played before a check: enough to amortize its cost, and few enough to find wrong values early."""
 
 OpenEvaluationCopies = Callable[[RunSpec, int, str | None, Pulse], EvaluationCopies]
-"""Makes this number of copies, with this render mode."""
+"""Makes a number of copies of a run's environment, with a render mode."""
 
 
 def open_looped_copies(run: RunSpec, count: int, render_mode: str | None, pulse: Pulse) -> EvaluationCopies:
-    """Copies in this process. Raises `UsageError` if the environment does not render in this mode, `rgb_array`."""
+    """Make copies in this process. Raises `UsageError` if the environment does not render in this mode, `rgb_array`."""
     make = EnvMaker(run.env.for_evaluation(), render_mode)
     with warnings.catch_warnings():
         if render_mode is not None:
             warnings.simplefilter("ignore")  # gymnasium's warning about a render mode that is refused below
         copies = loop_over(run, make, count, EnvCopy(evaluation=True), pulse)
-    modes = (copies.envs[0].metadata or {}).get("render_modes", [])  # None in some environments of the old package gym
+    modes = (copies.envs[0].metadata or {}).get("render_modes", [])  # some environments of the old package gym have None
     if render_mode is not None and (copies.envs[0].render_mode != render_mode or render_mode not in modes):
         copies.close()
         raise UsageError(f"environment {run.env.id} cannot be filmed: expected it to render {render_mode}, got {modes}")
@@ -61,34 +61,34 @@ def open_looped_copies(run: RunSpec, count: int, render_mode: str | None, pulse:
 
 
 class Evaluator:
-    """Plays whole episodes. It opens env copies when they are first needed."""
+    """Plays whole episodes. Env copies are opened when they are first needed."""
 
     def __init__(
         self, run: RunSpec, policy: Policy | CalledPolicy, open_copies: OpenEvaluationCopies = open_looped_copies
     ) -> None:
-        """`policy` must hold the weights to evaluate when `play` is called."""
+        """Whenever `play` is called, `policy` must have the weights that are to be evaluated."""
         self.seconds = 0.0
         """seconds spent in `play`"""
         self._run = run
         self._runner = LaneRunner(run, policy)
         self._open_copies = open_copies
         self._opponents = KnownOpponents(run)
-        self._copies: dict[str | None, EvaluationCopies] = {}  # by render mode
-        self._ended_steps = 0  # env steps of rows that are complete or were dropped
+        self._copies: dict[str | None, EvaluationCopies] = {}  # keys are render modes
+        self._ended_steps = 0  # env steps of all rows except those in progress
         self._under_way: Rows | None = None
 
     @property
     def steps(self) -> int:
-        """Number of env steps made, including those of unfinished rows."""
+        """Number of env steps made, including those of rows in progress."""
         return self._ended_steps + (0 if self._under_way is None else self._under_way.env_steps())
 
     def play(  # rule EVALUATE
         self, order: Evaluate, send: SendRows, pulse: Pulse, held: Mapping[int, Weights] = MappingProxyType({})
     ) -> Evaluated:
-        """Play one episode for each seed. `send` gets the rows, if the order asks for them. `held`: weights of opponents.
+        """Play one episode for each seed. If the order asks for rows, they are passed to `send`.
 
-        `pulse` is called at every step and may raise. If it raises, or the environment does (`EnvironmentFailed`), all
-        copies are closed.
+        `held` has the weights of opponents, by version. `pulse` is called at every step and may raise. If it raises, or the
+        environment does (`EnvironmentFailed`), all copies are closed.
         """
         began_s = perf_counter()
         try:
@@ -107,7 +107,7 @@ class Evaluator:
             self._copies.popitem()[1].close()
 
     def _play(self, order: Evaluate, send: SendRows, pulse: Pulse, others: OtherTeams | None) -> Evaluated:
-        """Play an order. Raises `EpisodesLost`."""
+        """Play an order. Raises `EpisodesLost` if env copies were lost with their worker."""
         run = self._run
         k = len(order.seeds)
         copies = self._opened(k, "rgb_array" if order.send_frames else None, pulse)
@@ -142,7 +142,7 @@ class Evaluator:
         )
 
     def _fill(self, rows: Rows, actions: StepActions, pulse: Pulse) -> None:
-        """Fill these rows, and check them."""
+        """Play until these rows are full, and check them."""
         self._under_way = rows
         try:
             self._runner.run(rows, actions, pulse)
@@ -152,7 +152,7 @@ class Evaluator:
         self._runner.check(rows)
 
     def _other_teams(self, order: Evaluate, held: Mapping[int, Weights]) -> OtherTeams | None:
-        """The other teams, if the order names their players."""
+        """The teams that opponents play; None if the order names no opponents."""
         find = self._opponents.among(held)
         matches = [Match(team, find(number)) for team, number in zip(order.teams, order.opponents, strict=True)]
         if not matches:
@@ -162,7 +162,9 @@ class Evaluator:
         return others
 
     def _opened(self, count: int, render_mode: str | None, pulse: Pulse) -> EvaluationCopies:
-        """At least this number of copies. Raises `UsageError` if their spaces are not those of the run."""
+        """Open copies, `count` or more, with this render mode. Raises `UsageError` if their spaces are not
+        those of the run.
+        """
         copies = self._copies.get(render_mode)
         if copies is not None and copies.count >= count:
             return copies
@@ -173,7 +175,7 @@ class Evaluator:
         return copies
 
     def _show_frame(self, sender: RowSender, copies: EvaluationCopies) -> None:
-        """Let the sender have what its copy renders, if it wants that."""
+        """Pass the frame that the sender's copy renders to the sender, if it wants one."""
         if not sender.wants_frame:
             return
         n = sender.episode
@@ -183,9 +185,10 @@ class Evaluator:
             raise environment_failed(None, f"copy {n}, {error}") from error
 
     def _played(self, n: int, L: int, rows: RowsOfLane, chosen: Array, ended: EndedEpisode | None) -> RowsOfEpisode:
-        """The first L of these rows, of the episode of copy n. `chosen` [T, k · A, *action]: the actions of all copies.
+        """The first L of these rows for copy n.
 
-        `ended`: the episode, if it ended in the last of them.
+        `chosen` [T, k · A, *action] are the actions of all copies. `ended` is the copy's episode if it ended in the last of
+        these rows, else None.
         """
         cut = ended is not None and ended.cut
         if self._run.seats:
@@ -204,22 +207,22 @@ class Evaluator:
         )
 
     def _shown(self, n: int, rows: RowsOfLane, steps: slice) -> list[Array]:
-        """Copy n's observations of these steps, without the mask, and without what only the critic sees."""
+        """Copy n's observations in these steps, without the mask, and without arrays that only the critic sees."""
         return [self._of_copy(n, leaf[steps]) for leaf in rows.obs[: len(self._run.policy.observation)]]
 
     def _of_copy(self, n: int, columns: Array) -> Array:
-        """The part of an array [T, k · A, …] that belongs to copy n: an entry for each seat, or one entry without seats."""
+        """The part of an array [T, k · A, …] that belongs to copy n: [T, A, …] with seats, else [T, …]."""
         A = self._run.seats_of_copy
         return columns[:, n * A : (n + 1) * A] if self._run.seats else columns[:, n]
 
 
 class _PlayedActions:
-    """The actions of an evaluation. They are checked before an environment gets them."""
+    """Chooses the actions of an evaluation, and checks them before an environment gets them."""
 
     def __init__(self, run: RunSpec, acting: Acting, rows: Rows, stream: Stream, *, greedy: bool) -> None:
         action = run.policy.action
         self.chosen = np.empty((rows.steps, rows.of_lanes[0].lane.columns, *action.shape), action.stored_dtype)
-        """[T, k · A, *action] of these rows"""
+        """[T, k · A, *action] the actions of these rows"""
         self._run = run
         self._acting = acting
         self._rows = rows
@@ -230,7 +233,7 @@ class _PlayedActions:
     def act(self, t: int, obs: Sequence[Array], state: Floats) -> Array:
         """Choose the actions [1, k · A, *action]. Raises `EnvironmentFailed` if they are not finite.
 
-        The action of a copy whose episode has ended does not count.
+        Actions of copies whose episodes have ended aren't checked.
         """
         chosen = self._acting.choose(obs, state, self._stream, greedy=self._greedy)
         if chosen.dtype.kind == "f":
@@ -242,5 +245,5 @@ class _PlayedActions:
         return chosen[None].copy()
 
     def written(self, i: int) -> list[Array]:
-        """No arrays: nobody learns from these rows."""
+        """No arrays, because nothing is learned from these rows."""
         return []

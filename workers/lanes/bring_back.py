@@ -1,10 +1,10 @@
 """Brings a lane back: continues its episodes on new env copies, from the lane's past (`protocol/lane_past.py`).
 
 Rule: each episode begins as it did before, and its actions are replayed without the policy, row by row, in all copies
-together. Then the copies' observations, returns and lengths are compared with the past. If they differ, the environment does
-not repeat itself: the copy starts anew, with the next number. Replayed steps are calls of the environment, with its
-timeouts, but aren't counted as env steps. If an environment has saved its state, the state is loaded, and nothing is
-replayed.
+together. Then the copies' observations, returns and lengths are compared with the past. If they differ, the environment is
+not deterministic, and the copy begins a new episode, with the next start number. Replayed steps are calls of the environment
+with its usual timeouts, but aren't counted as env steps. If an environment has saved its state, the state is loaded instead,
+and nothing is replayed.
 """
 
 from __future__ import annotations
@@ -37,12 +37,11 @@ NOT_REPEATED = (
 def bring_back(
     run: RunSpec, lane: Lane, past: LanePast, attributes: bytes, pulse: Pulse, written: Sequence[Array] = ()
 ) -> str:
-    """Continue this past on a new lane, whose copies have not been reset yet.
+    """Continue a lane from its past on a new `Lane`, whose copies have not been reset yet.
 
-    At the end they have these `attributes`, packed.
-
-    `written`: with seats, arrays [T, N · A, …] as the policy writes them. The past of another lane is not continued. Returns
-    a line for the user; empty if there is nothing to say. Raises `EnvironmentFailed`.
+    At the end, the copies have these `attributes` (packed). With seats, `written` has arrays [T, N · A, …] of the shapes and
+    dtypes that the policy writes. A past that doesn't fit the lane is not continued; new episodes begin instead. Returns a
+    line for the user, or an empty string if there is nothing to report. Raises `EnvironmentFailed` if a copy raises.
     """
     copies = lane.copies
     continued: list[int] = []
@@ -75,9 +74,9 @@ class _Repeated:
         self, run: RunSpec, lane: Lane, copies: LoopedCopies, past: LanePast, continued: list[int], pulse: Pulse
     ) -> None:
         self.continued = continued
-        """the copies that have agreed with the past so far"""
+        """the copies that can still be continued, because they haven't differed from the past so far"""
         self.why = ""
-        """how a copy differed"""
+        """how the first copy that differed from the past did so; empty if none has"""
         self._run = run
         self._lane = lane
         lane.starts = [last.start for last in past.copies]
@@ -92,7 +91,7 @@ class _Repeated:
         self._numbers = (np.zeros(lane.columns), np.zeros(lane.columns, bool), np.zeros(lane.columns, bool))
 
     def repeat(self) -> None:
-        """Begin the episodes as they began, and replay their actions. Raises `CopyFailed`."""
+        """Begin the episodes as they began before, and replay their actions. Raises `CopyFailed` if a copy raises."""
         past = self._past
         attributes = {each.row: each.packed.tobytes() for each in past.attributes}
         taken = action_converter_of(self._run.policy)(past.action)
@@ -114,7 +113,7 @@ class _Repeated:
                 self._set_random(n)
 
     def load(self, states: list[SavedCopy]) -> None:
-        """Load the saved states. A copy whose episode is over is reset by the next step."""
+        """Load the saved states. If the episode of a copy is over, let the next step reset the copy."""
         for n in list(self.continued):
             if self._past.copies[n].saved:
                 why = self._copies.load(n, states[n]) if n < len(states) else "its state is damaged"
@@ -123,7 +122,7 @@ class _Repeated:
         self._copies.end([n for n in self.continued if self._past.copies[n].over])
 
     def compare(self) -> None:
-        """Compare the copies with the past, and give up those that differ."""
+        """Compare the copies with the past, and no longer continue those that differ from it."""
         past = self._past
         returns = past.memory[0][:, :-2]
         for n in list(self.continued):
@@ -133,11 +132,11 @@ class _Repeated:
             most = self._sizes[n] * np.finfo(np.float64).eps * (len(past.action) - self._first(n) + 1)
             if any((new[columns] != old[columns]).any() for new, old in zip(self._obs, past.obs, strict=True)):
                 self._differs(n, "it shows another observation")
-            elif not np.abs(self._returns[n] - returns[n]).max() <= most < np.inf:  # for another order of sums
+            elif not np.abs(self._returns[n] - returns[n]).max() <= most < np.inf:  # tolerates another order of summation
                 self._differs(n, "its rewards add up to another return")
 
     def start_others(self) -> None:
-        """Start each copy anew that isn't continued."""
+        """Begin a new episode in each copy that isn't continued, with its next start number."""
         lane = self._lane
         anew = [n for n in range(lane.count) if n not in self.continued]
         for n in anew:
@@ -146,7 +145,7 @@ class _Repeated:
         self._seed(anew)
 
     def hand_over(self) -> None:
-        """Give the lane its state after its last row, except for copies that have started anew."""
+        """Give the lane the state that it had after its last row, except for copies that aren't continued."""
         lane = self._lane
         past = self._past
         over = [n for n in self.continued if past.copies[n].over]
@@ -163,7 +162,7 @@ class _Repeated:
             lane.seats.acts = self._acts
 
     def _first(self, n: int) -> int:
-        """The row of the first action of the episode of copy n."""
+        """The row of the first action in the episode of copy n."""
         return self._past.copies[n].first
 
     def _begins_with_start(self, n: int) -> bool:
@@ -177,14 +176,14 @@ class _Repeated:
         return bool(last.random) and last.is_repeated
 
     def _seed(self, copies: list[int]) -> None:
-        """Start these copies, each with the seed of its start."""
+        """Reset these copies, each with the seed that its start number determines."""
         if copies:
             lane = self._lane
             assert lane.number is not None
             self._began(copies, [copy_seed(self._run.seed, lane.number, lane.starts[n], n) for n in copies])
 
     def _reset(self, copies: list[int]) -> None:
-        """Begin the next episodes of these copies, from the random states that they had then."""
+        """Begin the next episodes of these copies, from the random states that the copies had when these episodes began."""
         if able := [n for n in copies if self._set_random(n)]:
             self._began(able, [None] * len(able))
 
@@ -204,14 +203,14 @@ class _Repeated:
             self._count(copies, result.columns.outside)
 
     def _see(self, result: StepResult, copies: list[int]) -> None:
-        """Keep the observations of these copies."""
+        """Store the observations of these copies."""
         columns = columns_of(copies, self._seats)
         self._lane.writer.write_some(self._obs, columns, result.leaves)
         if result.columns is not None:
             self._acts[columns] = result.columns.acts[columns]
 
     def _step(self, taken: Array, copies: list[int]) -> StepResult:
-        """Step these copies, and count their rewards."""
+        """Step these copies, and add up their rewards. A copy whose episode ends is no longer continued."""
         self._pulse()
         result = self._copies.step(taken[columns_of(copies, self._seats)], self._pulse, copies)
         write_numbers(self._numbers, slice(None), (result.reward, result.terminated, result.truncated))
@@ -227,7 +226,7 @@ class _Repeated:
         return result
 
     def _count(self, copies: list[int], rewards: Doubles) -> None:
-        """Add the rewards [N · A] of these copies."""
+        """Add the rewards [N · A] of these copies to their returns."""
         by_copy = rewards.reshape(-1, self._seats)[copies]
         self._returns[copies] += by_copy
         self._sizes[copies] += np.abs(by_copy).sum(axis=1)
@@ -238,7 +237,7 @@ class _Repeated:
 
 
 def _states(blob: Array, lane: Lane) -> list[SavedCopy]:
-    """The states of all copies; none if they are damaged."""
+    """Decode the states of all copies. Returns an empty list if they are damaged."""
     try:
         states = unpacked(blob)
     except (msgspec.MsgspecError, ValueError):
@@ -247,7 +246,7 @@ def _states(blob: Array, lane: Lane) -> list[SavedCopy]:
 
 
 def _fits(past: LanePast, memory: Sequence[Array], lane: Lane, run: RunSpec, written: Sequence[Array]) -> bool:
-    """Whether the arrays fit this lane. They come from another worker, through the learner."""
+    """Whether the arrays fit this lane. They come from another worker, by way of the learner, and so may be wrong."""
     action = run.policy.action
     rows = past.action.shape[0] if past.action.ndim else 0
     expected: Iterable[tuple[Array, tuple[int, ...], str]] = [
@@ -258,7 +257,7 @@ def _fits(past: LanePast, memory: Sequence[Array], lane: Lane, run: RunSpec, wri
         ),
     ]
     shapes = all(array.shape == shape and array.dtype == dtype for array, shape, dtype in expected)
-    before = [1 if last.random and last.is_repeated else 0 for last in past.copies]  # rows that reset the copy
+    before = [1 if last.random and last.is_repeated else 0 for last in past.copies]  # the row of the reset
     firsts = all(least <= last.first <= rows for least, last in zip(before, past.copies, strict=True))
     counts = len(past.copies) == lane.count and len(past.obs) == len(stored_leaves(run))
     return shapes and firsts and counts and lane.can_recall(memory, written)

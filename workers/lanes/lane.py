@@ -1,8 +1,8 @@
 """A lane: N env copies that are stepped together, and all the state that one step passes on to the next.
 
 Rule: a lane's whole state is here: its copies and their attributes, the observations and the policy's state, which copies
-are playing, their running episodes, seats that wait, opponents, and how its newest episodes began. The code that steps lanes
-(`runner.py`) is stateless. `bring_back.py` gives a new lane the state of one that was lost.
+are playing, their running episodes, seats that wait, opponents, and how the newest episodes began. The code that steps lanes
+(`runner.py`) is stateless. `bring_back.py` gives a new lane the state of a lane that was lost.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from millrace.workers.opponents import Opponent, OtherTeams
 
 
 class Lane:
-    """N env copies. Each has A columns, one for each seat; A is 1 for a gymnasium environment."""
+    """N env copies that are stepped together. Each has A columns, one for each seat; A is 1 for a gymnasium environment."""
 
     def __init__(
         self,
@@ -47,10 +47,10 @@ class Lane:
         incarnation: int = 0,
         most_steps: int = LARGEST,
     ) -> None:
-        """`count`: N; the lane has the first N of the copies.
+        """Make a lane of the first `count` of these copies.
 
-        `number`: None if the lane plays an evaluation. Then no step resets a copy, and one whose episode is over is not
-        stepped. `most_steps`: an episode that reaches this number of steps is cut.
+        `number` is None if the lane plays an evaluation: then no step resets a copy, and a copy whose episode is over is not
+        stepped. An episode that reaches `most_steps` steps is cut.
         """
         self.number = number
         self.incarnation = incarnation
@@ -63,7 +63,7 @@ class Lane:
         self.new_starts: Sequence[int] = ()
         """the copies that have started since the last call of `begun`"""
         self.remembers = isinstance(copies, LoopedCopies) and not run.teams
-        """whether its episodes can be continued on other copies"""
+        """whether the lane's episodes can be continued on other copies"""
         self.columns = self.count * run.seats_of_copy
         """N · A"""
         leaves = stored_leaves(run)
@@ -72,19 +72,24 @@ class Lane:
         self.state = zero_state(run.policy, self.columns)
         """[N · A, S] recurrent state of the policy, with which the next rows begin"""
         self.playing = np.ones(self.count, bool)
-        """[N] whether the copy's episode continues: if not, the next step only resets the copy, or leaves it as it is"""
+        """[N] whether the copy's episode continues; if not, the next step only resets the copy, or, in an evaluation, does
+        nothing with it
+        """
         self.episodes = RunningEpisodes(run, self.count, number, most_steps)
         self.seats = Seats(run.policy, self.columns) if run.seats else None
         self.others: OtherTeams | None = None
-        """the players of the other teams, if the policy plays only one team"""
+        """the players of the other teams; None if the policy plays all seats"""
         self.opponent: Opponent | None = None
-        """the opponent in the episodes that begin from now on; None: as before"""
+        """the opponent in the episodes that begin from now on; None: the same as before"""
         self.writer = ObservationWriter(leaves, self.columns, run.seats)
         self._run = run
-        self._attributes = b""  # attributes that were set in the copies
+        self._attributes = b""  # the attributes that were set on the copies last, packed
 
     def set_attributes(self, packed: bytes, pulse: Pulse) -> None:
-        """Set these attributes in all copies, unless already set. Raises `EnvironmentFailed` if a copy lacks one."""
+        """Set these attributes, packed, on all copies, except those that have the same value already.
+
+        Raises `EnvironmentFailed` if a copy lacks one.
+        """
         if packed == self._attributes:
             return
         before, now = (unpack(each) if each else {} for each in (self._attributes, packed))
@@ -96,14 +101,16 @@ class Lane:
         self._attributes = packed
 
     def start(self, starts: list[int], pulse: Pulse) -> None:
-        """Start all copies, with these numbers of their starts. Raises `EnvironmentFailed`."""
+        """Begin the first episode of each copy, where `starts` [N] has the copies' start numbers. Raises
+        `EnvironmentFailed`.
+        """
         assert self.number is not None
         self.starts = starts
         self.new_starts = range(self.count)
         self.reset([copy_seed(self._run.seed, self.number, start, n) for n, start in enumerate(starts)], pulse)
 
     def reset(self, seeds: Sequence[int], pulse: Pulse) -> None:
-        """Begin the first episodes, with a seed for each copy. Raises `EnvironmentFailed`."""
+        """Begin the first episodes, with a seed for each copy. Raises `EnvironmentFailed` if a copy raises."""
         self.episodes.begin(perf_counter())
         with environment_failures(self.number, "first reset" if self.autoresets else "reset"):
             leaves = self.copies.reset(seeds, pulse)
@@ -115,18 +122,21 @@ class Lane:
             self.add_outside(first.outside[: self.columns], 0)
 
     def add_outside(self, rewards: Doubles, step: int) -> None:
-        """Add rewards [N · A] of this step that don't belong to any row to the returns. No later check sees them."""
-        if not np.abs(rewards).max() < LARGEST_REWARD:  # false for NaN too
+        """Add rewards [N · A] of this step that don't belong to any row to the returns.
+
+        They are checked here, because they aren't in the rows that are checked later.
+        """
+        if not np.abs(rewards).max() < LARGEST_REWARD:  # the comparison is False for NaN too
             check_rewards(self.number, rewards[None], self._run.row_axes, step)
         self.episodes.returns += rewards.reshape(self.episodes.returns.shape)
 
     @property
     def sent(self) -> slice | npt.NDArray[np.intp]:
-        """The columns whose rows are in a rollout."""
+        """The columns that are part of a rollout: all, or only those of the policy's team."""
         return slice(None) if self.others is None else np.flatnonzero(self.others.mine)
 
     def begun(self) -> tuple[EpisodeBegin, ...]:  # rule PAST
-        """How the newest episodes began, for copies with new episodes since the last call."""
+        """How the newest episode began in each copy that has begun one since the last call of this."""
         random: dict[int, bytes | None] = dict.fromkeys(self.new_starts, b"" if self.remembers else None)
         self.new_starts = ()
         if self.remembers and isinstance(self.copies, LoopedCopies):
@@ -136,14 +146,16 @@ class Lane:
         return tuple(EpisodeBegin(n, self.starts[n], state) for n, state in sorted(random.items()))
 
     def memory(self) -> tuple[Array, ...]:  # rule PAST
-        """The state that `recall` needs besides the observations, the actions, and how the episodes began."""
+        """The state that `recall` needs, in addition to the observations, the actions, and how the episodes began."""
         if not self.remembers:
             return ()
         state = (self.state,) if self.state.size else ()
         return (self.episodes.memory(perf_counter()), *state, *(() if self.seats is None else self.seats.memory()))
 
     def save(self) -> list[SavedCopy]:
-        """The state of each copy, if the environment can save it. Raises `EnvironmentFailed`."""
+        """The saved state of each copy; empty if the environment can't save it. Raises `EnvironmentFailed` if a
+        copy raises.
+        """
         copies = self.copies
         if not (self.remembers and isinstance(copies, LoopedCopies) and copies.saves):
             return []
@@ -156,7 +168,7 @@ class Lane:
             return []
 
     def can_recall(self, memory: Sequence[Array], written: Sequence[Array]) -> bool:
-        """Whether this memory fits this lane. `written`: see `bring_back`."""
+        """Whether this memory fits this lane. For `written`, see `bring_back`."""
         own = self.memory()
         rest = memory[len(own) :]
         held = written if self.seats is not None and rest else ()
@@ -166,7 +178,7 @@ class Lane:
         return self.episodes.can_recall(memory[0])
 
     def recall(self, memory: Sequence[Array], copies: Sequence[int]) -> None:
-        """Take over, for these copies, the `memory` of another lane. `can_recall` must be true."""
+        """For these copies, restore the state from the `memory` of another lane. `can_recall` must have returned True."""
         left = list(memory)
         columns = columns_of(copies, self.columns // self.count)
         self.episodes.recall(left.pop(0), copies, perf_counter())
@@ -176,5 +188,5 @@ class Lane:
             self.seats.recall(left, columns)
 
     def close(self) -> None:
-        """Close the copies. Raises nothing."""
+        """Close the copies. Never raises."""
         self.copies.close()

@@ -1,4 +1,4 @@
-"""The episodes that env copies are playing: the one place where rewards are summed and steps are counted.
+"""The episodes that env copies are playing. Only this file sums rewards and counts steps.
 
 Rule: the fields of `RunningEpisodes` are the whole state of an episode before it ends. Returns are summed in float64, before
 any reward is rounded.
@@ -21,40 +21,39 @@ from millrace.workers.copies.env_errors import environment_failed
 from millrace.workers.opponents import OtherTeams, whole_episode
 
 FactsOfRows = Mapping[tuple[int, int], tuple[float, ...]]
-"""By row and copy: the facts of the episode that ended there."""
+"""The facts of each ended episode. A key is the row and the copy in which the episode ended."""
 
 
 class EndedEpisode(NamedTuple):
-    """An episode, and how it was played."""
+    """An episode that has ended, the copy that played it, and whether it was cut."""
 
     copy: int
-    """number of the copy that played it"""
+    """number of the copy in its lane"""
     episode: Episode
     cut: bool = False
-    """whether it was cut here, at the limit of its steps"""
+    """whether the episode was cut because it reached the limit of steps"""
 
 
 class RunningEpisodes:
     """The returns and lengths so far of the running episodes of N copies, with A seats each."""
 
     def __init__(self, run: RunSpec, copies: int, lane: int | None, most_steps: int = LARGEST) -> None:
-        """`lane`: its number, for errors; None for an evaluation.
-
-        `most_steps`: an episode that reaches this number of steps is cut.
-        """
+        """`lane` is the lane's number for errors, or None for an evaluation. An episode that reaches `most_steps` is cut."""
         self.returns = np.zeros((copies, run.seats_of_copy))
         """[N, A] float64: the sum of each seat's rewards"""
         self.lengths = np.zeros(copies, np.int64)
-        """[N] steps"""
+        """[N] number of steps so far"""
         self.began_s = [0.0] * copies
-        """[N] when the copy's last episode ended, or its first reset began, by perf_counter"""
+        """[N] when each running episode began, in seconds of `perf_counter`: at the end of the copy's last episode, or when
+        its first reset began
+        """
         self.most_steps = most_steps
         self._run = run
         self._lane = lane
         self._no_facts = (math.nan,) * len(run.info_keys)
 
     def memory(self, now_s: float) -> Doubles:
-        """[N, A + 2]: the returns so far, the steps, and the seconds."""
+        """[N, A + 2] the returns, the number of steps, and the seconds of each running episode so far."""
         memory = np.empty((len(self.lengths), self.returns.shape[1] + 2))
         memory[:, :-2] = self.returns
         memory[:, -2] = self.lengths
@@ -62,40 +61,39 @@ class RunningEpisodes:
         return memory
 
     def can_recall(self, memory: Doubles) -> bool:
-        """Whether these numbers have the right shape and are possible returns and times."""
+        """Whether these numbers are possible returns, steps and times: finite, and with no negative time."""
         return bool(np.isfinite(memory).all() and (memory[:, -1] >= 0).all())
 
     def recall(self, memory: Doubles, copies: Sequence[int], now_s: float) -> None:
-        """Take over, for these copies, the `memory` of others."""
+        """For these copies, restore the state from the `memory` of another lane."""
         for n in copies:
             self.returns[n] = memory[n, :-2]
             self.lengths[n] = memory[n, -2]
             self.began_s[n] = now_s - float(memory[n, -1])
 
     def begin(self, now_s: float) -> None:
-        """Begin the first episodes of all copies, with a reset."""
+        """Record that the first episodes of all copies begin now, with a reset."""
         self.began_s = [now_s] * len(self.began_s)
 
     def add(self, rewards: Array, playing: Bools) -> None:  # rule EPISODES
-        """Add one step of these copies [N], with rewards [N, A], which are 0 for seats without one."""
+        """Add one step of the copies that are `playing` [N]. `rewards` [N, A] are 0 for seats without a reward."""
         self.returns += rewards
         self.lengths += playing
 
     # rule EPISODE_ORDER
     def add_rows(self, reward: Array, resets: Bools, step_end_s: Sequence[float], facts: FactsOfRows) -> list[EndedEpisode]:
-        """Add T steps of copies with one agent each.
+        """Add T steps of copies with one agent each. Returns the episodes that ended, ordered by step, then by copy.
 
-        Returns the episodes that ended, ordered by step, then by copy. Like `add` and `ended` for each row, but several
-        times faster, because it sums the rewards of a copy's rows before it adds them to the return. `reward` [T, N] is 0
-        where a row only resets. `resets` [T+1, N]: whether row t only resets the copy; the last row is of the next step.
-        `step_end_s` [T] is when each step ended. Episodes are not checked: if all these rewards are finite, a learner takes
-        them.
+        This does the same as `add` and `ended` for each row, but is several times faster, because it sums the rewards of a
+        copy's rows before it adds them to the return. `reward` [T, N] is 0 where a row only resets its copy. `resets`
+        [T+1, N] says whether row t only resets the copy; its last row belongs to the next step. `step_end_s` [T] is when
+        each step ended. Episodes are not checked: if all these rewards are finite, a learner accepts the episodes.
         """
-        rewards = reward.T.tolist()  # by copy
+        rewards = reward.T.tolist()  # [N][T]
         returns = self.returns[:, 0].tolist()
         lengths = self.lengths.tolist()
         began_s = self.began_s
-        # For each copy, the first row that is not yet added to its episode, and whether that row only resets the copy.
+        # For each copy, the first row that is not yet added to its episode, and whether this row only resets the copy.
         first = [0] * len(rewards)
         only_resets = resets[0].tolist()
         found = []
@@ -126,10 +124,11 @@ class RunningEpisodes:
     def ended(
         self, n: int, now_s: float, of_info: tuple[float, ...] | None, others: OtherTeams | None, *, cut: bool = False
     ) -> EndedEpisode:
-        """End the episode of copy n.
+        """End the episode of copy n, and return it.
 
-        `of_info`: facts that the environment reports, if any. `others`: the players of the other teams. Raises
-        `EnvironmentFailed` if no learner would accept it: its return includes rewards that are in no row.
+        `of_info` are the facts that the environment reports, if any. `others` are the players of the other teams. Raises
+        `EnvironmentFailed` if no learner would accept the episode: its return includes rewards that are in no row, and so
+        haven't been checked.
         """
         returns: list[float] = self.returns[n].tolist()
         seconds = now_s - self.began_s[n]

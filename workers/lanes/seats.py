@@ -1,8 +1,9 @@
 """The state of the seats of a lane's env copies from step to step: who acts, who waits, and the actions of those who wait.
 
-Rule: a seat's row is the one in which its outcome arrives (`millrace.protocol.envs.seats`). Until then each row repeats what
-was written when the seat acted: action, log-probability, and the state of the policy before it. So the row is complete
-wherever rollouts are cut, and a rollout may contain an action that older weights chose, with its log-probability under them.
+Rule: a seat's valid row is the one in which the outcome of its action arrives (`millrace.protocol.envs.seats`). Until then,
+each row repeats what was written when the seat acted: the action, its log-probability, and the state of the policy before
+it. So that row is complete, wherever one rollout ends and the next begins. A rollout may therefore contain an action that
+older weights chose, with its log-probability under those weights.
 """
 
 from __future__ import annotations
@@ -18,21 +19,21 @@ from millrace.workers.copies.env_copies import SeatColumns
 
 
 class Seats:
-    """The seats of N copies, N · A columns."""
+    """The seats of N copies, which are N · A columns."""
 
     def __init__(self, policy: PolicySpec, columns: int) -> None:
         self.acts: Bools = np.zeros(columns, bool)
         """[N · A] whether the next step takes the seat's action"""
-        self._waits = np.zeros(columns, bool)  # [N · A] whether it has acted, and its row is not complete
-        self._held: list[Array] = []  # what the policy wrote when each seat last acted
-        self._held_state = zero_state(policy, columns)  # [N · A, S] the policy's state before that
+        self._waits = np.zeros(columns, bool)  # [N · A] whether the seat has acted, and its row is not complete yet
+        self._held: list[Array] = []  # [N · A, …] each, what the policy wrote when each seat last acted
+        self._held_state = zero_state(policy, columns)  # [N · A, S] the policy's state before each seat last acted
 
     def memory(self) -> tuple[Array, ...]:
-        """The state that `recall` needs: who waits, the policy's states before they acted, and the rows written then."""
+        """The state that `recall` needs: which seats wait, the policy's states before they acted, and what it then wrote."""
         return (self._waits.copy(), self._held_state.copy(), *(held.copy() for held in self._held))
 
     def recall(self, memory: Sequence[Array], columns: Sequence[int]) -> None:
-        """Take over, for these columns, the `memory` of other seats."""
+        """For these columns, restore the state from the `memory` of another lane's seats."""
         waits, held_state, *held = memory
         self._waits[columns] = waits[columns]
         self._held_state[columns] = held_state[columns]
@@ -41,11 +42,18 @@ class Seats:
             mine[columns] = array[columns]
 
     def state_before(self, state: Floats) -> Floats:
-        """The state before the first of the next rows, if the policy is in this state [N · A, S] now."""
+        """The policy's state [N · A, S] to send with a rollout that begins now, given its current `state`.
+
+        For a seat that waits, it is the state before the seat acted.
+        """
         return np.where(self._waits[:, None], self._held_state, state)
 
     def acted(self, t: int, written: Sequence[Array], before: Floats, state: Floats) -> None:
-        """Take the policy's row t, written for all columns from the state `before`. Only some seats act."""
+        """Correct what the policy has written for all columns at step t, because only some seats act.
+
+        In row t of the arrays `written`, the entries of other seats are replaced by those of their last action, and `state`
+        is reset to `before` for these seats.
+        """
         if not self._held:
             self._held = [np.zeros_like(array[0]) for array in written]
         for array, held in zip(written, self._held, strict=True):
@@ -56,6 +64,6 @@ class Seats:
         self._waits |= self.acts
 
     def stepped(self, columns: SeatColumns) -> None:
-        """Take the result of a step."""
+        """Record the result of a step: which rows it completes, and which seats act next."""
         self._waits &= ~columns.complete
         self.acts = columns.acts

@@ -1,1 +1,3 @@
-"""The supervisor of the workers of one machine: it starts them, watches them, and tells the learner what they are doing."""
+"""The supervisor of the workers of one machine: it starts and watches them, and reports to the learner what
+they are doing.
+"""

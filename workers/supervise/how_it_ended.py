@@ -1,4 +1,4 @@
-"""How a worker ended. Plain data. How long a worker may take to leave: supervisor.py."""
+"""How a worker ended, as plain data. For how long a worker may take to leave, see supervisor.py."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ class Ending:
     code: int
     """Exit code; below 0 if a signal ended it."""
     reason: str
-    """One line."""
+    """How the worker ended, in one line."""
     on_purpose: bool = False
-    """The worker announced that it would leave with this code."""
+    """Whether the worker announced that it would leave with this code."""
     failed: bool = False
-    """The environment, the policy, or the worker is to blame: the worker ended neither on purpose nor before it ran their
-    code.
+    """Whether the environment, the policy, or the worker is to blame: it did not end on purpose, nor before it ran any of
+    their code.
     """
     of_policy: bool = False
-    """It failed in a call of the policy."""
+    """Whether it failed in a call of the policy."""
     hung: bool = False
-    """It was ended because a call of its environment, or of the policy, took too long."""
+    """Whether it was ended because a call of the environment, or of the policy, took too long."""
     worked: bool = False
-    """Calls of its environment have returned."""
+    """Whether any calls of the environment have returned."""
     last_lines: str | None = None
-    """The last lines of its output, if it failed before it had joined a run."""
+    """The last lines of the worker's output, if it ended before it had joined a run; else None."""

@@ -1,12 +1,12 @@
-"""Tells the learner, over the supervisor's own connection, which workers are alive, what they do, and how others ended.
+"""Reports to the learner, over the supervisor's own connection, which workers are alive, what they do, and how others ended.
 
-Rule: it says so about every second, and more often while a call of an environment takes long. An ended worker is named for a
-while, because a message may be lost: a failed one at once, one that left on purpose a moment later, so that its own last
-messages arrive first. Nothing is sent before a worker has joined, because the worker itself reports a wrong address or key.
-This file imports neither numpy nor gymnasium.
+Rule: a report is sent about every second, and more often while a call of an environment takes long. It names an ended worker
+for a while, because a message may be lost: a worker that failed is named immediately, one that left on purpose a moment
+later, so that its own last messages arrive first. Nothing is sent before a worker has joined, because the worker itself
+reports a wrong address or key. This file imports neither numpy nor gymnasium.
 
-If the workers share weights, the learner sends each version once, over this connection. It answers each message, so that
-both sides know what has arrived; and its answer says which learner the weights belong to, as a Welcome does on a worker's
+If the workers share weights, the learner sends each version once, over this connection. It answers each report, so that both
+sides know what has arrived. Its answer also says to which learner the weights belong, as a Welcome does on a worker's
 connection.
 """
 
@@ -32,30 +32,33 @@ from millrace.workers.shared_weights import SharedWeights
 
 log = logging.getLogger("millrace.worker")
 
-EVERY_S = 1.0
-EVERY_S_WHILE_SLOW = 0.4
-SLOW_S = 0.3  # for longer calls of an environment, the supervisor speaks for the worker, which can't send heartbeats
-ENDED_AFTER_S = 0.2
-ENDED_FOR_S = 5.0
+EVERY_S = 1.0  # interval between two reports
+EVERY_S_WHILE_SLOW = 0.4  # the interval while a call of an environment takes longer than `SLOW_S`
+SLOW_S = 0.3  # during a longer call, the worker can't send heartbeats, and the learner relies on these reports
+ENDED_AFTER_S = 0.2  # a worker that left on purpose is named this long after its end
+ENDED_FOR_S = 5.0  # a worker is named until this long after its end
 
 
 class AliveSender:
     """The supervisor's connection to the learner."""
 
     def __init__(self, address: str, token: Token | None, weights: SharedWeights | None = None) -> None:
-        """Connects at the first `send` with content. `weights`: shares received weights among the workers."""
+        """The connection is made when `send` has something to report for the first time.
+
+        If the workers share weights, `weights` distributes those that arrive.
+        """
         self._address = address
         self._token = token
         self._weights = weights
-        self._first_session = self._replies = 0  # from the learner's last answer
+        self._first_session = self._replies = 0  # values in the learner's last answer
         self._socket: zmq.Socket[bytes] | None = None
         self._due_s = 0.0
         self._ended: list[tuple[float, WorkerExit]] = []
-        self._reported: set[int] = set()  # nonces of the ended workers that the last message named
+        self._reported: set[int] = set()  # nonces of the ended workers that the last report named
         self._encoder = msgspec.msgpack.Encoder()
 
     def send(self, running: Sequence[WorkerActivity], ended: Sequence[WorkerExit], now: float) -> None:
-        """Send this, if it is due."""
+        """Report the running workers, and those that have ended since the last call, if a report is due at `now`."""
         self._ended += [(now, each) for each in ended]
         self._ended = [(at, each) for at, each in self._ended if now - at < ENDED_FOR_S]
         joined = [each for each in running if each.doing != "starting"]
@@ -91,7 +94,9 @@ class AliveSender:
             self._socket.close(linger=200)
 
     def _take(self, frames: Sequence[zmq.Frame]) -> bool:
-        """Handle a message. Returns whether it says that the run is over. An unreadable one is ignored."""
+        """Handle a message of the learner. Returns whether it says that the run is over. An unreadable message
+        is ignored.
+        """
         with suppress(*INVALID):
             match msgspec.msgpack.decode(frames[0].bytes):
                 case ["Drain", *_]:
@@ -121,7 +126,7 @@ class AliveSender:
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context.instance()
         dealer = context.socket(zmq.DEALER)
         set_options(dealer, self._address, self._token is not None)
-        dealer.sndhwm = 10  # only the newest message counts
+        dealer.sndhwm = 10  # a short queue, because only the newest report matters
         name = f"supervisor-{socket.gethostname()}-{os.getpid()}-{os.urandom(3).hex()}"[-MAX_NAME:]
         dealer.routing_id = routing_id(name, self._token)
         dealer.reconnect_ivl = RECONNECT_MS

@@ -1,7 +1,7 @@
-"""Keeps the log of a worker short while the worker, and what its environment starts, append to it.
+"""Keeps the log of a worker short while the worker, and processes that its environment starts, append to it.
 
-Rule: if a log grows beyond `MOST` bytes, whole lines at its beginning and end stay, and a line says that the text between
-them was removed. Programs that append don't notice: the file stays the same, and is open for appending.
+Rule: if a log grows beyond `MOST` bytes, whole lines at its beginning and its end are kept, and a line says that the text
+between them was removed. This doesn't disturb programs that append, because the file stays the same one.
 """
 
 from __future__ import annotations
@@ -9,16 +9,16 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-MOST = 16 << 20  # bytes
-BEGINNING = 1 << 20  # bytes that stay
-END = 4 << 20  # bytes that stay
+MOST = 16 << 20  # bytes of a log before it is shortened
+BEGINNING = 1 << 20  # bytes that are kept at the beginning
+END = 4 << 20  # bytes that are kept at the end
 GONE = b"[millrace: the log became too long, and the text here was removed]\n"
 
 
 def keep_short(log: Path, position: int) -> int:
-    """Shorten the log if it is too long.
+    """Shorten the log if it is too long. Returns the new offset of the text that was at `position`.
 
-    Returns the new offset of the text that was at `position`. Raises `OSError`. Text that is written meanwhile may be lost.
+    Text that other processes write at the same time may be lost. Raises `OSError` if the log can't be shortened.
     """
     if log.stat().st_size <= MOST:
         return position

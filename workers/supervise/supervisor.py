@@ -1,19 +1,21 @@
 """Starts, watches, restarts and stops the workers of this machine.
 
-All it knows of their conversation is when the run is over.
+The supervisor doesn't follow their conversation with the learner; it only learns when the run is over.
 
 Rule: a worker that left on purpose with exit code 0, was refused (2), found no learner (EXIT_NO_LEARNER) or cannot take part
-in this run (EXIT_UNSUITABLE) is not started again. Any other is restarted with backoff: the pause doubles with each death,
-and is reset once calls of the environment have returned, or a worker has run for `HEALTHY_S`. So a simulator that works and
-then dies is soon back; the learner counts its failures. A worker left on purpose only if it announced this: exit codes
-caused by an environment are failures. No worker outlives its supervisor.
+in this run (EXIT_UNSUITABLE) is not started again. Any other worker is restarted with backoff: the pause doubles with each
+death, and is reset once calls of the environment have returned, or the worker has run for `HEALTHY_S` seconds. So a
+simulator that works and then dies is restarted quickly; the learner counts its failures. A worker counts as having left on
+purpose only if it has announced this: an exit code that an environment causes is a failure. No worker outlives its
+supervisor.
 
-A worker that has never joined a run, and has ended soon after its start `MOST_FAILED_STARTS` times in a row, is not started
-again: its problem, such as a broken installation, won't go away by itself.
+A worker that has never joined a run, and has ended early `MOST_FAILED_STARTS` times in a row, is not started again: its
+problem, such as a broken installation, won't go away by itself.
 
-With `stay`, only a refusal is final: each worker that has left a run is followed by a new one, which waits for the next.
+With `stay`, only a refusal is final: each worker that has left a run is replaced by a new one, which waits for the next run.
 
-All time limits of leaving, also those of the learner: docs/explanation/faults.md, "How long a worker may take to leave".
+All time limits for leaving, including those of the learner, are in docs/explanation/faults.md, "How long a worker may take
+to leave".
 """
 
 from __future__ import annotations
@@ -40,9 +42,9 @@ MOST_FAILED_STARTS = 4
 GIVEN_UP = f"; after {MOST_FAILED_STARTS} such ends it is not started again"
 POLL_S = 0.1
 ENFORCE_EVERY_S = 0.2
-STOP_WITHIN_S = 3.0  # after SIGTERM at the end of a run; then local workers are killed
-FINISH_ROLLOUT_WITHIN_S = 30.0  # after the request to leave, as long as calls of the environment return
-HANGS_AFTER_S = 8.0  # longest call of the environment after the request to leave, or the end of the run
+STOP_WITHIN_S = 3.0  # time for ending after SIGTERM at the end of a run, before local workers are killed
+FINISH_ROLLOUT_WITHIN_S = 30.0  # time for finishing a rollout after the request to leave, if calls of the environment return
+HANGS_AFTER_S = 8.0  # longest call of the environment once workers were asked to leave, or the run is over
 
 
 class Running(Protocol):
@@ -59,46 +61,46 @@ class Running(Protocol):
         ...
 
     def ended(self) -> Ending | None:
-        """How it ended, or None while it runs."""
+        """How the worker ended; None while it runs."""
         ...
 
     def activity(self, now: float) -> WorkerActivity | None:
-        """What it is doing. None if it has ended, or if its process is stopped."""
+        """What the worker is doing. None if it has ended, or if its process is stopped."""
         ...
 
     def last_line(self) -> str:
-        """The last line in its own log; empty if it has written nothing, or has no log."""
+        """The last line of the worker's own log; empty if it has written nothing, or has no log."""
         ...
 
     def end_if_hung(self, now: float) -> None:
-        """End it if a call of user code takes longer than its run allows."""
+        """End the worker if a call of user code takes longer than its run allows."""
         ...
 
     def lower_priority(self) -> None:
-        """Give it the lowest CPU priority, so that it uses only the CPU time that other processes leave.
+        """Give the worker the lowest CPU priority, so that it uses only CPU time that other processes leave unused.
 
-        A thread keeps its own.
+        A thread keeps its priority.
         """
         ...
 
     def stop(self) -> None:
-        """Ask it to leave."""
+        """Ask the worker to leave."""
         ...
 
     def wait(self, timeout_s: float) -> None:
-        """Wait until it has ended. A process that is still running after that is killed."""
+        """Wait until the worker has ended, at most `timeout_s` seconds. A process that still runs after that is killed."""
         ...
 
     def kill(self) -> None:
-        """End it at once. A thread cannot be killed, and is asked to leave at once."""
+        """End the worker immediately. A thread cannot be killed, so it is asked to leave immediately."""
         ...
 
 
 class LearnerNotice(Protocol):
-    """Tells the learner what the workers are doing."""
+    """Reports to the learner what the workers are doing."""
 
     def send(self, running: Sequence[WorkerActivity], ended: Sequence[WorkerExit], now: float) -> None:
-        """Say this, if it is time to."""
+        """Report the running workers, and those that have ended since the last call, if a report is due at `now`."""
         ...
 
     def listen(self, for_s: float) -> bool:
@@ -115,13 +117,13 @@ class _NamedWorker:
     started_s: float
     backoff_s: float = BACKOFF_FIRST_S
     restart_s: float | None = None
-    exit_code: int = 0  # of the last process that ended
-    has_joined: bool = False  # whether one of its processes has joined a run
-    failed_starts: int = 0  # in a row
+    exit_code: int = 0  # exit code of the last process that ended
+    has_joined: bool = False  # whether a process with this name has joined a run
+    failed_starts: int = 0  # number of failed starts in a row
 
 
 class Supervisor:
-    """N workers, w0 to wN-1."""
+    """Supervises N workers, which are called w0 to wN-1 unless there is another prefix."""
 
     def __init__(
         self,
@@ -132,9 +134,9 @@ class Supervisor:
         prefix: str = "w",
         stay: bool = False,
     ) -> None:
-        """`start` starts the worker with this name; names consist of `prefix` and a number.
+        """Start `count` workers, each by calling `start` with its name, which consists of `prefix` and a number.
 
-        `stay`: they serve one run after another.
+        With `stay`, they serve one run after another.
         """
         self._start = start
         self._clock = clock
@@ -151,7 +153,9 @@ class Supervisor:
             raise
 
     def poll(self) -> list[WorkerExit | StartFailed]:
-        """The workers that have ended since the last call. Ends those that hang, and starts those whose restart is due."""
+        """End workers that hang, restart those whose restart is due, and return those that have ended since the
+        last call.
+        """
         return [
             worker_exit if end.last_lines is None else StartFailed(worker_exit.worker, worker_exit.reason, end.last_lines)
             for worker_exit, end in self._ended()
@@ -179,7 +183,7 @@ class Supervisor:
     def _restart(self, worker: _NamedWorker, now: float) -> None:
         try:
             worker.running = self._start(worker.name)
-        except (OSError, UsageError) as error:  # the system currently lacks memory, processes or files
+        except (OSError, UsageError) as error:  # for example, the system lacks memory, processes or files now
             log.warning("worker %s cannot be started and will be tried again: %s", worker.name, error)
             self._schedule(worker, now)
             return
@@ -207,7 +211,7 @@ class Supervisor:
         worker.backoff_s = min(2 * worker.backoff_s, BACKOFF_MOST_S)
 
     def activities(self) -> list[WorkerActivity]:
-        """What each running worker is doing. A stopped process is left out."""
+        """What each running worker is doing. Processes that are stopped are left out."""
         now = self._clock()
         activities = (worker.running.activity(now) for worker in self._workers if worker.running is not None)
         return [activity for activity in activities if activity is not None]
@@ -219,44 +223,44 @@ class Supervisor:
 
     @property
     def names(self) -> list[str]:
-        """The names of the workers that run or will be restarted."""
+        """The names of the workers that are running or will be restarted."""
         restarts = not self._stopping
         return [each.name for each in self._workers if each.running is not None or (restarts and each.restart_s is not None)]
 
     @property
     def count(self) -> int:
-        """Number of workers that run or will be restarted."""
+        """The number of workers that are running or will be restarted."""
         return len(self.names)
 
     @property
     def exit_code(self) -> int:
-        """2 if a worker was refused, 1 if one failed, else 0."""
+        """2 if a worker was refused or could not take part, 1 if one failed or found no learner, else 0."""
         codes = {worker.exit_code for worker in self._workers}
         return 2 if codes & {EXIT_REFUSED, EXIT_UNSUITABLE} else 1 if codes - {0} else 0
 
     def ask_to_leave(self) -> None:
-        """Ask all workers to leave after the rollout in progress, or at once when asked again. Restart none."""
+        """Ask all workers to leave after the rollout in progress; if called again, immediately. No worker is restarted."""
         self._stopping = True
         for worker in self._workers:
             if worker.running is not None:
                 worker.running.stop()
 
     def lower_priority(self) -> None:
-        """Give all workers the lowest CPU priority, also those that will be started again."""
+        """Give all workers the lowest CPU priority, including those that will be restarted."""
         self._low_priority = True
         for worker in self._workers:
             if worker.running is not None:
                 worker.running.lower_priority()
 
     def kill(self, name: str) -> bool:
-        """End the worker of this name at once; False if no such worker runs here."""
+        """End the worker with this name immediately. Returns False if no such worker runs here."""
         running = [worker.running for worker in self._workers if worker.name == name and worker.running is not None]
         for process in running:
             process.kill()
         return bool(running)
 
     def stop(self, timeout_s: float = STOP_WITHIN_S) -> None:
-        """Ask all to leave, wait at most `timeout_s` for all together, and kill those still running."""
+        """Ask all workers to leave, wait for them at most `timeout_s` seconds in all, and kill those that still run."""
         self.ask_to_leave()
         deadline_s = self._clock() + timeout_s
         for worker in self._workers:
@@ -266,10 +270,11 @@ class Supervisor:
     def run(
         self, stop_requests: Callable[[], int], report: Callable[[str], None], notice: LearnerNotice | None = None
     ) -> int:
-        """Watch the workers until none is left. Returns the exit code. Each request to stop is passed on to all of them.
+        """Watch the workers until none is left. Returns the exit code.
 
-        After such a request, or once the run is over, no worker is restarted, and one whose environment hangs is killed.
-        With `stay`, a worker that hangs after the end of a run is killed, too.
+        Each request to stop is passed on to all workers. After the first one, or once the run is over, no worker is
+        restarted, and a worker whose environment hangs is killed. With `stay`, workers are restarted after the end of a run,
+        but one that hangs then is killed too. `report` gets a line about each worker that ends.
         """
         handled = 0
         leave_by_s = float("inf")
@@ -278,7 +283,7 @@ class Supervisor:
         while True:
             ended = self._ended()
             for each, end in ended:
-                if len(self._workers) > 1 or not end.on_purpose:  # a single worker has already said why it leaves
+                if len(self._workers) > 1 or not end.on_purpose:  # a single worker has said itself why it leaves
                     report(f"{each.worker} {each.reason}")
             if notice is not None:
                 notice.send(self.activities(), [each for each, _ in ended], self._clock())
@@ -296,7 +301,7 @@ class Supervisor:
                 leave_by_s = kill_hanging_from_s if self._stopping else leave_by_s
             if now > kill_hanging_from_s:
                 self._kill_hanging(HANGS_AFTER_S, now)
-                if not self._stopping:  # workers of the next run are younger than this
+                if not self._stopping:  # the remaining workers are those of the next run
                     kill_hanging_from_s = float("inf")
             if now > leave_by_s:
                 self.stop(0.0)
@@ -306,7 +311,7 @@ class Supervisor:
                 time.sleep(POLL_S)
 
     def _kill_hanging(self, longer_than_s: float, now: float) -> None:
-        """Kill the workers that have done one thing for too long."""
+        """Kill the workers whose current activity has lasted longer than this."""
         for worker in self._workers:
             doing = None if worker.running is None else worker.running.activity(now)
             if worker.running is not None and doing is not None and doing.for_s > longer_than_s:
@@ -314,5 +319,5 @@ class Supervisor:
 
 
 def core_flags(cores: Sequence[int], name: str) -> list[str]:
-    """Flags that pin workers w0, w1, … to these cores in turn. Empty if there are no cores."""
+    """The flags that pin worker `name`, one of w0, w1, …, to one of these cores. Empty if there are no cores."""
     return ["--core", str(cores[int(name.removeprefix("w")) % len(cores)])] if cores else []

@@ -1,9 +1,9 @@
 """A worker in its own process, which its supervisor starts, watches and ends.
 
-Rule: the worker has its own session. When the worker has ended, everything that its environment started in that session is
-killed; the slots of its env copies are free once all of these processes are gone, because this process holds them, too. If a
-call of user code takes longer than its run allows, the worker writes its stacks and is killed. A worker that leaves on
-purpose announces it: any other end is a failure, whatever the exit code.
+Rule: the worker has its own session. When the worker has ended, every process that its environment started in that session
+is killed. The slots of its env copies become free only when all of these processes are gone, because the supervisor holds
+the slots too. If a call of user code takes longer than its run allows, the worker writes its stacks and is killed. A worker
+that leaves on purpose announces it; any other end is a failure, whatever the exit code.
 """
 
 from __future__ import annotations
@@ -34,15 +34,15 @@ from millrace.workers.watchdog import deepest_frame, where_it_hung
 
 log = logging.getLogger("millrace.worker")
 
-popen = subprocess.Popen  # a separate name, so that a test may start workers in another way
+popen = subprocess.Popen  # a name of its own, so that a test can start workers in another way
 
 NONCE_VARIABLE = "MILLRACE_WORKER_NONCE"
-WRITE_STACKS_S = 0.3  # from the signal until the worker is killed
-CLOSE_ENVS_WITHIN_S = 5.0  # from a worker's notice that it leaves until it has closed its environments and ended
-KILLED_WITHIN_S = 5.0  # from SIGKILL until it is given up
+WRITE_STACKS_S = 0.3  # time for writing stacks, from the signal until the worker is killed
+CLOSE_ENVS_WITHIN_S = 5.0  # time for closing its environments and ending, once a worker has announced that it leaves
+KILLED_WITHIN_S = 5.0  # how long to wait for processes to end after SIGKILL
 POLL_S = 0.02
 LONGEST_OUTPUT = 1 << 20  # bytes that are read from the end of a log
-MOST_LAST_LINES = 12  # of the log, shown if a worker cannot start
+MOST_LAST_LINES = 12  # lines of the log that are shown if a worker cannot start
 MAX_LAST_TEXT = 2_000  # characters of these lines
 LOWEST_PRIORITY = 19  # niceness
 SINGLE_THREADED = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
@@ -55,16 +55,16 @@ class WorkerCommand:
     address: str
     name: str
     log: Path | None = None
-    """File for the worker's stderr. None: the supervisor's own stderr."""
+    """The file for the worker's output; None: it writes to the stdout and stderr of the supervisor."""
     token: Token | None = None
     flags: Sequence[str] = ()
-    """Further flags of `python -m millrace.workers`."""
+    """Additional flags for `python -m millrace.workers`."""
     handed: Sequence[int] = ()
-    """File descriptors that these flags name, which the worker inherits."""
+    """File descriptors that these flags name, and that the worker inherits."""
 
 
 class WorkerProcess:
-    """A worker in its own process."""
+    """A worker in its own process, as its supervisor sees it."""
 
     def __init__(self, start: WorkerCommand) -> None:
         self.name = start.name
@@ -72,18 +72,18 @@ class WorkerProcess:
         self.process_nonce = int.from_bytes(os.urandom(6), "little")
         self._slots = open_slots()
         self._page = ActivityReader()
-        self._because = ""  # why the supervisor ends it
+        self._because = ""  # why the supervisor ends the worker
         self._kill_at_s = float("inf")
         self._end: Ending | None = None
-        self._exit_code: int | None = None  # of the worker; processes that it started may not be gone yet
+        self._exit_code: int | None = None  # set when the worker has ended; processes that it started may still run
         self._give_up_at_s = float("inf")
-        self._was_reaped = False  # by the system, so that its exit code is not known
+        self._was_reaped = False  # whether the system has reaped the worker, so that its exit code is not known
         command = [sys.executable, "-P", "-m", "millrace.workers", start.address, "--name", start.name]
         command += ["--parent", str(os.getpid()), "--activity", str(self._page.fd)]
         command += ["--slots", str(self._slots), *start.flags]
-        # The child must find the modules that its parent found: a user's environment may lie beside the user's script.
+        # The child must find the modules that its parent found: a user's environment may be in the folder of their script.
         path = os.pathsep.join(entry or os.getcwd() for entry in [*sys.path, str(Path(__file__).parents[3])])
-        # A token that this program has not passed to the worker is not for this learner.
+        # The variable is removed: a token in it is not for this learner, or the worker would get it as `start.token`.
         environment = {name: value for name, value in os.environ.items() if name != TOKEN_VARIABLE}
         environment |= SINGLE_THREADED | {NONCE_VARIABLE: str(self.process_nonce), "PYTHONPATH": path}
         if start.token is not None:
@@ -107,11 +107,11 @@ class WorkerProcess:
 
     @property
     def pid(self) -> int:
-        """Process id."""
+        """The process id of the worker."""
         return self._process.pid
 
     def ended(self) -> Ending | None:
-        """How it ended, or None while it, or a process that it started, still runs."""
+        """How the worker ended; None while it, or a process that it started, still runs."""
         if self._runs():
             return None
         if self._end is None:
@@ -128,10 +128,11 @@ class WorkerProcess:
         return self._end
 
     def activity(self, now: float) -> WorkerActivity | None:
-        """What it is doing.
+        """What the worker is doing.
 
-        None if it has ended, or if it is stopped: then nobody speaks for it. While processes that it started still run, its
-        last activity is reported: if the learner considered it silent during that time, it would not count the failure.
+        None if it has ended. None if its process is stopped, so that the learner considers the worker silent. While
+        processes that it started still run, its last activity is reported: if the learner considered it silent during that
+        time, it would not count the failure.
         """
         if self.ended() is not None or _is_stopped(self.pid):
             return None
@@ -139,11 +140,13 @@ class WorkerProcess:
         return WorkerActivity(self.name, self.process_nonce, page.doing, page.for_s, page.env_calls)
 
     def last_line(self) -> str:
-        """The last line of its log that this process wrote; empty if there is none."""
+        """The last line that this process has written to its log; empty if there is none."""
         return one_line("".join(self._output().strip().splitlines()[-1:]))
 
     def end_if_hung(self, now: float) -> None:
-        """End it if a call of user code takes longer than its run allows, or if it announced its exit but doesn't end."""
+        """End the worker if a call of user code takes longer than its run allows, or if it has announced its exit but
+        doesn't end.
+        """
         if not self._runs():
             return
         touch(self._slots)
@@ -162,10 +165,10 @@ class WorkerProcess:
                     self._process.send_signal(STACK_SIGNAL)
 
     def lower_priority(self) -> None:
-        """Give its main thread, which steps the environments, the lowest CPU priority.
+        """Give the worker's main thread, which steps the environments, the lowest CPU priority.
 
-        With Linux's autogroup, niceness counts only within a session, and a worker has its own session. So the session gets
-        the niceness, too.
+        With Linux's autogroup, the niceness of a process matters only within its session, and a worker has its own session.
+        So the session gets the same niceness.
         """
         if self._runs():
             os.setpriority(os.PRIO_PROCESS, self.pid, LOWEST_PRIORITY)
@@ -173,12 +176,12 @@ class WorkerProcess:
                 Path(f"/proc/{self.pid}/autogroup").write_text(str(LOWEST_PRIORITY))
 
     def stop(self) -> None:
-        """SIGTERM: it finishes the rollout in progress, and leaves."""
+        """Send SIGTERM: the worker finishes the rollout in progress, and leaves."""
         if self._runs():
             self._process.terminate()
 
     def wait(self, timeout_s: float) -> None:
-        """Wait until it has ended; kill it if it is still running after that.
+        """Wait until the worker has ended, at most `timeout_s` seconds; kill it if it still runs after that.
 
         A process that survives even SIGKILL, because it waits for a device or a network file system, is left behind.
         """
@@ -196,14 +199,14 @@ class WorkerProcess:
         return True
 
     def kill(self) -> None:
-        """Send SIGKILL to its whole session, because it hangs."""
+        """Send SIGKILL to the worker's whole session."""
         if self._runs():
             self._kill_session()
 
     # ---------------------------------------------------------------- inside
 
     def _runs(self) -> bool:
-        """Whether the worker runs. When it has ended, its session is killed and it is reaped."""
+        """Whether the worker runs. If it has ended, its session is killed and the worker is reaped."""
         if self._exit_code is None and self._has_ended():
             self._kill_session()  # before the process is reaped: until then no other process can have its id
             self._exit_code = self._process.wait()
@@ -211,12 +214,12 @@ class WorkerProcess:
         return self._exit_code is None
 
     def _has_ended(self) -> bool:
-        """Whether it has ended. This doesn't reap it if the system can tell without."""
+        """Whether the worker has ended. If the system allows, this doesn't reap it."""
         if not hasattr(os, "waitid"):
             return self._process.poll() is not None
         try:
             return os.waitid(os.P_PID, self.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None
-        except ChildProcessError:  # it was reaped already, because this program ignores SIGCHLD
+        except ChildProcessError:  # the worker was reaped already, because this program ignores SIGCHLD
             self._was_reaped = True
             return True
 
@@ -226,7 +229,7 @@ class WorkerProcess:
         kill(live_members(self.pid))
 
     def _ending(self, code: int) -> Ending:
-        """How it ended. `code` is negative if a signal ended it."""
+        """How the worker ended. `code` is negative if a signal ended it."""
         page = self._page.read(time.monotonic())
         output = self._output()
         last = "".join(f" ({line})" for line in output.strip().splitlines()[-1:])
@@ -251,7 +254,7 @@ class WorkerProcess:
             line = f"ended{meanwhile}; its exit code is not known"
         else:
             line = f"ended with exit code {code}{meanwhile}{last if code else ''}"
-        # In `close`, an environment has finished its work: if the process ends there, that doesn't count as a failure.
+        # In `close`, an environment has done its work already. If the process ends there, that doesn't count as a failure.
         failed = page.doing != "closing" and (worked or page.doing not in OUR_CODE)
         of_policy = failed and page.doing in OF_POLICY
         last_lines = _end_of(output) if page.doing == "starting" else None
@@ -266,7 +269,7 @@ class WorkerProcess:
         )
 
     def _output(self) -> str:
-        """Its output in the log, only the end if it is long: a simulator may write without limit."""
+        """The worker's output in the log; only the end if it is long, because a simulator may write without limit."""
         with suppress(OSError):  # the log may have been deleted
             if self._log is not None:
                 with self._log.open("rb") as log:
@@ -280,7 +283,7 @@ class WorkerProcess:
                 self._log_from = keep_short(self._log, self._log_from)
 
     def _write(self, stacks: str) -> None:
-        """Write to the worker's stderr."""
+        """Write why the worker is ended, and its stacks, where the worker's output goes."""
         text = f"worker {self.name} {self._because}\n{stacks}"
         with suppress(OSError):
             if self._log is None:
@@ -291,17 +294,17 @@ class WorkerProcess:
 
 
 def _end_of(output: str) -> str:
-    """Its last lines."""
+    """The last lines of a worker's output."""
     return escaped("\n".join(output.strip().splitlines()[-MOST_LAST_LINES:]))[-MAX_LAST_TEXT:]
 
 
 def _signal_name(number: int) -> str:
-    """The name of a signal. Most real-time signals have none."""
+    """The name of a signal; its number if it has no name, as most real-time signals."""
     return signal.Signals(number).name if number in set(signal.Signals) else f"signal {number}"
 
 
 def _opened(log: Path | None) -> BinaryIO:
-    """The file for a worker's output. If the folder was deleted, it is made again; if that fails, output is dropped."""
+    """Open the file for a worker's output. If its folder was deleted, it is recreated; if that fails, output is dropped."""
     with suppress(OSError):
         if log is not None:
             log.parent.mkdir(parents=True, exist_ok=True)
@@ -310,5 +313,5 @@ def _opened(log: Path | None) -> BinaryIO:
 
 
 def _is_stopped(pid: int) -> bool:
-    """Whether the process is stopped by a signal or a debugger. False on a system without /proc."""
+    """Whether a signal or a debugger has stopped the process. False on a system without /proc."""
     return process_stat(pid)[:1] in (["T"], ["t"])

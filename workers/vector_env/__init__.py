@@ -1,1 +1,1 @@
-"""Stepping for a vector environment: env copies are stepped with the actions that the learner sends."""
+"""The worker's part of a vector environment: it steps env copies with the actions that the learner sends."""

@@ -1,8 +1,8 @@
-"""The env copies of one lane of a vector environment with seats: N · A rows, those of a copy side by side.
+"""The env copies of one lane of a vector environment with seats. They have N · A rows, where those of a copy are adjacent.
 
 Rule: rows are, bit for bit, those of a loop over the same copies (`millrace.protocol.envs.seats`). With SameStep, the step
-in which a copy's last agent leaves has its last rows, the first observations of its next episode, and infos with the final
-observations.
+in which a copy's last agent leaves returns the last rows of the episode, but with the first observations of the next
+episode; the final observations are in the infos.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from millrace.workers.vector_env.stepped_lane import SteppedLane
 
 
 class SeatedLane(SteppedLane):
-    """N env copies with A seats each."""
+    """N env copies with A seats each, which are stepped together."""
 
     def _of_each(self, actions: Sequence[Array]) -> Iterable[Any]:
         of_copies = [array.reshape(-1, len(self._seats), *array.shape[1:]) for array in actions]
@@ -43,8 +43,8 @@ class SeatedLane(SteppedLane):
         return [(row, dict(info)) for row, info in zip(numbers, newest.infos, strict=True) if info]
 
     def _newest(self, copies: Iterable[int], infos: CopyInfos) -> tuple[SeatStep, Sequence[Any]]:
-        """The newest step of these copies, and the observations to write."""
-        last = {n: info["final_obs"] for n, info in infos}  # final observations of copies that SameStep has reset
+        """The newest steps of these copies as one `SeatStep`, and the leaves to write for them."""
+        last = {n: info["final_obs"] for n, info in infos}  # last steps of copies that SameStep has reset
         steps: list[SeatStep] = [self._observations[n] for n in copies]
         newest = side_by_side(_reset(last[n], step) if n in last else step for n, step in zip(copies, steps, strict=True))
         seen = newest.observations
@@ -53,7 +53,7 @@ class SeatedLane(SteppedLane):
 
 
 def _reset(last: SeatStep, first: SeatStep) -> SeatStep:
-    """The last step of an episode, in which SameStep has reset its copy."""
+    """The result of a step that ended an episode (`last`), and in which SameStep then reset the copy (`first`)."""
     infos: list[Mapping[str, Any]] = [
         {"final_obs": seen, "final_info": info, **new}
         for seen, info, new in zip(last.observations, last.infos, first.infos, strict=True)

@@ -28,9 +28,9 @@ from millrace.workers.copy_slots import EnvMaker
 
 
 class ResultRows(NamedTuple):
-    """Arrays into which a lane writes the results of its copies: its own, or a part of shared memory."""
+    """The arrays into which a lane writes the results of its copies: arrays of its own, or parts of shared memory."""
 
-    obs: tuple[Array, ...]  # [N, *leaf] each; with seats, all of these have N · A rows
+    obs: tuple[Array, ...]  # [N, *leaf] each; with seats, all arrays here have N · A rows
     reward: Array  # [N] float64
     terminated: Array  # [N] bool
     truncated: Array  # [N] bool
@@ -47,15 +47,16 @@ class SteppedLane:
     """N env copies that are stepped together."""
 
     def __init__(self, spec: StepSpec, lane: int, incarnation: int, rows: ResultRows, pulse: Pulse) -> None:
-        """Make the copies, without a reset. Raises `UsageError` if their spaces are not the vector environment's."""
+        """Make the copies, without resetting them. Raises `UsageError` if their spaces are not the vector environment's."""
         self.incarnation = incarnation
         self.rows = rows
         self.executed = 0
-        """number of the newest order through shared memory that was executed"""
+        """number of the newest order in shared memory that was executed"""
         first = spec.first_copy(lane)
         self.count = spec.lanes[lane]
         makes = [EnvMaker(spec.envs[of], spec.render_mode) for of in spec.copies[first : first + self.count]]
-        # Copies of a later incarnation replace lost ones, whose episodes have ended: a step resets them unless `reset` did.
+        # Copies of a later incarnation replace lost ones, whose episodes count as ended. So a step resets the new copies,
+        # unless `reset` has done so before.
         which = _first_copy(spec, lane)
         check = partial(_checked, spec)
         self._loop = EnvLoop(makes, pulse, spec.autoreset, ended=incarnation > 0, first=which, dress=check)
@@ -66,22 +67,22 @@ class SteppedLane:
         self._nest = make_unflatten(action)
         self._nested_observations = _is_nested(observation)
         self._read = make_flatten(observation)
-        self._observations: list[Any] = [None] * self.count  # the last ones that the copies returned
+        self._observations: list[Any] = [None] * self.count  # the last observation that each copy returned
         self._seats = spec.seats
         self._writer = ObservationWriter(spec.leaves, len(rows.reward), spec.seats)
         self._joined = self._writer.joined(array[None] for array in rows.obs)
 
     # rules RESET_SOME, OPTIONS
     def reset(self, copies: Sequence[int], seeds: Sequence[int | None], options: Any, pulse: Pulse) -> CopyInfos:
-        """Start episodes in these copies, with a seed for each.
+        """Begin episodes in these copies, with a seed for each. Returns the infos by row.
 
-        `options`: a list with options for each copy, or options for all.
+        `options` is a list with options for each copy, or the same options for all.
         """
         each = options if isinstance(options, list) else [options] * len(copies)
         return self._write_some(copies, self._loop.reset(copies, seeds, self._observations, pulse, each))
 
     def step(self, actions: Sequence[Array], pulse: Pulse) -> CopyInfos:
-        """Step each copy with its row of the actions, which are [N, *leaf] for each leaf."""
+        """Step each copy with its row of the actions, which are [N, *leaf] for each leaf. Returns the infos by row."""
         step = self._loop.steps
         infos = self._loop.step(self._of_each(actions), self._observations, pulse)
         try:
@@ -115,7 +116,10 @@ class SteppedLane:
         write_numbers((rows.reward, rows.terminated, rows.truncated), of_all, (loop.reward, loop.terminated, loop.truncated))
 
     def call(self, copies: Sequence[int], name: str, args: Sequence[Any], kwargs: dict[str, Any]) -> list[Any]:
-        """The attribute of each of these copies, or its result if it can be called. Its exceptions are not caught."""
+        """For each of these copies, the attribute with this name, or, if it is callable, the result of calling it.
+
+        Exceptions of the environment are not caught.
+        """
         results = []
         for n in copies:
             attribute = self._loop.envs[n].get_wrapper_attr(name)
@@ -127,12 +131,12 @@ class SteppedLane:
         return [describe_env(self._loop.envs[n]) for n in copies]
 
     def assign(self, copies: Sequence[int], name: str, values: Sequence[Any]) -> None:
-        """Set the attribute of these copies to one value each."""
+        """Set the attribute with this name on these copies, to one of `values` on each."""
         for n, value in zip(copies, values, strict=True):
             self._loop.envs[n].set_wrapper_attr(name, value)
 
     def close(self) -> None:
-        """Close every copy. What a copy raises is ignored."""
+        """Close every copy. Exceptions of the copies are ignored."""
         self._loop.close()
 
 
@@ -144,7 +148,7 @@ def _first_copy(spec: StepSpec, lane: int) -> EnvCopy:
 
 
 def _checked(spec: StepSpec, env: gymnasium.Env[Any, Any], which: EnvCopy) -> gymnasium.Env[Any, Any]:
-    """A copy of the vector environment. Raises `UsageError` if its spaces differ."""
+    """Return the copy `env`. Raises `UsageError` if its spaces or agents differ from those of the vector environment."""
     copy = f"{'evaluation ' if which.evaluation else ''}copy {which.number}"
     try:
         fits = (leaves_with_own_dtype(env.observation_space), leaves_with_own_dtype(env.action_space)) == (

@@ -1,7 +1,7 @@
-"""A worker's part of a vector environment: it owns lanes of env copies and executes their orders, one at a time.
+"""A worker's part of a vector environment: it has lanes of env copies, and executes the orders for them, one at a time.
 
-Orders arrive as messages. Orders to step may arrive through shared memory instead, if this process inherited it; the results
-are then written there, too. Both ways step the same lanes. A lane whose copies can't be used any more is closed.
+Orders arrive as messages. If this process has inherited shared memory, orders to step may arrive there instead; the results
+are then written there too. Both kinds of orders step the same lanes. A lane whose copies can no longer be used is closed.
 """
 
 from __future__ import annotations
@@ -32,23 +32,23 @@ from millrace.workers.vector_env.stepped_lane import ResultRows, SteppedLane, ne
 
 
 class Stepper:
-    """Executes orders on lanes of env copies, which are made at their first order."""
+    """Executes orders on lanes of env copies. A lane is made when its first order arrives."""
 
     def __init__(
         self, spec: StepSpec, shared_memory: InheritedDescriptors | None = None, *, allow_private_names: bool = True
     ) -> None:
-        """`shared_memory`: file descriptors of shared memory and wake pipes, if this process inherited them.
+        """`shared_memory` has the file descriptors of shared memory and wake pipes, if this process inherited them.
 
-        `allow_private_names`: a Call may use names that begin with an underscore.
+        `allow_private_names` says whether a Call may use names that begin with an underscore.
         """
         self.steps = 0
-        """env steps made"""
+        """number of env steps made"""
         self.stages: Stages = {"open": 0.0, "step": 0.0}
-        """seconds spent making and resetting copies, and stepping them"""
+        """seconds spent making and resetting copies (`open`), and stepping them (`step`)"""
         self._spec = spec
         self._allow_private_names = allow_private_names
         self.lanes = OpenLanes[SteppedLane]()
-        """the lanes that have had an order, until they are closed"""
+        """the lanes that have been made and not been closed"""
         self._memory = None if shared_memory is None else SharedMemory(spec, shared_memory.memory)
         self._wake_in = None if shared_memory is None else WakePipe(read_fd=shared_memory.to_worker)
         self._wake_out = None if shared_memory is None else WakePipe(write_fd=shared_memory.to_learner)
@@ -57,7 +57,10 @@ class Stepper:
         self._spin_s = 0.0  # how long to spin before the next wait for the wake pipe
 
     def execute(self, order: Order, pulse: Pulse) -> Answer:  # rules ORDER_ANSWERED, ORDER_ONLY
-        """The answer to the order. Raises `EnvironmentFailed`, and what `pulse` raises; the lane is then closed."""
+        """Execute an order, and return the answer.
+
+        Raises `EnvironmentFailed` if the environment raises, and whatever `pulse` raises; the lane is then closed.
+        """
         try:
             with environment_failures(order.lane), self.lanes.in_use():
                 lane = self._lane_for(order.lane, order.incarnation, pulse)
@@ -76,10 +79,11 @@ class Stepper:
         return _stepped(order, lane.rows, pack_infos(infos))
 
     def serve_shared_memory(self, timeout_s: float, pulse: Pulse, session: int, send: Callable[[Stepped], None]) -> bool:
-        """Execute the orders in shared memory until `timeout_s` have passed; True if the wake pipe announced a message.
+        """Execute the orders in shared memory for `timeout_s` seconds. Returns True early if the wake pipe announces a
+        message.
 
-        Spinning is faster than a wait for the pipe. At most `cores - 1` workers spin, the first to finish. The last
-        does not spin, so its core is free for the learner when it wakes the learner.
+        Spinning is faster than waiting for the pipe. At most `cores - 1` workers spin: those that finish first. The last
+        worker does not spin, so that its core is free for the learner, which it wakes.
         """
         assert self._memory is not None
         assert self._wake_in is not None
@@ -120,7 +124,7 @@ class Stepper:
             self.lanes.close([number])
             raise environment_failed(number, error) from error
         if number not in self.lanes:
-            return True  # it was released meanwhile, and another worker may now have it
+            return True  # the lane was released in the meantime, and another worker may have it now
         if not memory.answer(number, order, infos):
             step = Step(session, -order, number, lane.incarnation, ())
             send(_stepped(step, lane.rows, infos))
@@ -137,14 +141,14 @@ class Stepper:
 
     def _step(self, lane: SteppedLane, actions: Iterable[Array], pulse: Pulse) -> CopyInfos:
         began = perf_counter()
-        # A copy of the actions, because an environment may keep its action, or change it.
+        # The actions are copied, because an environment may keep its action, or change it.
         infos = lane.step([array.copy() for array in actions], pulse)
         self.steps += lane.count
         self.stages["step"] += perf_counter() - began
         return infos
 
     def _lane_for(self, number: int, incarnation: int, pulse: Pulse) -> SteppedLane:
-        """The lane in this incarnation, which is made if it doesn't exist."""
+        """The lane in this incarnation. If it doesn't exist, it is made."""
         if (lane := self.lanes.here(number, incarnation)) is not None:
             return lane
         began = perf_counter()
@@ -163,7 +167,7 @@ class Stepper:
 
 
 def pack_infos(infos: CopyInfos) -> bytes:
-    """The infos as bytes; empty if there are none."""
+    """Pack the infos as bytes; empty if there are none. Values that aren't plain are replaced by their `repr`."""
     return pack(infos, use_repr=True) if infos else b""
 
 
@@ -172,7 +176,7 @@ def _array(data: bytes) -> npt.NDArray[np.uint8]:
 
 
 def _stepped(order: Reset | Step, rows: ResultRows, infos: bytes) -> Stepped:  # rule STEPPED_ARRAYS
-    """The answer, with its own copies of the arrays, because it may be sent again."""
+    """The answer to an order. Its arrays are copies, because it may have to be sent again later."""
     return Stepped(
         session=order.session,
         ticket=order.ticket,
@@ -187,7 +191,9 @@ def _stepped(order: Reset | Step, rows: ResultRows, infos: bytes) -> Stepped:  #
 
 
 def _private_name(order: Call, arguments: Any) -> str:
-    """The private name that a call uses: its own, or an argument of a gymnasium method. Empty if there is none."""
+    """The private name that a call uses: its own name, or an argument of one of gymnasium's methods. Empty if
+    there is none.
+    """
     names = [order.name]
     if order.name in ("get_wrapper_attr", "has_wrapper_attr", "set_wrapper_attr") and not order.assign:
         args, kwargs = arguments
@@ -196,7 +202,7 @@ def _private_name(order: Call, arguments: Any) -> str:
 
 
 def _call(order: Call, lane: SteppedLane, allow_private_names: bool) -> Returned:  # rule RETURNED
-    """The attribute's values or results. If it raises, the answer contains the exception."""
+    """Execute a call. The answer contains the results, or, if the call raises, the exception."""
     results: list[Any] = []
     error = detail = ""
     try:
