@@ -271,7 +271,7 @@ class Described(Message, frozen=True):
 
 
 class Evaluate(Message, frozen=True):
-    """Play one episode for each seed, each on a copy of its own, under weights of this version. Answered by `Evaluated`.
+    """Play one episode for each seed, on env copies of no lane, under weights of this version. Answered by `Evaluated`.
 
     (rule EVALUATE)
     """

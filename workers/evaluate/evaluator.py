@@ -162,8 +162,9 @@ class Evaluator:
         return others
 
     def _opened(self, count: int, render_mode: str | None, pulse: Pulse) -> EvaluationCopies:
-        """Open copies, `count` or more, with this render mode. Raises `UsageError` if their spaces are not
-        those of the run.
+        """At least `count` copies with this render mode, which are opened if necessary.
+
+        Raises `UsageError` if their spaces are not those of the run.
         """
         copies = self._copies.get(render_mode)
         if copies is not None and copies.count >= count:
