@@ -62,13 +62,13 @@ class AllowedCode(Enum):
 
     REGISTERED = 0
     """only environments that are registered on the worker's machine, by id, and their attributes without a leading
-    underscore: the learner may be anyone
+    underscore; for any learner
     """
     MODULES = 1
-    """also `module:EnvId`, which imports the module: the learner runs on this machine"""
+    """also `module:EnvId`, which imports the module; for a learner on this machine"""
     CALLABLES = 2
-    """also pickled callables, and functions and classes that the learner names: its key is known, or only this user can have
-    started the learner
+    """also pickled callables, and functions and classes that the learner names; for a learner whose key is known, or that
+    only this user can have started
     """
 
     def refuses_to_call(self, what: str) -> str:

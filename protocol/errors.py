@@ -197,7 +197,7 @@ def _whole_message(error: Exception) -> str:
 class CheckpointError(RunError):
     """A checkpoint, or a file that `RolloutService.save` wrote, is missing, broken, of another format or of another policy.
 
-    A resumed run takes the newest undamaged checkpoint; this is raised if there is none.
+    A resumed run uses its newest undamaged checkpoint; this is raised if there is none.
 
     >>> import millrace, pathlib
     >>> _ = pathlib.Path("state.npz").write_bytes(b"not a saved state")
@@ -228,8 +228,7 @@ class NoWorkers(RunError):
 class LearnerLost(RunError):
     """Another learner process of a run with shards is gone, or doesn't answer in time. The state was saved by rank 0.
 
-    Its exit code 75 says that trying again may help: whoever started the processes starts all of them again, with
-    `--resume auto`.
+    Exit code 75 says that trying again may help: start all processes of the run again, with `--resume auto`.
 
     >>> import millrace
     >>> millrace.LearnerLost("learner: rank 1 is gone").exit_code

@@ -93,7 +93,7 @@ class Rejoin(Message, frozen=True):
 
 
 class Weights(Message, frozen=True):
-    """Weights that an order names. They carry no session, so that one encoding serves all workers."""
+    """Weights that an order names. The message contains no session, so that it is encoded once for all workers."""
 
     version: Natural
     parameters: Array

@@ -48,7 +48,7 @@ class RunProgress(msgspec.Struct, frozen=True, kw_only=True):
     """the learner's current activity: starting, gathering rollouts, learning, or evaluating; empty if it is not known"""
     waiting: Line = ""
     """who waits for whom, and for what share of the time, or the progress of an evaluation: "evaluating for 41 s: 37 of 100
-    episodes (…"; empty if nobody waits long"""
+    episodes (…"; empty if no one waits for long"""
     stop_reason: Line = ""
     """why the run ended; empty while it continues"""
     cut_short: bool = False

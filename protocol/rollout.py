@@ -74,7 +74,7 @@ class Rollout(msgspec.Struct, frozen=True, tag=True, array_like=True, forbid_unk
     truncated: Array
     """[T, N] bool: a time limit ended the episode; bootstrap from obs[t+1]"""
     valid: Array
-    """[T, N] bool: False on the row in which a finished copy is reset"""
+    """[T, N] bool: False in a row that only resets the copy; with seats, also where no outcome of the seat arrives"""
     state: Array
     """[N, S] float32: state of the recurrent core before obs[0]; S is 0 without a core"""
     episodes: tuple[Episode, ...] = ()

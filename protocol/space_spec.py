@@ -125,7 +125,7 @@ def check_size(description: EnvDescription) -> None:
 
 
 def check_space(name: str, space: SpaceSpec) -> None:
-    """Like `check_size`, for one space, which errors call `name`."""
+    """Like `check_size`, for one space. `name` is its name in errors."""
     leaves = list(_leaves(space, 0))
     if len(leaves) > MAX_LEAVES:
         raise BadMessage(f"{name}: expected at most {MAX_LEAVES} arrays, got {len(leaves)}")

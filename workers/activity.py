@@ -108,7 +108,9 @@ def activity() -> Activity:
 
 
 def share_activity(page: Activity) -> None:
-    """Let the worker in this thread write to this page. Call this before it makes anything."""
+    """Let the worker in this thread write to this page. Call this before the worker is made, because its parts keep the page
+    that they find.
+    """
     _of_thread.activity = page
 
 

@@ -1,8 +1,8 @@
 """Runs one worker in this process, which a supervisor has started. Imports torch only if the policy needs it.
 
 Exit codes: 0 if the worker was drained or asked to leave, or its supervisor has ended; EXIT_NO_LEARNER if no learner
-answered; EXIT_UNSUITABLE if it cannot take part in this run; 1 if it failed; 2 if it was refused or used wrongly. The code
-is also written to the page that the supervisor reads: an exit without this counts as a failure.
+answered; EXIT_UNSUITABLE if it cannot take part in this run; 1 if it failed; 2 if it was refused, or its flags were wrong.
+The code is also written to the page that the supervisor reads: an exit without this counts as a failure.
 """
 
 from __future__ import annotations

@@ -1,5 +1,4 @@
-"""The last resort against a hang: a process ends itself if its supervisor, which normally ends hung workers, has not done
-so.
+"""The last resort against a hang: a process ends itself if its supervisor, which normally ends hung workers, does not.
 
 Rule: if `feed` has not been called for longer than the run allows, the process writes the stack of each of its threads to
 stderr and exits immediately with exit code 1. Its supervisor ends it before that (`end_if_hung` in

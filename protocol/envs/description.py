@@ -40,9 +40,9 @@ class DescribedEnv:
     """time limit of an episode in env steps; None if there is none"""
     render_mode: str | None = None
     wrappers: frozenset[str] = frozenset()
-    """the classes of its wrappers, by `class_name`"""
+    """the names of the classes of the environment's wrappers (`class_name`)"""
     seats: tuple[str, ...] = ()
-    """the names of its agents, if it is an environment with seats; the spaces above are then those of each seat"""
+    """the names of the agents, if it is an environment with seats; the spaces above are then those of each seat"""
     takes_turns: bool = False
     """whether a seat may have to wait for others between two of its actions"""
 

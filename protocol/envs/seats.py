@@ -51,7 +51,7 @@ class SeatStep(NamedTuple):
     complete: list[bool]
     """whether this step completes a row of the seat"""
     acts: list[bool]
-    """whether the next step takes the seat's action"""
+    """whether the seat acts in the next step"""
     outside: list[float]
     """rewards outside of any row: before the seat's first action, or after its end"""
 
@@ -77,8 +77,9 @@ class SeatedEnv(gymnasium.Env[SeatStep, Sequence[Any]]):
     """Whether a seat may have to wait for others between two of its actions."""
 
     def __init__(self, env: Any, name: str) -> None:
-        """Wrap a PettingZoo environment, which errors call `name`. Raises `UsageError` unless all agents have the same
-        spaces.
+        """Wrap a PettingZoo environment. `name` is its name in errors.
+
+        Raises `UsageError` unless all agents have the same spaces.
         """
         self.env = env
         self.metadata = getattr(env, "metadata", {})

@@ -38,7 +38,9 @@ class LogRateLimiter:
 
 @dataclass(frozen=True)
 class Allowance:
-    """How much one source may log: `lines` and `bytes` at once, and then so many per second."""
+    """How much one source may log: `lines` and `bytes` at once, and `lines_per_s` and `bytes_per_s` in each second after
+    that.
+    """
 
     lines: int
     lines_per_s: float

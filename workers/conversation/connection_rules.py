@@ -33,7 +33,7 @@ def checked_token(address: str, token: Token | None, *, insecure: bool) -> Token
     """The token with which to connect, or None to connect without a token. Raises `UsageError` if neither is allowed."""
     check_address(address)
     if not address.startswith("tcp://"):
-        return None  # the permissions of the socket decide who may open it
+        return None  # the permissions of the socket determine who may connect
     if token is None and not insecure and not is_local(address):
         raise UsageError(
             f"address {address} is on another machine: expected --token FILE (or {TOKEN_VARIABLE}), made there by "

@@ -185,7 +185,7 @@ class Statistics:
 
 @dataclass
 class _SessionState:
-    """The state of one session. Each session starts with a new one."""
+    """The state of one session. A new object is made for each session."""
 
     descriptions: HeldDescriptions = field(default_factory=HeldDescriptions)
     rollouts: HeldRollouts = field(default_factory=HeldRollouts)
@@ -387,7 +387,7 @@ class Session:
         return self._leave(WorkerFailed(), 1, error, failure)
 
     def decline(self, reason: str, exit_code: int = EXIT_UNSUITABLE) -> list[WorkerEffect]:  # rule DECLINED
-        """Leave a run in which this worker can't take part. Another exit code than the default means: not now."""
+        """Leave a run in which this worker can't take part; with another exit code, in which it can't take part now."""
         return self._leave(WorkerFailed(), exit_code, reason, Goodbye(self.session, one_line(reason), ()))
 
     def refused(self, reason: str) -> list[WorkerEffect]:  # rules REFUSE, AFTER_REFUSE

@@ -51,7 +51,7 @@ class SeatColumns(NamedTuple):
     complete: Bools
     """[N · A] whether a row of the seat is complete"""
     acts: Bools
-    """[N · A] whether the next step takes the seat's action"""
+    """[N · A] whether the seat acts in the next step"""
     outside: Doubles
     """[N · A] rewards outside of any row"""
     over: Bools

@@ -51,7 +51,7 @@ PULSE_S = 0.05  # a loop over slow copies calls `pulse` at this interval
 
 
 class EnvLoop:
-    """N environments that are stepped one after the other. All their exceptions are raised as `CopyFailed`."""
+    """N environments that are stepped one after another. All their exceptions are raised as `CopyFailed`."""
 
     def __init__(
         self,

@@ -23,7 +23,7 @@ class Seats:
 
     def __init__(self, policy: PolicySpec, columns: int) -> None:
         self.acts: Bools = np.zeros(columns, bool)
-        """[N · A] whether the next step takes the seat's action"""
+        """[N · A] whether the seat acts in the next step"""
         self._waits = np.zeros(columns, bool)  # [N · A] whether the seat has acted, and its row is not complete yet
         self._held: list[Array] = []  # [N · A, …] each, what the policy wrote when each seat last acted
         self._held_state = zero_state(policy, columns)  # [N · A, S] the policy's state before each seat last acted
