@@ -17,7 +17,7 @@ other, such as a return or a recurrent state. Both are still cut where an episod
 `resets` says which steps only reset the copy:
 
     a row that is terminated or truncated is valid, and no later row of that seat is valid until its copy is reset
-    a step that resets a copy has no valid row of it
+    a step that resets a copy has no valid row of that copy
     if agents don't take turns, a valid row that is neither terminated nor truncated is followed by a valid one
 """
 
@@ -157,8 +157,8 @@ class Batch(msgspec.Struct, frozen=True):
     lane: npt.NDArray[np.int64]
     """[ΣN] the lane of each column"""
     fresh: Bools
-    """[ΣN] True where the rows don't continue those of an earlier batch: the column's lane has just been started, or a
-    rollout in between was not used"""
+    """[ΣN] True where the rows don't continue an earlier rollout of the lane: the lane, or its copy, has just been started,
+    or a rollout in between was not used"""
     columns_per_rollout: int
     """number of columns of each rollout: N, or N · A with seats. The columns of a lane are adjacent, even if the batch has
     several of its rollouts

@@ -417,7 +417,7 @@ class StepSpec(msgspec.Struct, frozen=True, tag=True):
     """
 
     def first_copy(self, lane: int) -> int:
-        """Number of the lane's first copy."""
+        """The number that the lane's first copy has in the whole vector environment."""
         return sum(self.lanes[:lane])
 
     @property

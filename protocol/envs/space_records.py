@@ -35,7 +35,7 @@ MAX_DIMENSIONS = 8
 
 
 def describe_space(space: gymnasium.Space[Any], name: str = "space") -> SpaceSpec:
-    """The record of a space. Raises `UsageError` for a space that is not supported; `name` is the space's name in it."""
+    """The record of a space. Raises `UsageError`, in which `name` names the space, if the space is not supported."""
     return _describe(space, name, 0)
 
 

@@ -6,7 +6,7 @@ and a comparison. The log-probabilities of a whole rollout are computed in one c
     Categorical   P = Σ sizes   logits; action = argmax(logits + Gumbel noise)               (Gumbel-max trick)
     Bernoulli     P = K         logits; action = logits + logistic noise > 0
     Gaussian      P = 2 D       mean, log standard deviation; action = mean + exp(log_std) · normal noise, not clipped
-    Product       P = Σ factors independent factors, whose params, noise and actions are concatenated
+    Product       P = Σ Pᵢ      independent factors, whose params, noise and actions are concatenated
 
 A mixed action has at most three factors, because a stored row has the choices of all its parts, then all bits, then all
 numbers (`millrace.protocol.action_parts`).

@@ -333,7 +333,7 @@ class ActorAndCritics(FlatNetwork):
         return self.actor_params(self.encode(x, images))
 
     def head(self, h: Tensor) -> Tensor:
-        """`actor_params`, without the exploration parameters that the learner sends."""
+        """Like `actor_params`: distribution params without the exploration parameters, which the learner sends."""
         return self.actor_params(h)
 
     def actor_params(self, h: Tensor) -> Tensor:

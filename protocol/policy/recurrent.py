@@ -21,7 +21,7 @@ import numpy.typing as npt
 from millrace.protocol.arrays import Floats
 from millrace.protocol.specs import PolicySpec
 
-GATES = {"lstm": 4, "gru": 3}  # linear maps per unit of a core, the candidate state included
+GATES = {"lstm": 4, "gru": 3}  # number of gates, where the candidate state counts as one
 
 
 def zero_state(spec: PolicySpec, *lead: int) -> Floats:

@@ -1,7 +1,7 @@
 """A loop over N env copies with A seats each. They have N · A columns, where those of a copy are adjacent.
 
-Rule: the mask of a column is that of the last observation in the episode in which its seat acts. Until there is one, all
-actions are allowed.
+Rule: a column has the mask of the last observation, in this episode, in which the column's seat acts. Until there is one,
+all actions are allowed.
 """
 
 from __future__ import annotations

@@ -26,4 +26,4 @@ class Ending:
     worked: bool = False
     """Whether any calls of the environment have returned."""
     last_lines: str | None = None
-    """The last lines of the worker's output, if it ended before it had joined a run; else None."""
+    """The last lines of the worker's output, if it failed before it had joined a run; else None."""
