@@ -186,9 +186,7 @@ def _check_env_arguments(config: Config) -> None:
 
 
 def _check_learner_inference(config: Config) -> None:
-    if config.max_lag:
-        wrong = f"max_lag: expected 0, got {config.max_lag}; the policy acts under the newest weights"
-    elif config.vector != "loop":
+    if config.vector != "loop":
         wrong = f"vector: expected loop, got {config.vector}; its workers step copies one by one"
     elif config.restart_episodes:
         wrong = f"restart_episodes: expected 0, got {config.restart_episodes}; its workers make no copy anew"

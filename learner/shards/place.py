@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 from millrace.learner.shards.division import Division
 from millrace.protocol.address import is_local
+from millrace.protocol.bounds import one_line
 from millrace.protocol.errors import UsageError
 
 LOOPBACK = ("lo", "lo0")  # names of the loopback interface, on Linux and on macOS
@@ -61,6 +62,17 @@ class Place(NamedTuple):
 
 
 ALONE = Place(0, 1, "", 0)
+
+
+def trains_alone(environment: Mapping[str, str]) -> str:
+    """A warning if a launcher has started several processes of a run without shards; otherwise empty."""
+    processes = environment.get("WORLD_SIZE", "1")
+    if processes == "1":
+        return ""
+    return (
+        f"WORLD_SIZE is {one_line(processes, 20)}, but shards is 1: each process trains a run of its own; to train one run "
+        "with all of them, set --shards to a multiple of their number"
+    )
 
 
 def check_loopback(place: Place, *, insecure: bool) -> None:

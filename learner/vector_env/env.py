@@ -150,11 +150,10 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         self.step_async(actions)
         return self.step_wait()
 
-    def step_async(self, actions: Any, lanes: Sequence[int] | None = None) -> None:
-        """Order every copy to step, or those of these lanes; `step_wait` returns the results."""
+    def step_async(self, actions: Any) -> None:
+        """Order every copy to step; `step_wait` returns the results."""
         self._check_idle("step_async")
-        arrays = action_arrays(actions, self._read_actions, self._action_leaves, self.num_envs)
-        self._send_recv.step(self._layout.lanes if lanes is None else lanes, arrays, self._layout.rows, together=True)
+        self._step(self._layout.lanes, actions, together=True)
         self._state = AsyncState.WAITING_STEP
 
     def step_wait(self, timeout: float | None = None) -> GymnasiumStep:
@@ -163,6 +162,27 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         A worker that does not answer within `timeout` seconds (`timeout_s` by default) is given up.
         """
         return self._wait(AsyncState.WAITING_STEP, timeout)
+
+    # ---------------------------------------------------------------- some lanes, while others step
+
+    def begin_step(self, lanes: Sequence[int], actions: Any) -> None:
+        """Order the copies of these lanes to step. Other lanes may be stepping. Actions have a row for every copy."""
+        self._check_idle("begin_step", of_sent=True)
+        self._step(lanes, actions, together=False)
+
+    def end_step(self, lanes: Sequence[int]) -> GymnasiumStep:
+        """Wait for the step of these lanes. Returns and raises what `step` does; only the rows of these lanes count.
+
+        After an error, nothing is waited for any more.
+        """
+        self._check_idle("end_step", of_sent=True)
+        return self._rows(self._send_recv.recv_some(lanes))
+
+    def abandon(self) -> None:
+        """Wait for nothing any more: the results of what was sent don't come back."""
+        if self.outstanding:
+            self._send_recv.abandon()
+        self._state = AsyncState.DEFAULT
 
     # ---------------------------------------------------------------- lanes that do not wait for each other
 
@@ -259,6 +279,11 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         self.close()
 
     # ---------------------------------------------------------------- inside
+
+    def _step(self, lanes: Sequence[int], actions: Any, *, together: bool) -> None:
+        """Order the copies of these lanes to step. `together`: no other lane is stepped before these have come back."""
+        arrays = action_arrays(actions, self._read_actions, self._action_leaves, self.num_envs)
+        self._send_recv.step(lanes, arrays, self._layout.rows, together=together)
 
     def _check_idle(self, doing: str, *, of_sent: bool = False) -> None:
         """Raise if this cannot be done now. `of_sent`: it may be done while copies have not come back."""

@@ -199,6 +199,19 @@ class SendRecv:
             raise
         return sent.take()
 
+    def recv_some(self, lanes: Sequence[int]) -> Ready:
+        """Wait until these lanes are ready, and take them; others stay. Raises as `recv_all`, and abandons as it does."""
+        try:
+            self.look(self.timeout_s)
+            while not self._sent.are_ready(lanes):
+                self._parts.hub.wait(self.timeout_s, together=False)
+                self.look(self.timeout_s)
+            self._raise_losses()
+        except BaseException:
+            self.abandon()
+            raise
+        return self._sent.take_some(lanes)
+
     def look(self, timeout_s: float) -> None:
         """Note what has come of the lanes that are under way. Never waits. Raises `EnvironmentFailed` and `NoWorkers`."""
         self._take_results()

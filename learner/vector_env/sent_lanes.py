@@ -103,6 +103,10 @@ class SentLanes:
         """Whether no lane is under way."""
         return len(self._results) == len(self.sent)
 
+    def are_ready(self, lanes: Iterable[int]) -> bool:
+        """Whether none of these lanes is under way."""
+        return all(lane in self._results or lane not in self.sent for lane in lanes)
+
     @property
     def under_way(self) -> list[int]:
         """Lanes that are not ready."""
@@ -174,6 +178,17 @@ class SentLanes:
         for lane in ready.results:
             del self.sent[lane]
         return ready
+
+    def take_some(self, lanes: Iterable[int]) -> Ready:
+        """Those of these lanes that are ready. They have come back now; other lanes stay ready."""
+        taken = [lane for lane in sorted(lanes) if lane in self._results]
+        rows = self._layout.rows_of(self._layout.copies_of(taken)) if self._losses else ()
+        for lane in taken:
+            del self.sent[lane]
+        return Ready(
+            {lane: self._results.pop(lane) for lane in taken},
+            {row: self._losses.pop(row) for row in rows if row in self._losses},
+        )
 
     def _copies(self, lanes: Iterable[int]) -> list[int]:
         found: list[int] = []

@@ -12,7 +12,6 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from time import monotonic
-from typing import Any
 
 from millrace.launch.crew import Crew
 from millrace.launch.vector import VectorEnvPool, open_vector_env_pool
@@ -26,7 +25,7 @@ from millrace.learner.members.member import Member
 from millrace.learner.members.who_may_connect import BindSettings
 from millrace.learner.members.worker_processes import WorkerProcesses
 from millrace.learner.torch_setup import torch_device
-from millrace.learner.vector_env.env import GymnasiumStep, ZmqVectorEnv
+from millrace.learner.vector_env.env import ZmqVectorEnv
 from millrace.learner.vector_env.settings import VectorEnvSettings
 from millrace.protocol.alive import StartFailed, WorkerActivity, WorkerExit
 from millrace.protocol.env_spec import EnvSpec
@@ -133,7 +132,7 @@ class SteppingPool:
         settings = self._settings
         env = self._env = self._stepping.vector_env(described)
         before_wait = _BeforeWaits(env, settings.workers, settings.no_workers_timeout_s)
-        copies = SplitVectorEnv(env, settings.lanes, before_wait, partial(_step_lanes, env), settings.facts, masked=masked)
+        copies = SplitVectorEnv(env, settings.lanes, before_wait, env, settings.facts, masked=masked)
         self._thread = self._acting_thread(copies)
         processes = _ActingProcesses(self._thread, copies, env, self._stepping.expected)
         return Lobby(self._own.bound.link, processes, self._before)
@@ -157,7 +156,7 @@ class SteppingPool:
         def actors(run: RunSpec) -> Actors:
             policy = acting_policy(run.policy, self._settings.device(), run.images_dtype)
             evaluator = Evaluator(run, policy, lambda run, count, render_mode, pulse: evaluation_copies)
-            return Actors(Collector(run, policy, copies.open_lane, copies.step_all), evaluator)
+            return Actors(Collector(run, policy, copies.open_lane, copies), evaluator)
 
         def start(name: str) -> WorkerThread:
             return WorkerThread(self._own.bound.link.address, name, self._own.bound.context, actors)
@@ -198,12 +197,6 @@ class _ActingProcesses(WorkerProcesses):
         failures = self._failures.copy()
         self._failures.clear()
         return failures
-
-
-def _step_lanes(env: ZmqVectorEnv, lanes: Sequence[int], actions: Any) -> GymnasiumStep:
-    """Step the copies of these lanes only. Actions and results have a row for every copy, which other copies ignore."""
-    env.step_async(actions, lanes)
-    return env.step_wait()
 
 
 def acting_policy(spec: PolicySpec, device: str, images: ActingDtype) -> Policy:

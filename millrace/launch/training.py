@@ -29,7 +29,7 @@ from millrace.learner.run_setup import (
     run_folder,
     stopped,
 )
-from millrace.learner.shards.place import ALONE, Place, check_loopback
+from millrace.learner.shards.place import ALONE, Place, check_loopback, trains_alone
 from millrace.learner.torch_setup import one_thread, torch_device
 from millrace.learner.whole_run import train_to_the_end
 from millrace.protocol.env_spec import EnvSpec
@@ -51,6 +51,8 @@ def train(config: Config, resume: Path | None, watch: Watch, env: EnvSpec | None
     In a run with shards, only rank 0 of the learner processes does this; the others take part in its updates.
     """
     place = _place(config)
+    if config.shards == 1 and (line := trains_alone(os.environ)):
+        log.warning("%s", line)
     check_loopback(place, insecure=config.insecure_shards)
     if place.rank > 0:  # perhaps on a machine without the folder of the run, or of the run that it starts from
         from millrace.learner.shards.roles import follow  # imports PyTorch

@@ -37,7 +37,7 @@ from millrace.workers.copies.value_checks import check_acted, check_observed, ch
 from millrace.workers.lanes.bring_back import bring_back
 from millrace.workers.lanes.lane import Lane
 from millrace.workers.lanes.rows import Rows, RowsOfLane
-from millrace.workers.lanes.runner import LaneRunner, StepAll, no_step_for_all
+from millrace.workers.lanes.runner import LaneRunner, Part, TogetherSteps
 from millrace.workers.opponents import KnownOpponents, Match, Opponents, OtherTeams
 
 OpenEnvCopies = Callable[[RunSpec, int, Pulse], EnvCopies]
@@ -58,9 +58,9 @@ class Collector:
         run: RunSpec,
         policy: Policy | CalledPolicy,
         open_copies: OpenEnvCopies = open_env_copies,
-        step_all: StepAll = no_step_for_all,
+        together: TogetherSteps | None = None,
     ) -> None:
-        """`step_all`: steps the env copies of all lanes at once, if one vector environment holds them all."""
+        """`together`: steps the env copies of all lanes at once, if one vector environment holds them all."""
         self.note = ""
         """what the user should know about the environment, once a lane has seen it"""
         self.env_attributes = b""
@@ -68,12 +68,12 @@ class Collector:
         self.lanes = OpenLanes[Lane]()
         """the lanes with a rollout, until they are closed"""
         self._run = run
-        self._runner = LaneRunner(run, policy, step_all)
+        self._runner = LaneRunner(run, policy, together)
         self._open_copies = open_copies
         self._opponents = KnownOpponents(run)
         self._action_streams = cache(lambda lane: RoundStreams(run.seed, Purpose.ACTIONS, lane))
         self._ended_steps = 0  # env steps of rollouts that are complete or were dropped
-        self._under_way: Rows | None = None
+        self._under_way: list[Rows] = []
 
     @property
     def stages(self) -> Stages:
@@ -83,7 +83,7 @@ class Collector:
     @property
     def steps(self) -> int:
         """Number of env steps made, including those of running rollouts. A step that only resets a copy doesn't count."""
-        return self._ended_steps + (0 if self._under_way is None else self._under_way.env_steps())
+        return self._ended_steps + sum(rows.env_steps() for rows in self._under_way)
 
     def load(self, parameters: Floats, buffers: Floats) -> None:
         """Use these weights from now on."""
@@ -120,19 +120,23 @@ class Collector:
             lane.set_attributes(self.env_attributes, pulse)
             self._meet(lane, assignment, opponents)
         states = [lane.state if lane.seats is None else lane.seats.state_before(lane.state) for lane in lanes]
-        run = self._run
         drawn = [self._action_streams(each.lane).of(each.round) for each in assignments]
-        actions = self._runner.acting.begin(drawn)
-        rows = self._under_way = Rows(run, lanes, run.rollout_steps)
+        parts = [self._part(lanes[among], drawn[among]) for among in self._runner.together.parts(len(lanes))]
+        self._under_way = [part.rows for part in parts]
         try:
-            self._runner.run(rows, actions, pulse)
+            self._runner.run(parts, pulse)
         finally:
-            self._ended_steps += rows.env_steps()
-            self._under_way = None
+            self._ended_steps += sum(rows.env_steps() for rows in self._under_way)
+            self._under_way = []
+        filled = [(rows, part.actions.columns(i)) for part in parts for i, rows in enumerate(part.rows.of_lanes)]
         return [
-            self._rollout(rows.of_lanes[i], states[i], actions.columns(i), assignment, version, session)
-            for i, assignment in enumerate(assignments)
+            self._rollout(rows, state, acted, assignment, version, session)
+            for (rows, acted), state, assignment in zip(filled, states, assignments, strict=True)
         ]
+
+    def _part(self, lanes: Sequence[Lane], drawn: Sequence[np.random.Generator]) -> Part:
+        """These lanes and their random numbers, before the first step."""
+        return Part(Rows(self._run, lanes, self._run.rollout_steps), self._runner.acting.begin(drawn))
 
     def _lane_for(self, assignment: Assignment, pulse: Pulse) -> Lane:
         """The lane in this incarnation, which is opened if it isn't open."""

@@ -1,7 +1,8 @@
 """One vector environment split into lanes: its workers step the env copies, and a collector acts.
 
 Rule: a lane returns, bit for bit, what a loop over its copies would return. The lane chooses its copies' seeds and actions,
-and the vector environment's autoreset is NextStep, like the loop's.
+and the vector environment's autoreset is NextStep, like the loop's. If the vector environment can step some lanes while
+others wait, the lanes are stepped in two parts: the policy acts for one part while the copies of the other step.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from gymnasium.vector import VectorEnv
@@ -30,6 +31,21 @@ METHODS = ("close", "render", "reset", "step")  # of every environment
 Result = TypeVar("Result")
 
 
+class StepsSomeLanes(Protocol):
+    """A vector environment that can step some of its lanes while others step."""
+
+    calls: Any
+
+    def begin_step(self, lanes: Sequence[int], actions: Any) -> None:
+        """Order the copies of these lanes to step. Actions have a row for every copy of the vector environment."""
+
+    def end_step(self, lanes: Sequence[int]) -> Any:
+        """Wait for them. Returns what gymnasium's `step` does, of which only the rows of these lanes count."""
+
+    def abandon(self) -> None:
+        """Wait for nothing any more."""
+
+
 class SplitVectorEnv:
     """Lanes of equally many copies each. Lane 0 has the first copies of the vector environment."""
 
@@ -38,17 +54,20 @@ class SplitVectorEnv:
         env: VectorEnv[Any, Any, Any],
         lanes: int,
         before_wait: Callable[[Pulse], None] = lambda pulse: None,
-        step_lanes: Callable[[Sequence[int], Any], Any] | None = None,
+        some: StepsSomeLanes | None = None,
         facts: Sequence[str] = (),
         *,
         masked: bool = False,
     ) -> None:
         """`before_wait` is called before each wait for the vector environment, with the `pulse` to call during the wait.
 
-        `step_lanes` steps some lanes of the vector environment: then it may have more lanes than these, for evaluation.
-        `facts`: names of the numbers in `info` that belong to an episode. `masked`: read masks of the allowed actions.
+        `some`: the same vector environment, if it can step some lanes: then it may have more lanes than these, for
+        evaluation. `facts`: names of the numbers in `info` that belong to an episode. `masked`: read masks of the allowed
+        actions.
         """
         self.env = env
+        self.in_parts = 1 if some is None else min(lanes, 2)
+        """in how many parts the lanes are stepped"""
         self.facts = facts
         observation = env.single_observation_space
         action = env.single_action_space
@@ -56,66 +75,112 @@ class SplitVectorEnv:
         self.observation_space = without_mask(observation, action) if masked else observation
         """of one copy"""
         self._lanes = lanes
+        self._count = 0  # number of copies of a lane, once one is opened
         self._before_wait = before_wait
-        self._step_lanes = step_lanes
+        self._some = some
         self._actions: Array | None = None  # [num_envs, *action]
         self._read = make_flatten(self.observation_space)
         self._batched = make_batched(action)
         self._result: StepResult | None = None
         self._no_workers: NoWorkers | None = None
-        self._calls: Any = getattr(env, "calls", None)  # of a `ZmqVectorEnv`
         self._assigned: dict[tuple[int, str], tuple[slice, bytes]] = {}  # attributes that were set, by first copy and name
         self._lost = False  # whether copies were lost, so that their replacements need the attributes
 
     def open_lane(self, run: RunSpec, lane: int, pulse: Pulse) -> EnvCopies:
         """The copies of this lane: `OpenEnvCopies` of a `Collector`."""
+        self._count = run.copies
         return SplitLane(self, lane * run.copies, run.copies)
 
     def evaluation_lane(self, count: int) -> SplitLane:
         """The last copies, for evaluation. Each of them is a lane of one copy, after the other lanes."""
         return SplitLane(self, self.env.num_envs - count, count)
 
-    def step_all(self, lanes: Sequence[int], actions: Array, pulse: Pulse) -> None:
-        """Step the copies of all lanes, with actions [L, N, *action]: `StepAll` of a `Collector`."""
+    def parts(self, lanes: int) -> Sequence[slice]:
+        """Parts of consecutive lanes, as equal as possible, and none without a lane."""
+        ends = [lanes * (i + 1) // self.in_parts for i in range(self.in_parts)]
+        return [slice(begin, end) for begin, end in zip([0, *ends[:-1]], ends, strict=True) if end > begin]
+
+    def begin(self, lanes: Sequence[int], actions: Array, pulse: Pulse) -> None:
+        """Order the copies of these lanes to step, with actions [L, N, *action]: `TogetherSteps` of a `Collector`.
+
+        Raises `ValueError` unless they are all lanes of a part: the policy's rounding may depend on who acts together.
+        """
         order = sorted(range(len(lanes)), key=lanes.__getitem__)
-        if [lanes[i] for i in order] != list(range(self._lanes)):
-            raise ValueError(f"lanes: expected all {self._lanes} of the vector environment at once, got {sorted(lanes)}")
         in_order = actions[order].reshape(-1, *actions.shape[2:])  # [L · N, *action]
-        try:
-            self._result = self.step_some(range(self._lanes), slice(len(in_order)), in_order, pulse)
-        except CopyFailed as error:
-            lane, copy = divmod(error.copy or 0, len(in_order) // self._lanes)
-            raise environment_failed(lane, CopyFailed(copy, "step", error.line)) from error
+        lanes = [lanes[i] for i in order]
+        if lanes not in [[*range(part.start, part.stop)] for part in self.parts(self._lanes)]:
+            raise ValueError(f"lanes: expected all {self._lanes} of the vector environment at once, got {lanes}")
+        if self._some is not None:
+            self._order(lanes, self._copies_of(lanes), in_order, pulse)
+            return
+        with self._errors_of_lanes():
+            returned = self._wait(lambda: self.env.step(self._batched(in_order)), pulse)
+        self._result = self._read_result(returned, slice(None))
+
+    def end(self, lanes: Sequence[int], pulse: Pulse) -> None:
+        """Wait for the copies of these lanes. `SplitLane.step` returns what they gave."""
+        if self._some is not None:
+            with self._errors_of_lanes():
+                self._result = self._ended(lanes, self._copies_of(lanes), pulse)
 
     def step_evaluation(self, first: int, copies: Sequence[int], actions: Array, pulse: Pulse) -> None:
         """Step these of the copies for evaluation, the first of which is `first`."""
         lanes = [self._lanes + n for n in copies]
-        self._result = self.step_some(lanes, [first + n for n in copies], actions, pulse)
+        chosen = [first + n for n in copies]
+        self._order(lanes, chosen, actions, pulse)
+        self._result = self._ended(lanes, chosen, pulse)
 
-    def step_some(self, lanes: Sequence[int], copies: slice | list[int], actions: Array, pulse: Pulse) -> StepResult:
-        """Step these lanes, which have these copies, with their actions. The result has a row for each copy of all lanes."""
+    def _copies_of(self, lanes: Sequence[int]) -> list[int]:
+        return [lane * self._count + n for lane in lanes for n in range(self._count)]
+
+    @contextmanager
+    def _errors_of_lanes(self) -> Iterator[None]:
+        """While it is entered, errors of copies become errors of their lanes."""
+        try:
+            yield
+        except CopyFailed as error:
+            lane, copy = divmod(error.copy or 0, self._count)
+            raise environment_failed(lane, CopyFailed(copy, "step", error.line)) from error
+
+    def _order(self, lanes: Sequence[int], copies: list[int], actions: Array, pulse: Pulse) -> None:
+        """Order these lanes, which have these copies, to step with their actions."""
+        assert self._some is not None
+        begin_step = self._some.begin_step
         if self._lost:
             self._assign_again(pulse)
-        if self._step_lanes is None:
-            result = self._wait(lambda: self.env.step(self._batched(actions)), pulse)
-        else:
-            if self._actions is None:
-                self._actions = np.resize(actions, (self.env.num_envs, *actions.shape[1:]))  # any actions of the space
-            padded = self._actions
-            step_lanes = self._step_lanes
-            padded[copies] = actions
-            result = self._wait(lambda: step_lanes(lanes, self._batched(padded)), pulse)
-        observation, reward, terminated, truncated, infos = result
+        if self._actions is None:
+            self._actions = np.resize(actions, (self.env.num_envs, *actions.shape[1:]))  # any actions of the space
+        padded = self._actions
+        padded[copies] = actions
+        self._wait(lambda: begin_step(lanes, self._batched(padded)), pulse)
+
+    def _ended(self, lanes: Sequence[int], copies: list[int], pulse: Pulse) -> StepResult:
+        """Wait for these lanes, which have these copies. The result has a row for each copy of all lanes."""
+        assert self._some is not None
+        end_step = self._some.end_step
+        return self._read_result(self._wait(lambda: end_step(lanes), pulse), copies)
+
+    def _read_result(self, returned: Any, copies: slice | list[int]) -> StepResult:
+        """What a step of these copies returned. It has a row for each copy of the vector environment."""
+        observation, reward, terminated, truncated, infos = returned
         self._lost |= bool(self._assigned) and "worker_lost" in infos
         facts: Facts = {}
-        if self.facts and (ended := terminated | truncated).any():
-            facts = of_ended(facts_of_copies(self.facts, infos, self.env.num_envs), ended)
+        if self.facts:
+            ended = np.zeros(self.env.num_envs, bool)
+            ended[copies] = terminated[copies] | truncated[copies]
+            if ended.any():
+                facts = of_ended(facts_of_copies(self.facts, infos, self.env.num_envs), ended)
         leaves: Leaves = self._read(observation)
         if self._masks is not None:
             waits = np.ones(self.env.num_envs, bool)  # copies that were not stepped have no new mask
             waits[copies] = False
             leaves = [*leaves, self._masks.read_all(observation, infos, terminated | waits, truncated)]
         return StepResult(leaves, reward, terminated, truncated, infos.get("worker_lost"), facts)
+
+    def abandon(self) -> None:
+        """Wait for nothing any more: a rollout was dropped."""
+        if self._some is not None:
+            self._some.abandon()
 
     def result(self, copies: slice) -> StepResult:
         """The part of the last step's result that belongs to these copies."""
@@ -159,14 +224,16 @@ class SplitVectorEnv:
             if not there or name in METHODS:
                 what = "a method" if there else "none"
                 raise CopyFailed(None, line=f"expected an attribute of the environment that is called {name}, got {what}")
-            self._calls.assign(chosen, name, [unpack(packed)] * len(chosen))
+            assert self._some is not None
+            self._some.calls.assign(chosen, name, [unpack(packed)] * len(chosen))
         except EnvironmentFailed as error:
             raise CopyFailed(None, f"set_env_attr {name}") from error
 
     def _have(self, copies: Sequence[int], name: str) -> bool:
         """Whether these copies have the attribute. Copies of a client in another language have no attributes."""
         try:
-            return all(self._calls.call(copies, "has_wrapper_attr", (name,), {}))
+            assert self._some is not None
+            return all(self._some.calls.call(copies, "has_wrapper_attr", (name,), {}))
         except AttributeError:
             return False
 
@@ -216,7 +283,7 @@ class SplitLane:
             return self._split.reset(slice(self._first, self._first + len(seeds)), seeds, pulse)
 
     def step(self, actions: Array, pulse: Pulse, copies: Sequence[int] | None = None) -> StepResult:
-        """The result of the step that `SplitVectorEnv.step_all` made; in an evaluation, of a step of these copies."""
+        """The result of the step that `SplitVectorEnv.end` waited for; in an evaluation, of a step of these copies."""
         if copies is not None:
             with self._own_numbers():
                 self._split.step_evaluation(self._first, copies, actions, pulse)
@@ -231,7 +298,11 @@ class SplitLane:
         raise ValueError("render: copies of a vector environment cannot be filmed; use millrace evaluate --video")
 
     def close(self) -> None:
-        """Do nothing: the copies belong to the vector environment, and are reset when the lane starts anew."""
+        """The copies belong to the vector environment, and are reset when the lane starts anew.
+
+        A lane is closed when its rollout is dropped, so the step of any lane that is under way isn't wanted any more.
+        """
+        self._split.abandon()
 
     @contextmanager
     def _own_numbers(self) -> Iterator[None]:

@@ -35,7 +35,7 @@ from millrace.workers.copy_slots import EnvMaker
 from millrace.workers.evaluate.episode_rows import RowSender, RowsOfEpisode, SendRows, as_frame
 from millrace.workers.lanes.lane import Lane
 from millrace.workers.lanes.rows import EpisodesLost, Rows, RowsOfLane
-from millrace.workers.lanes.runner import LaneRunner
+from millrace.workers.lanes.runner import LaneRunner, Part
 from millrace.workers.lanes.running_episodes import EndedEpisode
 from millrace.workers.opponents import KnownOpponents, Match, OtherTeams
 
@@ -145,7 +145,7 @@ class Evaluator:
         """Play until these rows are full, and check them."""
         self._under_way = rows
         try:
-            self._runner.run(rows, actions, pulse)
+            self._runner.run([Part(rows, actions)], pulse)
         finally:
             self._ended_steps += rows.env_steps()
             self._under_way = None

@@ -12,7 +12,7 @@ from torch import distributed
 from millrace.learner.config.layers import resolve
 from millrace.learner.shards.division import Division, pairwise_sum
 from millrace.learner.shards.learners import Timeouts, connected, listening
-from millrace.learner.shards.place import ALONE, INTERFACES, LOOPBACK, Place, check_loopback
+from millrace.learner.shards.place import ALONE, INTERFACES, LOOPBACK, Place, check_loopback, trains_alone
 from millrace.protocol.errors import UsageError
 
 VARIABLES = {"RANK": "1", "WORLD_SIZE": "2", "MASTER_ADDR": "localhost", "MASTER_PORT": "29500"}
@@ -21,6 +21,11 @@ VARIABLES = {"RANK": "1", "WORLD_SIZE": "2", "MASTER_ADDR": "localhost", "MASTER
 def test_a_place_is_what_the_launcher_says() -> None:
     assert Place.of(VARIABLES) == Place(1, 2, "localhost", 29500)
     assert Place.of({}) == Place.of({"WORLD_SIZE": "1", "RANK": "0"}) == ALONE
+
+
+def test_several_processes_of_a_run_without_shards_are_warned_of() -> None:
+    assert trains_alone({}) == trains_alone({"WORLD_SIZE": "1"}) == ""
+    assert trains_alone(VARIABLES).startswith("WORLD_SIZE is 2, but shards is 1: each process trains a run of its own; ")
 
 
 @pytest.mark.parametrize("name", ["RANK", "MASTER_ADDR", "MASTER_PORT"])

@@ -129,6 +129,43 @@ def test_each_copy_has_the_rows_of_lock_step_in_any_order_of_completion(
                 assert bit_equal(tuple(row), tuple(wanted_row)), f"row {t}: {row} is not {wanted_row}"
 
 
+def rows_in_parts(env: ZmqVectorEnv, actions: Sequence[Any], parts: Sequence[Sequence[int]]) -> list[list[Row]]:
+    """The rows of each copy when the lanes of a part are waited for together, while those of the others step."""
+    layout = env._layout
+    first, infos = env.reset(seed=5)
+    each = of_copies(env, first)
+    found = [[Row(each[n], np.float64(0), np.False_, np.False_, info_of(infos, n))] for n in range(env.num_envs)]
+    for action in [*actions, None]:
+        for lanes in parts:
+            if env.outstanding and layout.copies(lanes[0])[0] in env.outstanding:
+                observation, reward, terminated, truncated, infos = env.end_step(lanes)
+                each = of_copies(env, observation)
+                for n in layout.copies_of(lanes):
+                    found[n].append(Row(each[n], reward[n], terminated[n], truncated[n], info_of(infos, n)))
+            if action is not None:
+                env.begin_step(lanes, action)
+    return found
+
+
+@settings(examples(30), phases=(Phase.explicit, Phase.reuse, Phase.generate, Phase.shrink))
+@given(st.booleans(), st.sampled_from([((0,), (1, 2)), ((2, 0), (1,)), ((1,), (0,), (2,))]), st.integers(2, 12), st.data())
+def test_parts_that_step_by_turns_have_the_rows_of_lock_step(
+    shared: bool, parts: Sequence[Sequence[int]], steps: int, data: st.DataObject
+) -> None:
+    theirs = SyncVectorEnv([lambda: gymnasium.make(INFORMS, disable_env_checker=True)] * 3)
+    theirs.action_space.seed(3)
+    actions = [theirs.action_space.sample() for _ in range(steps)]
+    wanted = rows_in_lock_step(theirs, AutoresetMode.NEXT_STEP, actions)
+    theirs.close()
+    with made(INFORMS, 3, 3, 3, shared=shared) as (env, link):
+        link.choose = lambda count: data.draw(st.integers(0, count - 1))
+        found = rows_in_parts(env, actions, parts)
+    for mine, other in zip(found, wanted, strict=True):
+        assert len(mine) == len(other)
+        for t, (row, wanted_row) in enumerate(zip(mine, other, strict=True)):
+            assert bit_equal(tuple(row), tuple(wanted_row)), f"row {t}: {row} is not {wanted_row}"
+
+
 @BOTH_WAYS
 def test_actions_go_to_their_copies_also_where_shared_memory_would_round_them(shared: bool) -> None:
     """The results of `recv` are the caller's own: later steps do not change them."""
@@ -240,6 +277,50 @@ def test_a_copy_that_is_reset_after_its_loss_is_not_reported() -> None:
         send(env, [2])
         row = received(env)[2]
         assert (row.observation, row.info) == (np.float32(0.8), {})
+
+
+@BOTH_WAYS
+def test_a_worker_lost_in_one_part_truncates_its_copies_and_no_others(shared: bool) -> None:
+    with made(shared=shared) as (env, link):
+        env.reset(seed=1)
+        env.begin_step([0, 1], zeros(range(3)))
+        env.begin_step([2], zeros(range(3)))
+        link.frozen = {"w1", "w2"}
+        link.leave("w1")
+        _, _, _, truncated, infos = env.end_step([0, 1])
+        assert truncated[:2].tolist() == [False, True]
+        assert infos["worker_lost"][:2].tolist() == [False, True]
+        link.frozen = set()
+        observation, reward, _, truncated, infos = env.end_step([2])
+        assert (observation[2, 0], reward[2], truncated[2]) == (np.float32(0.8), 1.0, False)
+        assert "worker_lost" not in infos, "it was reported before"
+
+
+@BOTH_WAYS
+def test_attributes_are_set_while_other_lanes_step(shared: bool) -> None:
+    with made(INFORMS, shared=shared) as (env, _):
+        env.reset(seed=1)
+        actions = env.action_space.sample()
+        env.begin_step([2], actions)
+        env.calls.assign([0, 1], "level", [3, 4])
+        env.begin_step([0, 1], actions)
+        env.end_step([2])
+        env.end_step([0, 1])
+        assert env.get_attr("level")[:2] == (3, 4)
+
+
+@BOTH_WAYS
+def test_what_was_abandoned_does_not_come_back(shared: bool) -> None:
+    with made(shared=shared) as (env, link):
+        env.reset(seed=1)
+        link.frozen = {"w0", "w1", "w2"}
+        env.begin_step([0], zeros(range(3)))
+        env.begin_step([1, 2], zeros(range(3)))
+        env.abandon()
+        assert env.outstanding == []
+        link.frozen = set()
+        observation, _ = env.reset(seed=1)
+        assert observation[:, 0].tolist() == [1.0, 1.0, 1.0], "the first observations of new episodes"
 
 
 def test_the_answer_to_an_order_for_which_nobody_waits_any_more_is_not_taken_for_a_later_one() -> None:

@@ -35,13 +35,14 @@ REINFORCE: dict[str, Any] = {"steps": 16_000, "algo": "reinforce", "preset": "no
         ("CartPole-v1", {"steps": 2_000, "n_epochs": 2}),
         pytest.param("Pendulum-v1", {"steps": 7_000, "rollout_steps": 64, "n_epochs": 1}, marks=pytest.mark.soak),
         ("CartPole-v1", {"steps": 1_500, "core": "lstm", "core_size": 8, "n_epochs": 1, "normalize_observations": True}),
+        ("CartPole-v1", {"steps": 3_000, "n_epochs": 2, "max_lag": 1, "lanes": 4, "envs": 8}),
         pytest.param("CartPole-v1", {"steps": 3_000, "algo": "a2c"}, marks=pytest.mark.soak),
         (f"{TOY}Steer-v0", {"steps": 1_500, "n_epochs": 1, "rollout_steps": 16}),
         ("CartPole-v1", {"steps": 2_000, "algo": "dqn"}),
         pytest.param("CartPole-v1", REINFORCE, marks=pytest.mark.soak),
         pytest.param("CartPole-v1", {"steps": 4_000, "algo": "impala", "max_lag": 0}, marks=pytest.mark.soak),
     ],
-    ids=["ppo", "gaussian", "lstm", "a2c", "mixed", "dqn", "reinforce", "impala"],
+    ids=["ppo", "gaussian", "lstm", "lag", "a2c", "mixed", "dqn", "reinforce", "impala"],
 )
 def test_the_weights_equal_those_of_inference_workers(tmp_path: Path, env: str, settings: dict[str, Any]) -> None:
     """Bit for bit: seeds and random numbers belong to the lane, wherever its copies are and wherever the policy acts."""

@@ -85,7 +85,7 @@ def test_a_split_vector_environment_gives_the_facts_of_the_loop() -> None:
     env = SyncVectorEnv([RUN.env.make] * 6)
     env.reset()
     split = SplitVectorEnv(env, 2, facts=NAMES)
-    collector = Collector(RUN, random_policy(RUN.policy), split.open_lane, split.step_all)
+    collector = Collector(RUN, random_policy(RUN.policy), split.open_lane, split)
     for one, other in zip(
         collect(collector, RUN, lanes=range(2)), collect(random_collector(RUN), RUN, lanes=range(2)), strict=True
     ):

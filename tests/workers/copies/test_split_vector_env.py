@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from itertools import pairwise
 from typing import Any
 
 import msgspec
@@ -12,12 +13,14 @@ import pytest
 from gymnasium.vector import SyncVectorEnv
 
 from millrace.extras.datasets.episodes import EpisodeAssembler
+from millrace.protocol.arrays import Array
 from millrace.protocol.errors import NoWorkers
 from millrace.protocol.policy.layout import acting_size, buffer_size
 from millrace.protocol.policy.torch_policy import TorchPolicy
 from millrace.protocol.specs import RunSpec
 from millrace.workers.collect.collector import Collector
 from millrace.workers.conversation.held import Assignment
+from millrace.workers.copies.env_loop import Pulse
 from millrace.workers.copies.split_vector_env import SplitVectorEnv
 from tests.support.in_process.collectors import TOY, bits, collect, no_pulse, random_collector, random_policy, run_of
 
@@ -36,7 +39,7 @@ def split_collector(run: RunSpec) -> Iterator[Collector]:
     env = SyncVectorEnv([run.env.make] * (LANES * run.copies))
     env.reset()  # SyncVectorEnv, unlike ZmqVectorEnv, takes a mask only after a first reset
     split = SplitVectorEnv(env, LANES)
-    yield Collector(run, random_policy(run.policy), split.open_lane, split.step_all)
+    yield Collector(run, random_policy(run.policy), split.open_lane, split)
     env.close()
 
 
@@ -84,7 +87,7 @@ def test_that_no_worker_is_left_is_raised_once_to_whoever_asks() -> None:
     env.reset()
     split = SplitVectorEnv(env, LANES)
     with pytest.raises(NoWorkers):
-        collect(Collector(run, random_policy(run.policy), split.open_lane, split.step_all), run, lanes=range(LANES))
+        collect(Collector(run, random_policy(run.policy), split.open_lane, split), run, lanes=range(LANES))
     with pytest.raises(NoWorkers, match=r"^waited 1 s for 1 worker$"):
         split.raise_if_no_workers()
     split.raise_if_no_workers()
@@ -117,7 +120,7 @@ def test_a_lost_step_is_in_no_valid_row(at: int) -> None:
     env = LosesTwoCopies([run.env.make] * (LANES * run.copies), at)
     env.reset()
     split = SplitVectorEnv(env, LANES)
-    collector = Collector(run, random_policy(run.policy), split.open_lane, split.step_all)
+    collector = Collector(run, random_policy(run.policy), split.open_lane, split)
     by_lane = zip(*(collect(collector, run, k, lanes=range(LANES)) for k in range(4)), strict=True)
     assembler = EpisodeAssembler(lambda actions: (actions,))
     whole = []
@@ -168,11 +171,69 @@ def test_one_forward_pass_for_all_lanes_equals_one_pass_for_each_lane(policy: di
     assert not spec.state_size or (after_one != 0.25).any()
 
 
-def test_step_all_gets_the_actions_of_all_lanes_before_the_first_lane_steps() -> None:
+class Watched:
+    """Each lane steps its own copies, in these parts, and this notes when which of them begin and end."""
+
+    def __init__(self, *parts: slice) -> None:
+        self._parts = parts
+        self.seen: list[str] = []
+
+    def parts(self, lanes: int) -> Sequence[slice]:
+        return self._parts
+
+    def begin(self, lanes: Sequence[int], actions: Array, pulse: Pulse) -> None:
+        self.seen.append(f"begin {[*lanes]} {actions.shape}")
+
+    def end(self, lanes: Sequence[int], pulse: Pulse) -> None:
+        self.seen.append(f"end {[*lanes]}")
+
+
+def test_the_policy_acts_for_one_part_while_the_other_steps() -> None:
     run = msgspec.structs.replace(RUNS["discrete"], rollout_steps=2)
-    calls: list[tuple[list[int], tuple[int, ...]]] = []
-    collector = Collector(
-        run, random_policy(run.policy), step_all=lambda lanes, actions, pulse: calls.append((list(lanes), actions.shape))
-    )
-    collect(collector, run, lanes=(4, 1))
-    assert calls == [([4, 1], (2, 2))] * 2
+    watched = Watched(slice(0, 1), slice(1, 3))
+    collect(Collector(run, random_policy(run.policy), together=watched), run, lanes=(4, 1, 2))
+    assert watched.seen == [
+        "begin [4] (1, 2)",
+        "begin [1, 2] (2, 2)",
+        "end [4]",
+        "begin [4] (1, 2)",
+        "end [1, 2]",
+        "begin [1, 2] (2, 2)",
+        "end [4]",
+        "end [1, 2]",
+    ]
+
+
+@pytest.mark.parametrize("ends", [(3,), (2, 3), (1, 2, 3)])
+def test_the_number_of_parts_changes_no_bit(ends: Sequence[int]) -> None:
+    run = RUNS["lstm"]
+    alone = random_collector(run)
+    collector = Collector(run, random_policy(run.policy), together=Watched(*(slice(*each) for each in pairwise((0, *ends)))))
+    for k in range(3):
+        actual, expected = (collect(one, run, k, lanes=range(LANES)) for one in (collector, alone))
+        assert [bits(one) for one in actual] == [bits(other) for other in expected]
+
+
+def test_a_dropped_rollout_abandons_the_steps_under_way() -> None:
+    run = RUNS["discrete"]
+    abandoned = []
+
+    class Abandons(SyncVectorEnv):
+        calls = None
+
+        def begin_step(self, lanes: Sequence[int], actions: Any) -> None:
+            pass
+
+        def end_step(self, lanes: Sequence[int]) -> Any:
+            raise NoWorkers("none")
+
+        def abandon(self) -> None:
+            abandoned.append(True)
+
+    env = Abandons([run.env.make] * (LANES * run.copies))
+    env.reset()
+    split = SplitVectorEnv(env, LANES, some=env)
+    with pytest.raises(NoWorkers):
+        collect(Collector(run, random_policy(run.policy), split.open_lane, split), run, lanes=range(LANES))
+    assert abandoned
+    env.close()
