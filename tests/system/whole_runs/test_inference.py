@@ -216,8 +216,8 @@ def test_the_run_ends_when_the_workers_elsewhere_have_left(stage: Stage) -> None
 
 
 def test_unsupported_settings_are_refused_in_one_line() -> None:
-    with pytest.raises(UsageError, match="inference learner: max_lag: expected 0, got 1"):
-        resolve("CartPole-v1", max_lag=1, **IN_LEARNER)
+    with pytest.raises(UsageError, match="inference learner: eval_workers: expected 0, got 1"):
+        resolve("CartPole-v1", eval_workers=1, **IN_LEARNER)
     with pytest.raises(UsageError, match="inference: expected one of workers, learner, got 'gpu'"):
         resolve("CartPole-v1", inference="gpu")
 
