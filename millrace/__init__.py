@@ -18,7 +18,7 @@ from millrace.oldest_versions import check_versions
 
 check_versions()
 
-import millrace.protocol.machine.waiting_threads  # noqa: E402, F401  # before torch, if the program imports millrace first
+import millrace.protocol.machine.waiting_threads  # noqa: E402, F401  # sets a variable that torch reads at its own import
 from millrace.protocol.errors import (  # noqa: E402
     CheckpointError,
     EnvironmentFailed,
@@ -130,7 +130,7 @@ _IMPORTED_WHEN_USED = {
     "record": "millrace.playing",
     "train": "millrace.runs",
 }
-"""Public names, and the module of each. They are imported at first use, because their imports take long."""
+"""The module that defines each public name. A module is imported when one of its names is first used, to save time."""
 
 _MODULES = ("algorithms", "testing")
 """Public modules, also imported at first use"""

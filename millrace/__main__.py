@@ -1,7 +1,8 @@
 """`python -m millrace` and the command `millrace`: run the command line and end the process.
 
-Rule: from the first line of `command` on, a signal that ends the process gives exit code 130 and no traceback. So slow
-imports happen there. Signals wait meanwhile, because an extension module whose import is interrupted may crash.
+Rule: from the first line of `command` on, a signal that ends the process gives exit code 130 and no traceback. This is why
+`command` makes the slow imports. It blocks signals during these imports, because an extension module may crash if its import
+is interrupted.
 """
 
 from __future__ import annotations
@@ -22,14 +23,14 @@ def command() -> NoReturn:
     try:
         with stopped_by_signals():
             code = main()
-    except KeyboardInterrupt:  # during the imports, or while `main` printed another error
+    except KeyboardInterrupt:  # a signal during the imports, or while `main` printed another error
         sys.stderr.write("millrace: interrupted\n")
         code = 130
     if "millrace.learner.imports_ahead" in sys.modules:
         from millrace.learner.imports_ahead import exit_if_importing
 
         exit_if_importing(code)
-    gc.freeze()  # skips the garbage collection of torch's objects at exit, which is a tenth of a short run
+    gc.freeze()  # skips the garbage collection of torch's objects at exit, which takes a tenth of a short run
     sys.exit(code)
 
 

@@ -1,4 +1,4 @@
-"""Everything that you need for your own algorithm. Importing this module imports PyTorch.
+"""Everything that you need to write your own algorithm. Importing this module imports PyTorch.
 
 There are two levels. On the first, you write only the loss; millrace does everything else in an update:
 
@@ -16,44 +16,45 @@ There are two levels. On the first, you write only the loss; millrace does every
 ...         return loss, {"penalty": penalty}
 >>> run = millrace.train("CartPole-v1", algo=Mine, penalty=0.2, steps=500, workers=1, eval_episodes=2, progress=False)
 
-On the second, a class derives from `Algorithm` and makes the whole update. `millrace.testing.check_algorithm` finds mistakes
-in a class of either level. Use the class with `millrace train CartPole-v1 --algo my_module:Mine --penalty 0.2`, or with
-`millrace.train("CartPole-v1", algo=Mine, penalty=0.2)`.
+On the second, you derive a class from `Algorithm` and write the whole update. `millrace.testing.check_algorithm` finds
+mistakes in a class of either level. Use the class with `millrace train CartPole-v1 --algo my_module:Mine --penalty 0.2`, or
+with `millrace.train("CartPole-v1", algo=Mine, penalty=0.2)`.
 
 The algorithm itself:
 
-- `Algorithm`, the base of all; `GradientDescent`, the base of the built-in ones: optimizers, schedules, statistics,
-  `UpdateMetrics`, the state; `ActorCritic`, the base of algorithms with an actor and a critic: `PPO`, `A2C`, `IMPALA` and
-  `REINFORCE`; `OffPolicy`, the base of algorithms with a replay buffer: `DQN`, `SAC` and `TD3`. The last two share
-  `Continuous`: actions in a bounded Box, an exact replay ratio.
-- `AlgorithmConfig`, `ActorCriticConfig`, `OffPolicyConfig` and `ContinuousConfig`, the bases of `Config`; `PPOConfig` and so
-  on. Every setting has a default value and a type, perhaps with bounds: `Annotated[float, msgspec.Meta(gt=0)]`. The text
-  under it is its help.
-- `Free`, `Adaptable` and `Fixed` say whether a resumed run may change a setting: `n_steps: Free[int] = 3`. Without one, a
-  float is free and anything else is fixed.
+- `Algorithm`: the base class of all algorithms. `GradientDescent`: the base of the built-in ones, with their optimizers,
+  schedules, running statistics, `UpdateMetrics` and saved state. `ActorCritic`: the base of algorithms with an actor and a
+  critic (`PPO`, `A2C`, `IMPALA`, `REINFORCE`). `OffPolicy`: the base of algorithms with a replay buffer (`DQN`, `SAC`,
+  `TD3`). `Continuous`: the base of `SAC` and `TD3`, for actions in a bounded Box and an exact replay ratio.
+- `AlgorithmConfig`, `ActorCriticConfig`, `OffPolicyConfig` and `ContinuousConfig`: base classes for an algorithm's `Config`.
+  `PPOConfig` and its like are the settings of the built-in algorithms. Every setting has a default value and a type, which
+  may have bounds: `Annotated[float, msgspec.Meta(gt=0)]`. The string under a setting is its help text.
+- `Free`, `Adaptable` and `Fixed`: mark whether a resumed run may change a setting, as in `n_steps: Free[int] = 3`. A setting
+  without a mark is free if it is a float, and fixed otherwise.
 
-What it learns from:
+What an algorithm learns from:
 
-- `Batch`: rollouts side by side, numpy arrays [T, ΣN, …]. `LossInput`: the rows of a minibatch that `ActorCritic.loss` gets.
+- `Batch`: the rollouts of all lanes side by side, as numpy arrays [T, ΣN, …]. `LossInput`: the rows of a minibatch, which
+  `ActorCritic.loss` gets.
 - `Observations` and `Estimates`: argument and result of `ActorCritic.estimate`.
 - `PriorData`: the dataset that `Algorithm.add_prior` gets.
-- `Start`: what a run with `--from` takes from another one; `Algorithm.start_from` gets it.
+- `Start`: what a run with `--from` takes over from the other run, which `Algorithm.start_from` gets.
 - `PolicySpec`, `ActionSpec` and `Leaf`: the policy and the spaces, as plain data.
 
 Tools:
 
-- `gae`, `vtrace` and `EpisodeEnds`: advantages and targets of arrays [T, N].
-- `ActorCriticNetwork`, `QNetwork` and `ActorAndCritics`: the networks that workers act with, and `log_prob_and_entropy`,
-  `policy_log_prob` or `squashed_sample` for their outputs. `trainable`: a leaf of autograd's graph for a flat tensor.
-- `ReplayBuffer`, which gives a `Sample` of transitions, `MixedReplay`, which also draws prior data, `Hindsight`, which gives
-  transitions another goal, and `SequenceReplay`, which gives a `SequenceSample` for a policy with memory; `Transitions`, the
-  tensors of either, with their `Sequences`; and `CriticLoss`, the result of a loss on them.
-- `Encoder`: the layers before the hidden layers of a network; `RecurrentInput`: the input of its recurrent core.
+- `gae` and `vtrace`: compute advantages and value targets from arrays [T, N] and their `EpisodeEnds`.
+- `ActorCriticNetwork`, `QNetwork` and `ActorAndCritics`: the networks that workers act with. `log_prob_and_entropy`,
+  `policy_log_prob` and `squashed_sample` take their outputs. `trainable`: makes a flat tensor a leaf of autograd's graph.
+- `ReplayBuffer`: returns a `Sample` of transitions. `MixedReplay` also samples prior data; `Hindsight` replaces the goals of
+  transitions; `SequenceReplay` returns a `SequenceSample`, for a policy with memory. `Transitions`: the tensors of either
+  sample, with their `Sequences`. `CriticLoss`: the result of a loss on them.
+- `Encoder`: the layers before the hidden layers of a network. `RecurrentInput`: the input of its recurrent core.
 - `ObservationNormalizer` and `RewardScaler`: running statistics of observations and of returns.
-- `features` and `normalize`: observations as these networks take them; `random_shift`: images, moved at random.
-- `UsageError`: raise it, in one line, for settings or spaces that cannot be used.
-- `torch_seed` of a `Purpose`: the seed of a random stream that is independent of all others of a run.
-- `check_finite` and `scheduled`: the check before a gradient step, and settings that fall over the run.
+- `features` and `normalize`: turn observations into the input of these networks. `random_shift`: shifts images at random.
+- `UsageError`: raise it, with a message of one line, for settings or spaces that cannot be used.
+- `torch_seed`: the seed of the random stream for a `Purpose`, which is independent of all other streams of the run.
+- `check_finite`: the check before a gradient step. `scheduled`: the current value of a setting that decreases over the run.
 """
 
 from __future__ import annotations

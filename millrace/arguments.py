@@ -1,12 +1,11 @@
-"""Checks arguments of public functions: they become plain values, and those that aren't settings are checked.
+"""Converts the arguments of public functions to plain values, and checks those that aren't settings.
 
-Rule: arguments become plain values. numpy's scalars and members of enums become Python's numbers and text; a whole number
-has at most 64 bits, and text can be written to a file. A parameter in the signature has the type of its annotation.
-Settings, which a function takes as `**settings: Unpack[ATypedDict]`, are checked where msgspec makes a record of them.
-Arguments annotated as `object` are the user's own objects, and stay unchanged. Errors are one line that begins with the
-function's name.
+Rule: numpy's scalars and members of enums become Python's numbers and text; a whole number has at most 64 bits, and text can
+be written to a file. A parameter in the signature must have the type of its annotation. Settings, which a function takes as
+`**settings: Unpack[ATypedDict]`, are checked later, when msgspec makes a record of them. Arguments annotated as `object` are
+the user's own objects, and stay unchanged. Errors are one line that begins with the function's name.
 
-The signature shows the keys of such a `TypedDict` by name, for `help` and notebooks.
+For `help` and notebooks, the signature shows each key of such a `TypedDict` as a keyword of its own.
 """
 
 from __future__ import annotations
@@ -33,13 +32,13 @@ WORDS: dict[Any, str] = {
     dict: "a dict",
 }
 UNSET = type("Unset", (), {"__repr__": lambda unset: "..."})()
-"""Shown as the default of a keyword whose default depends on other settings"""
+"""Shown by `help` in place of the default of a setting"""
 _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
 
 
 def checked(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
-    """The same function, which raises `UsageError` for arguments that its annotations do not allow."""
+    """Wrap a function, so that it raises `UsageError` for arguments that its annotations do not allow."""
     signature = inspect.signature(function)
     who = function.__qualname__.removesuffix(".__init__").rpartition(".")[2]
 
@@ -68,7 +67,7 @@ def checked(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Re
                     given.arguments[name] = {key: fitting(key, one, hints()[name]) for key, one in value.items()}
                 case inspect.Parameter.VAR_POSITIONAL:
                     given.arguments[name] = tuple(fitting(name, one, hints()[name]) for one in value)
-                case _ if name in hints():  # all but self
+                case _ if name in hints():  # every argument except self
                     given.arguments[name] = fitting(name, value, hints()[name])
         try:
             return function(*given.args, **given.kwargs)
@@ -82,7 +81,7 @@ def checked(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Re
 
 
 def _by_name(function: Callable[..., Any], signature: inspect.Signature) -> Iterator[inspect.Parameter]:
-    """The parameters of a function, with the keys of a TypedDict in place of the dict."""
+    """The parameters of a function, with one for each key of a TypedDict in place of `**settings`."""
     for parameter in signature.parameters.values():
         if _names_keys(parameter.annotation):
             keys = get_args(eval(parameter.annotation, function.__globals__))[0].__annotations__
@@ -93,19 +92,19 @@ def _by_name(function: Callable[..., Any], signature: inspect.Signature) -> Iter
 
 
 def _names_keys(annotation: object) -> bool:
-    """Whether an annotation, given as text, says that keywords are the keys of a TypedDict."""
+    """Whether an annotation (a string) says that the keywords are the keys of a TypedDict."""
     return str(annotation).startswith("Unpack[")
 
 
 def plain(value: Any) -> Any:
-    """The value with Python's scalars in place of numpy's and of subclasses, also in lists, tuples and dicts."""
+    """The value with Python's own scalars in place of numpy's and of subclasses, even inside lists, tuples and dicts."""
     match value:
         case np.generic():
             return value.item()
         case bool():
             return value
         case str():
-            return str.__str__(value)  # `str` would give the name of a member of an enum
+            return str.__str__(value)  # for a member of an enum, `str(value)` would give its name
         case int() | float():
             return (int if isinstance(value, int) else float)(value)
         case list() | tuple() if type(value) in (list, tuple):
@@ -116,7 +115,7 @@ def plain(value: Any) -> Any:
 
 
 def unusable(value: Any) -> str:
-    """What was expected in place of text or a number that doesn't fit into messages and files; empty if it fits."""
+    """Why text or a number can't be written to messages and files, as `expected …`; empty if it can."""
     try:
         match value:
             case os.PathLike():
@@ -131,7 +130,7 @@ def unusable(value: Any) -> str:
 
 
 def fits(value: Any, hint: Any) -> bool:
-    """Whether an annotation allows this value."""
+    """Whether the annotation `hint` allows this value."""
     origin = get_origin(hint)
     parts = get_args(hint)
     if origin in (Union, UnionType):

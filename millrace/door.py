@@ -1,16 +1,17 @@
-"""Everything that an extra in your own package may import: for callbacks, commands and kinds of env copies.
+"""Everything that an extra in your own package may import, to add callbacks, commands or kinds of env copies.
 
 Rule: an extra imports only names of `millrace`, `millrace.algorithms` and this file, so that the rest of millrace may
-change. These are functions and classes, at most forty; no modules.
+change. This file exports at most forty names: functions and classes, but no modules.
 
     commands            `Flag`, `parse_flags`, `one_line`; a command is an entry point of the group `millrace.commands`
     runs on the disk    `find_runs`, `read_line`, `RunLine`, `read_rows`, `read_summary`
-    what a run tells    `Rollout`, `Batch`, `Episode`, `AcceptedRollout`, beside `millrace.Callback` and `millrace.Progress`
+    callbacks           `Rollout`, `Batch`, `Episode`, `AcceptedRollout`, in addition to `millrace.Callback` and
+                        `millrace.Progress`
     kinds of env copies `CopiesKind`, `EnvCopies`, `StepResult`, `CopyFailed`, `EnvSpec`, `RunSpec`; a kind is an entry point
                         of the group `millrace.copies`
-    other data          `PriorData`, from which an algorithm learns besides its own rollouts
+    other data          `PriorData`, from which an algorithm learns in addition to its own rollouts
 
-Imports no torch.
+This module doesn't import torch.
 """
 
 from __future__ import annotations

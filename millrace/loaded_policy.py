@@ -1,7 +1,7 @@
-"""A saved policy that acts: `millrace.load`. Reads the run folder; needs no environment, and torch only for images.
+"""A saved policy that acts: `millrace.load`. It reads the run folder; it needs no environment, and torch only for images.
 
 Rule: for the same observations it chooses the same actions as the workers of `millrace evaluate`, bit for bit, if you pass
-    as many observations at once as a worker plays side by side (`--copies`). In a batch of another size, the last bits of a
+    as many observations at once as a worker has env copies (`--copies`). In a batch of another size, the last bits of a
     matrix product may differ.
 """
 
@@ -30,19 +30,19 @@ from millrace.protocol.rows.array_checks import wrong_values
 from millrace.protocol.specs import Leaf, PolicySpec
 
 Observation: TypeAlias = Any
-"""An array, a number, or a dict or tuple of observations: what the environment returns, or a vector environment."""
+"""An observation as an environment or vector environment returns it: an array, a number, or a dict or tuple of these."""
 
 
 class LoadedPolicy:
-    """A policy from a run folder that acts: `policy(observation)` is an action for `env.step`. `millrace.load` makes it.
+    """A policy loaded from a run folder: `policy(observation)` returns an action for `env.step`. `millrace.load` makes it.
 
     It takes one observation of the environment's space, or n of them stacked along a first axis, and returns one action or
-    n. Actions are the environment's: of the dtype and shape of its action space, counted from its `start` and within its
-    bounds; those of a Dict or Tuple space are a dict or tuple. Pass observations as the environment returns them; the policy
-    normalizes them if it was trained with normalization.
+    n. An action is an element of the environment's action space: it has the space's dtype and shape, is within its bounds,
+    and counts from its `start`. For a Dict or Tuple space it is a dict or tuple. Pass observations as the environment
+    returns them; the policy normalizes them if it was trained with normalization.
 
     A policy with a recurrent core remembers what it saw in each env copy: call `reset(n)` before the first observations, and
-    say with `first` which copies begin a new episode.
+    pass `first` to mark the copies that begin a new episode.
 
     >>> import gymnasium, millrace
     >>> policy = millrace.load(run)
@@ -61,12 +61,12 @@ class LoadedPolicy:
         self.spec: PolicySpec = card.policy
         """The observations, the actions and the network, as plain data."""
         self.parameters: Floats = parameters
-        """The flat float32 vector [P] that `RolloutService.publish` takes: your own learner can start from this policy.
-        `PolicyParameters(policy.spec)` names its pieces.
+        """The parameters, as a flat float32 vector [P]. Your own learner can start from this policy by passing it to
+        `RolloutService.publish`. `PolicyParameters(policy.spec)` names its pieces.
         """
         self.buffers: Floats = buffers
-        """Mean and standard deviation of the observations, flat float32 [2 D], for `publish`; empty if they aren't
-        normalized.
+        """Mean and standard deviation of the observations, as a flat float32 vector [2 D] for `RolloutService.publish`;
+        empty if the policy doesn't normalize them.
         """
         self._name = f"{card.env}, {'best' if best else 'newest'} policy"
         self._policy = make_policy(card.policy)
@@ -77,13 +77,14 @@ class LoadedPolicy:
         self._to_env_action = action_leaves_of(card.policy)
         self._nest = make_nest([part.path for part in card.policy.action.parts] or [()])
         self._generator = None if deterministic else generator(seed, Purpose.PLAYED_ACTIONS)
-        self._state: Floats | None = None  # [1, n, S] of a recurrent policy, once it was reset
+        self._state: Floats | None = None  # [1, n, S]; only if the policy is recurrent, after `reset`
 
     @checked
     def reset(self, copies: int = 1, *, seed: int | None = None) -> None:
-        """Begin new episodes in this number of env copies. A policy with a recurrent core needs this; others don't.
+        """Begin new episodes in this number of env copies. Only a policy with a recurrent core needs this call.
 
-        `seed`: restart the random numbers of a policy that samples its actions. Raises `UsageError` if `copies` is below 1.
+        `seed` restarts the random numbers of a policy that samples its actions. Raises `UsageError` if `copies` is below 1,
+        or so large that the recurrent states don't fit into memory.
 
         >>> import millrace, numpy
         >>> policy = millrace.load(run, deterministic=False)
@@ -94,7 +95,7 @@ class LoadedPolicy:
         check_at_least("reset: seed", seed or 0, 0)
         try:
             self._state = zero_state(self.spec, 1, copies)
-        except (MemoryError, ValueError) as error:  # ValueError: no array can be this long
+        except (MemoryError, ValueError) as error:  # ValueError: longer than any numpy array can be
             raise UsageError(f"reset: copies: expected a number whose states fit into memory, got {copies}") from error
         if seed is not None and self._generator is not None:
             self._generator = generator(seed, Purpose.PLAYED_ACTIONS)
@@ -102,18 +103,20 @@ class LoadedPolicy:
     def __call__(
         self, observation: Observation, *, first: npt.ArrayLike | None = None, mask: npt.ArrayLike | None = None
     ) -> Any:
-        """The action for one observation, as `env.step` takes it; for a batch of n observations, actions [n, *action], or a
-        dict or tuple of arrays [n, *part].
+        """Choose an action for one observation, to pass to `env.step`, or n actions for a batch of n observations.
+
+        A batch of actions is an array [n, *action], or for a Dict or Tuple space a dict or tuple of arrays [n, *part].
 
         Arguments:
             observation: An element of the environment's observation space, or n of them: arrays [n, *leaf]. A Dict or Tuple
                 observation is a dict or tuple of such arrays. The policy normalizes it if it was trained with normalization.
-            first: For a recurrent policy: True where this observation is the first of an episode. A bool, or [n] of them.
-            mask: Which actions are allowed: [choices] bool or int8, as in `info["action_mask"]`, or [n, choices]. If the
-                policy was trained with masks in its Dict observations, they are read there. None: all are allowed.
+            first: For a recurrent policy: whether this observation is the first of an episode, as a bool or an array [n].
+            mask: Which actions are allowed: [choices] bool or int8, as in `info["action_mask"]`, or [n, choices]. If it is
+                None, a policy that was trained with masks in its Dict observations reads them there; otherwise all actions
+                are allowed.
 
-        Raises `UsageError` if the observation isn't in the space, isn't finite, or is for another number of copies than
-        `reset`.
+        Raises `UsageError` if the observation isn't in the space, isn't finite, or has another number of copies than the
+        `reset` before it; or if the mask has a wrong shape or allows no action.
 
         >>> import millrace
         >>> policy = millrace.load(run)
@@ -147,7 +150,7 @@ class LoadedPolicy:
         return f"<{self._name} of {self.run}; {how}>"
 
     def _state_for(self, n: int, first: npt.ArrayLike | None) -> Floats:
-        """The recurrent state [1, n, S], which the policy updates in place."""
+        """The recurrent state [1, n, S], which the policy updates in place. Raises `UsageError` if `reset` doesn't match."""
         if not self.spec.state_size:
             return zero_state(self.spec, 1, n)
         if self._state is None:
@@ -178,7 +181,7 @@ class LoadedPolicy:
         return allowed
 
     def _leaves(self, observation: Observation) -> tuple[tuple[Array, ...], bool]:
-        """The arrays [1, n, *leaf] of an observation or a batch, and whether it was one observation."""
+        """The arrays [1, n, *leaf] of an observation or a batch of n, and whether it was a single observation."""
         leaves = self.spec.observation
         if len(leaves) == 1 and not leaves[0].path:
             by_path = {"": observation}
@@ -202,14 +205,14 @@ def load(run: str | os.PathLike[str], *, best: bool = False, deterministic: bool
     """Load a policy from a run folder, to act with it: `policy(observation)` returns the action.
 
     Arguments:
-        run: The run folder. The run need not have ended: its policy is saved with each checkpoint.
-        best: Take the policy with the best evaluation during the run (`eval_every`). Otherwise it is the newest one, as in
-            `millrace evaluate`: the policy with which a run that has ended was evaluated at its end.
-        deterministic: Take the most probable action, as `millrace evaluate` does. Otherwise sample it, as in training.
+        run: The run folder. The run may still be training: its policy is saved with each checkpoint.
+        best: Load the policy with the best evaluation during the run (`eval_every`). Otherwise load the newest one, as
+            `millrace evaluate` does; if the run has ended, this is the policy of its final evaluation.
+        deterministic: Choose the most probable action, as `millrace evaluate` does. Otherwise sample it, as in training.
         seed: Seed of sampled actions.
 
-    It reads policy.safetensors and policy.json; neither the environment nor the algorithm must be installed. A policy with
-    images or an encoder imports torch. Raises `UsageError`, with a message of one line, if there is no such policy.
+    It reads policy.safetensors and policy.json; neither the environment nor the algorithm needs to be installed. A policy
+    with images or an encoder imports torch. Raises `UsageError`, with a message of one line, if there is no such policy.
 
     >>> import millrace, numpy
     >>> policy = millrace.load(run)
@@ -222,7 +225,7 @@ def load(run: str | os.PathLike[str], *, best: bool = False, deterministic: bool
 
 
 def _by_path(observation: Observation, path: str) -> Iterator[tuple[str, Any]]:
-    """The arrays of a Dict or Tuple observation, by the policy's names for them."""
+    """The arrays of a Dict or Tuple observation, each with its path (`a/b`), by which the policy knows it."""
     match observation:
         case Mapping():
             parts = list(observation.items())
@@ -236,7 +239,7 @@ def _by_path(observation: Observation, path: str) -> Iterator[tuple[str, Any]]:
 
 
 def _checked(value: Any, leaf: Leaf) -> Array:
-    """An array [*leaf] or [n, *leaf] of the dtype of its space. Raises `UsageError`."""
+    """The value as an array [*leaf] or [n, *leaf] of its space's dtype. Raises `UsageError` if it isn't in the space."""
     try:
         given = np.asarray(value)
     except (ValueError, TypeError):  # rows of different lengths; a tensor on a GPU

@@ -1,4 +1,4 @@
-"""Checks, when `millrace` is imported, that no installed package is too old for it, without importing any."""
+"""Checks, when `millrace` is imported, that no installed package is too old for it. It doesn't import the packages."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ class Oldest(NamedTuple):
 
     version: tuple[int, int]
     file: str
-    """the file of the package that has its version"""
+    """the file of the package that contains its version"""
     asked_by: str
-    """what may have required an older one"""
+    """what may have required an older version, for the error"""
 
 
 OLDEST = {
     "gymnasium": Oldest((1, 1), "__init__.py", "a package of environments"),
-    "numpy": Oldest((2, 0), "version.py", "another package"),  # in older versions, a uint64 and an int together gave a float
+    "numpy": Oldest((2, 0), "version.py", "another package"),  # in older versions, uint64 and int promote to float
 }
 VERSION = re.compile(r"""^(?:__version__|version) *= *["'](\d+\.\d+[\d.]*)""", re.MULTILINE)
 
@@ -47,9 +47,10 @@ def check_versions() -> None:
 
 
 def _too_old(name: str, oldest: Oldest) -> str:
-    """A line if the installed package is too old; empty if it isn't, or isn't installed.
+    """An error line if the installed package is too old; empty if it is new enough or isn't installed.
 
-    Its version is read in its source text: `importlib.metadata` takes a third of the time of `import millrace`.
+    The version is read from the package's source text, because `importlib.metadata` would take a third of the time of
+    `import millrace`.
     """
     folder = _folder(name)
     try:
@@ -68,7 +69,7 @@ def _too_old(name: str, oldest: Oldest) -> str:
 
 
 def _folder(name: str) -> Path | None:
-    """The folder of the package that `import NAME` finds, or has found; None if there is none."""
+    """The folder of the package that `import NAME` finds or has already imported; None if there is none."""
     module = sys.modules.get(name)
     spec = getattr(module, "__spec__", None) if module is not None else importlib.util.find_spec(name)
     if spec is None or not spec.submodule_search_locations:

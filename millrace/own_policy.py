@@ -1,4 +1,4 @@
-"""A user-defined policy: the callable that makes it in the workers, and its declarations. Imports no torch."""
+"""A user-defined policy: the callable that makes it in the workers, and its declared arrays. Imports no torch."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ BATCH_NAMES = frozenset(
 
 @dataclass(frozen=True)
 class OwnPolicy:
-    """A policy that you wrote, for `RolloutService`: any network and distribution, in any framework that the workers have.
+    """Your own policy for `RolloutService`: any network and distribution, in any framework that the workers have installed.
 
     >>> import millrace, numpy
     >>> class Policy:
@@ -40,25 +40,26 @@ class OwnPolicy:
     ...     service.gather().extras["logits"].shape
     (8, 2, 2)
 
-    `factory(**kwargs)` is called in each worker and returns such an object. `act` is called once for each step of a lane,
-    with exactly its copies; if they have several agents, with all of them, including those that wait or have left. Their
-    memory is `state` [N, state_size] float32, which is zeros when an episode begins; if the object keeps nothing else
-    between its calls, results do not depend on the number of workers. An action is whole numbers that count from 0, or
-    float32, which is clipped to the space after it was stored. If the environment has action masks, `act` also gets `mask=`
-    [N, choices] bool, and must choose an allowed action. `service.evaluate` calls the object's `act_greedy` if there is one,
-    else `act`. docs/how-to/own_learner.md has more.
+    Each worker calls `factory(**kwargs)`, which returns such an object. `act` is called once for each step of a lane, with
+    the observations of all its copies; if copies have several agents, of all the agents, including those that wait or have
+    left. `state` [N, state_size] float32 is the policy's memory, which is zero when an episode begins. If the object stores
+    nothing else between calls, results do not depend on the number of workers. An action consists of whole numbers that
+    count from 0, or of float32 numbers, which are clipped to the space after they were stored. If the environment has action
+    masks, `act` also gets `mask=` [N, choices] bool, and must choose an allowed action. `service.evaluate` calls the
+    object's `act_greedy` if it has one, and `act` otherwise. See also docs/how-to/own_learner.md.
     """
 
     factory: str | Callable[..., object]
     """`module:callable`, which every worker can import; or a callable, which is sent to the workers by cloudpickle (over
     ipc, inproc, or tcp with keys)"""
     arrays: Mapping[str, tuple[int, ...]]
-    """shape of each of its parameters, by name: what `publish` takes and `load` gets, as float32"""
+    """shape of each parameter array, by name: `publish` takes these arrays, and `load` gets them as float32"""
     extras: Mapping[str, Any] = field(default_factory=dict)
-    """dtype of each further array that `act` returns, by name, as numpy.dtype takes it: `"float32"` for a number of each
-    action, `("float32", (2,))` for an array of shape [2]. `log_prob` must be float32; it is then `batch.log_prob`"""
+    """dtype of each further array that `act` returns, by name, as numpy.dtype takes it: `"float32"` for one number per
+    action, `("float32", (2,))` for an array of shape [2] per action. `log_prob` must be float32; it becomes `batch.log_prob`
+    """
     state_size: int = 0
-    """S, how many numbers the state of one column has"""
+    """S, the number of floats in the state of one column"""
     kwargs: Mapping[str, Scalar] = field(default_factory=dict)
     """keyword arguments of the factory"""
 
@@ -75,11 +76,11 @@ class OwnPolicy:
 
     @property
     def extra_arrays(self) -> tuple[ExtraArray, ...]:
-        """The declared extras except `log_prob`. Raises `UsageError`."""
+        """The declared extras except `log_prob`. Raises `UsageError` if a declaration can't be used."""
         return tuple(extra for extra in self._declared() if extra != LOG_PROB)
 
     def spec(self, observation: tuple[Leaf, ...], action: ActionSpec) -> PolicySpec:
-        """The policy for these spaces. Raises `UsageError` for declarations that cannot be used."""
+        """The specification of the policy for these spaces. Raises `UsageError` if a declaration can't be used."""
         if not (isinstance(self.factory, str) or callable(self.factory)):
             raise UsageError(f"policy: factory: expected module:callable or a callable, got {self.factory!r:.60}")
         for name, table in (("arrays", self.arrays), ("extras", self.extras), ("kwargs", self.kwargs)):

@@ -1,4 +1,4 @@
-"""Evaluating a run's policy: the command `evaluate`, the function of the same name, and parts that `record` shares.
+"""`evaluate` and `record`: the functions in Python, and what they share with the commands of the same names.
 
 Rule: each keyword of the function is a flag of the command with the same name and default. Worker processes play
 the episodes; the caller's process runs no environment code.
@@ -28,16 +28,18 @@ from millrace.protocol.envs.wrappers import WrapperLike
 from millrace.protocol.errors import UsageError, did_you_mean
 from millrace.terminal import count_line
 
-NOT_KEYWORDS = ("wrappers",)  # in Python they may be objects, and are passed separately
+NOT_KEYWORDS = ("wrappers",)  # may be objects in Python, so functions take them as parameters of their own
 ShowPlayed = Callable[[str], None]
-"""Gets the progress, as text."""
+"""Takes the progress as text, and shows it."""
 _Flags = TypeVar("_Flags", bound=PlayFlags)
 RecordVideos = Callable[[PolicyPlayer, Path, int, int, int, str], tuple[Evaluation, list[Path]]]
-"""Gets player, run folder, episodes, seed, max_steps and the prefix of the names of the videos."""
+"""Takes the player, run folder, episodes, seed, max_steps, and the prefix of the videos' file names. Returns the evaluation
+and the paths of the videos.
+"""
 
 
 class Given(NamedTuple):
-    """Replaces the environment and the wrappers that the run remembers by name."""
+    """The environment and the wrappers to use in place of those that the run stores by name; None: use the stored ones."""
 
     env: EnvLike | None = None
     wrappers: Sequence[WrapperLike] | None = None
@@ -76,18 +78,19 @@ def evaluate(
 
     Arguments:
         run: A `Run`, or a run folder.
-        episodes: Number of episodes; if not given 100, or 3 with `video`.
+        episodes: Number of episodes; by default 100, or 3 with `video`.
         env: The environment that the run was started with, if it can't be found by its name because it was made in another
-            script or notebook. (`Run.evaluate` of the `Run` that `train` returned knows it.)
-        wrappers: Likewise the wrappers.
-        progress: Show how far it is.
-        **keywords: The flags of `millrace evaluate`. `seed` of the episodes; `best`, to use the policy with the best
-            evaluation during the run in place of the newest; `against`, a run folder whose policy plays the other teams
-            of a game; the number of `workers`, and of the `copies` that each plays side by side; `max_steps` of all
-            episodes together; `transport` or `bind`; `inference`; `max_env_failures`; `video`, to film them.
+            script or notebook. (You don't need it for `Run.evaluate` of the `Run` that `train` returned.)
+        wrappers: The wrappers that the run was started with, if they can't be found by their names either.
+        progress: Show the progress.
+        **keywords: The flags of `millrace evaluate`: `seed` of the episodes; `best`, to use the policy with the best
+            evaluation during the run instead of the newest; `against`, the run folder of a policy that plays the other teams
+            of a game; `workers`, the number of worker processes, and `copies`, the number of episodes that each plays at the
+            same time; `max_steps`, the env steps of all episodes together; `video`, to film the episodes; `transport`,
+            `bind`, `inference` and `max_env_failures`.
 
-    Returns the `Evaluation`: `return_mean`, `return_std`, `length_mean`, `episodes` and `cut`. It does not depend on the
-    number of workers. Raises `UserFacingError` with a message of one line.
+    Returns an `Evaluation`: `return_mean`, `return_std`, `length_mean`, `episodes` and `cut`. The result does not depend on
+    the number of workers. Raises `UserFacingError` with a message of one line.
 
     >>> import millrace
     >>> result = millrace.evaluate(run, episodes=2, workers=1)
@@ -110,22 +113,23 @@ def record(
     progress: bool = True,
     **keywords: Unpack[RecordKeywords],
 ) -> RecordedDataset:
-    """Write episodes of a run's policy as a Minari dataset, as `millrace record` does. It needs the pip extra `record`.
+    """Write episodes of a run's policy as a Minari dataset, as `millrace record` does. This needs the pip extra `record`.
 
     Arguments:
         run: A `Run`, or a run folder.
         out: Id of the dataset, such as `cartpole/expert-v0`. It is written to MINARI_DATASETS_PATH, or to
             ~/.minari/datasets.
-        steps: Number of env steps. The last episode is finished, unless that would take more than twice as many.
+        steps: Number of env steps. The last episode is finished, unless that would take more than twice this number.
         env: The environment that the run was started with, if it can't be found by its name because it was made in another
-            script or notebook. (`Run.record` of the `Run` that `train` returned knows it.)
-        wrappers: Likewise the wrappers.
-        progress: Show how far it is.
-        **keywords: The flags of `millrace record`: `stochastic`, to sample actions; `npy`, a file for rows of observation
-            and action; `seed`, `best`, `workers`, `transport`, `bind`, `inference` and `max_env_failures`.
+            script or notebook. (You don't need it for `Run.record` of the `Run` that `train` returned.)
+        wrappers: The wrappers that the run was started with, if they can't be found by their names either.
+        progress: Show the progress.
+        **keywords: The flags of `millrace record`: `stochastic`, to sample actions; `npy`, a file to which each step is also
+            written as a row of observation and action; `seed`, `best`, `workers`, `transport`, `bind`, `inference` and
+            `max_env_failures`.
 
-    Returns a `RecordedDataset`: `dataset_id`, `episodes`, `steps`, `return_mean`, `return_std` and `cut`. It does not depend
-    on the number of workers. Raises `UserFacingError` with a message of one line; in that case no files are left.
+    Returns a `RecordedDataset`: `dataset_id`, `episodes`, `steps`, `return_mean`, `return_std` and `cut`. The dataset does
+    not depend on the number of workers. Raises `UserFacingError` with a message of one line; then no files are left behind.
 
     >>> import millrace
     >>> millrace.record(run, "cartpole/example-v0", steps=20, workers=1).dataset_id
@@ -138,7 +142,10 @@ def record(
 
 
 def flags_of(kind: type[_Flags], name: str, **keywords: Any) -> _Flags:
-    """The flags from these keyword arguments. Raises `UsageError`, which names a wrong one."""
+    """The record `kind` made of these keyword arguments. Raises `UsageError`, which names the wrong keyword.
+
+    `name`: the function that was called, for errors.
+    """
     fields = fields_of(kind)
     for keyword in keywords:
         if keyword not in fields or keyword in NOT_KEYWORDS:
@@ -148,9 +155,9 @@ def flags_of(kind: type[_Flags], name: str, **keywords: Any) -> _Flags:
 
 
 def play(flags: EvaluateFlags, watch: ShowPlayed, given: Given | None = None) -> tuple[Evaluation, list[Path]]:
-    """Play greedy episodes. Returns their evaluation, and the paths of the videos if there are any.
+    """Play greedy episodes. Returns their evaluation and the paths of the videos, if any.
 
-    Raises `UserFacingError`, or `KeyboardInterrupt` if the user stops it.
+    Raises `UserFacingError`, or `KeyboardInterrupt` if the user interrupts it.
     """
     episodes = flags.episodes if flags.episodes is not None else 3 if flags.video else 100
     record_videos: RecordVideos | None = None
@@ -173,7 +180,10 @@ def play(flags: EvaluateFlags, watch: ShowPlayed, given: Given | None = None) ->
 
 
 def playing_workers(flags: PlayFlags, count: int, copies: int) -> PlayingWorkers:
-    """`count` local workers that play episodes, or workers from elsewhere, on at most `copies` env copies each."""
+    """`count` local workers that play the episodes, or workers that join from elsewhere at `flags.bind`.
+
+    `copies`: see `PlayingWorkers.copies`.
+    """
     settings = RolloutConfig(max_env_failures=flags.max_env_failures)
     return PlayingWorkers(count, flags.transport, flags.bind, flags.inference, copies, settings)
 
@@ -183,7 +193,7 @@ def _which(flags: PlayFlags) -> Which:
 
 
 def policy_to_play(flags: PlayFlags, given: Given | None) -> SavedPolicy:
-    """The policy to play, and its environment. Raises `UserFacingError` if one of them is not found or cannot be played."""
+    """The policy to play and its environment. Raises `UserFacingError` if one of them can't be found or can't be played."""
     env, wrappers = given or Given(flags.env or None, flags.wrappers or None)
     saved = saved_policy(flags.run, _which(flags), env=env, wrappers=wrappers)
     if saved.seats and flags.inference == "learner":

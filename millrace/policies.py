@@ -1,7 +1,7 @@
-"""The policies that workers can act with: how a user chooses one, and where its parameters are in the flat vector.
+"""The policies that workers can act with: the classes by which a user chooses one, and the layout of its flat parameters.
 
-A policy here is only the acting part: observation in, distribution over actions out. Anything else that a learner trains,
-such as a critic, is up to the learner. Imports no torch.
+A policy here is only the acting part: it maps an observation to a distribution over actions. Anything else that a learner
+trains, such as a critic, is up to the learner. Imports no torch.
 """
 
 from __future__ import annotations
@@ -30,19 +30,19 @@ class PolicyChoice(Protocol):
 
     @property
     def extra_arrays(self) -> tuple[ExtraArray, ...]:
-        """Further arrays that it returns with its actions."""
+        """Further arrays that the policy returns with its actions."""
         ...
 
     def spec(self, observation: tuple[Leaf, ...], action: ActionSpec) -> PolicySpec:
-        """The policy for these spaces. Raises `UsageError` if there is none."""
+        """The specification of the policy for these spaces. Raises `UsageError` if it can't be used with them."""
         ...
 
 
 @dataclass(frozen=True, init=False)
 class MLP:
-    """Hidden layers and a linear output: `MLP(64, 64)`.
+    """A policy with fully connected hidden layers and a linear output: `MLP(64, 64)`.
 
-    If the observation has images, they go through convolutions first, as with `CNN`.
+    Images in the observation first pass through convolutions, as they do in `CNN`.
 
     >>> import millrace
     >>> with millrace.RolloutService("CartPole-v1", millrace.MLP(32), workers=1, envs=2, lanes=1) as service:
@@ -54,7 +54,7 @@ class MLP:
     """widths of the hidden layers"""
     activation: Activation
     normalize_observations: bool
-    """subtract a mean and divide by a standard deviation, which are published as buffers; clip to ±10"""
+    """subtract a mean from observations, divide by a standard deviation, and clip to ±10; both are published as buffers"""
 
     @checked
     def __init__(self, *net: int, activation: Activation = "tanh", normalize_observations: bool = False) -> None:
@@ -64,11 +64,11 @@ class MLP:
 
     @property
     def extra_arrays(self) -> tuple[ExtraArray, ...]:
-        """None: a batch has its log-probabilities."""
+        """Empty: a batch always has the log-probabilities of this policy."""
         return ()
 
     def spec(self, observation: tuple[Leaf, ...], action: ActionSpec) -> PolicySpec:
-        """The policy for these spaces."""
+        """The specification of the policy for these spaces. Raises `UsageError` if a width isn't positive."""
         if not all(width > 0 for width in self.net):
             raise UsageError(f"policy: expected widths of hidden layers, as in MLP(64, 64), got {self.net}")
         return PolicySpec(
@@ -82,7 +82,9 @@ class MLP:
 
 @dataclass(frozen=True, init=False)
 class CNN(MLP):
-    """Convolutions for images, then hidden layers: `CNN(512)`. Large images get those of Mnih et al. (2015).
+    """A policy with convolutions for images, followed by hidden layers: `CNN(512)`.
+
+    Large images get the convolutions of Mnih et al. (2015), small images two 3 x 3 convolutions.
 
     >>> import millrace
     >>> millrace.CNN(128).net
@@ -94,7 +96,7 @@ class CNN(MLP):
         super().__init__(*(net or (512,)), activation=activation, normalize_observations=normalize_observations)
 
     def spec(self, observation: tuple[Leaf, ...], action: ActionSpec) -> PolicySpec:
-        """The policy for these spaces. Raises `UsageError` if the observation has no image."""
+        """The specification of the policy for these spaces. Raises `UsageError` if the observation has no image."""
         found = super().spec(observation, action)
         if not found.convolves:
             shapes = ", ".join(f"{leaf.dtype}{list(leaf.shape)}" for leaf in observation)
@@ -104,9 +106,9 @@ class CNN(MLP):
 
 @dataclass(frozen=True, init=False)
 class Recurrent(MLP):
-    """A recurrent core, then hidden layers: `Recurrent(64, core="lstm", core_size=64)`.
+    """A policy with a recurrent core, followed by hidden layers: `Recurrent(64, core="lstm", core_size=64)`.
 
-    A batch has the core's state before its first row in `state`.
+    `RolloutBatch.state` is the state of the core before the batch's first row.
 
     >>> import millrace
     >>> policy = millrace.Recurrent(32, core="gru", core_size=16)
@@ -118,7 +120,7 @@ class Recurrent(MLP):
 
     core: Core
     core_size: int
-    """number of units of the core"""
+    """number of units in the core"""
 
     @checked
     def __init__(
@@ -134,7 +136,7 @@ class Recurrent(MLP):
         object.__setattr__(self, "core_size", core_size)
 
     def spec(self, observation: tuple[Leaf, ...], action: ActionSpec) -> PolicySpec:
-        """The policy for these spaces."""
+        """The specification of the policy for these spaces. Raises `UsageError` if `core_size` is below 1."""
         check_at_least("policy: core_size", self.core_size, 1)
         return msgspec.structs.replace(super().spec(observation, action), core=self.core, core_size=self.core_size)
 
@@ -149,11 +151,11 @@ class Piece(NamedTuple):
     """
 
     name: str
-    """as `actor.0.weight`; weights are [outputs, inputs]"""
+    """such as `actor.0.weight`; weights have shape [outputs, inputs]"""
     shape: tuple[int, ...]
     offset: int
     gain: float
-    """gain of the orthogonal initialization; 0: it starts at zero"""
+    """gain of the orthogonal initialization; 0: initialized to zero"""
 
     @property
     def size(self) -> int:
@@ -178,15 +180,15 @@ class PolicyParameters:
         self._fields = parameter_layout(spec)[0]
         self._buffer_fields = buffer_layout(spec)
         self.layout = _pieces(self._fields)
-        """Its pieces, in order."""
+        """The pieces of the flat vector, in order."""
         self.buffers = _pieces(self._buffer_fields)
         """The pieces of the buffers: `observation_mean` and `observation_std` if observations are normalized."""
 
     @checked
     def initial(self, seed: int = 1) -> Floats:
-        """Initial parameters [P] float32: orthogonal weights with the gains of the layout, biases 0.
+        """Initial parameters [P] float32: orthogonal weights, scaled by the gains in `layout`, and zero biases.
 
-        Raises `UsageError` for an `OwnPolicy`: only you know its initial values.
+        Raises `UsageError` for an `OwnPolicy`, because only you know its initial values.
 
         >>> import millrace
         >>> parameters = millrace.PolicyParameters(millrace.load(run).spec)
@@ -220,7 +222,9 @@ class PolicyParameters:
         return named_views(flat, self._fields)
 
     def flat(self, parameters: Mapping[str, Array] | Array) -> Floats:
-        """A flat copy [P] float32 of a flat vector, or of arrays by name. Raises `UsageError`.
+        """A flat copy [P] float32 of a flat vector, or of arrays by name.
+
+        Raises `UsageError` if an array is missing, has a wrong shape, or isn't finite.
 
         >>> import millrace
         >>> parameters = millrace.PolicyParameters(millrace.load(run).spec)
@@ -231,7 +235,9 @@ class PolicyParameters:
         return _flat(parameters, self._fields, "parameters")
 
     def flat_buffers(self, buffers: Mapping[str, Array] | Array | None) -> Floats:
-        """A flat float32 copy of buffers. None: mean 0 and standard deviation 1. Raises `UsageError`.
+        """A flat float32 copy of the buffers, given flat or by name. None stands for mean 0 and standard deviation 1.
+
+        Raises `UsageError` if an array is missing, has a wrong shape, or isn't finite.
 
         >>> import millrace
         >>> parameters = millrace.PolicyParameters(millrace.load(run).spec)
@@ -276,7 +282,7 @@ def _flat(given: Mapping[str, Array] | Array, fields: tuple[Field, ...], what: s
 
 
 def _numbers(value: Any, what: str) -> Floats:
-    """The value as a float32 array; a number that is too large for it becomes infinite. Raises `UsageError`."""
+    """The value as a float32 array, in which too large a number becomes infinite. Raises `UsageError` unless it is real."""
     try:
         array = np.asarray(value)
     except ValueError:  # rows of different lengths

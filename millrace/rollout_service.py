@@ -1,4 +1,4 @@
-"""Rollouts for your own learner, in any framework and any loop: millrace collects, you learn.
+"""Rollouts for your own learner, in any framework and any loop: millrace collects the rollouts, you train the policy.
 
     with millrace.RolloutService("CartPole-v1", policy=millrace.MLP(64, 64), workers=2, envs=64) as service:
         parameters = service.policy.initial(seed=1)
@@ -7,8 +7,8 @@
             parameters = update(parameters, batch)
             service.publish(parameters)
 
-The built-in trainer uses the same service: tickets, ledger, lags, faults and reproducible results work as in `millrace
-train`. Imports no torch.
+The built-in trainer uses the same mechanism, so tickets, ledger, lags, faults and reproducible results work as in
+`millrace train`. This module doesn't import torch.
 """
 
 from __future__ import annotations
@@ -50,19 +50,19 @@ from millrace.saved_state import ServiceState, digest, read, unreadable, write
 if TYPE_CHECKING:
     from millrace.learner.algorithms.normalizer import Normalizer
 
-PULSE_S = 0.005  # how often messages are answered while the user computes
-EVALUATION_COPIES = 4  # episodes that a worker plays side by side
+PULSE_S = 0.005  # interval at which messages are answered while the user's code computes
+EVALUATION_COPIES = 4  # number of episodes that a worker plays at the same time
 
 
 class RolloutBatch(Batch, frozen=True, kw_only=True, eq=False):
-    """One rollout of each lane, side by side: T steps of N env copies. All arrays are writable and yours.
+    """One rollout of each lane, side by side: T steps of N env copies. All arrays are yours, and writable.
 
-    Row t says: in `obs[t]` the policy took `action[t]`, got `reward[t]` and saw `obs[t + 1]`, wherever `valid[t]`. A row
-    that is not valid only resets its env copy: leave it out of every loss, return and count.
+    In row t of a column, the policy observed `obs[t]`, took `action[t]`, and got `reward[t]` and `obs[t + 1]`, if `valid[t]`
+    is True. A row that isn't valid only resets its env copy: leave it out of every loss, return and count.
 
-    With several agents, each has a column: N is the number of copies times `len(service.seats)`, and the columns of a copy
-    are adjacent. A row that is not valid may then also belong to an agent that waits for others, or has left: a return or a
-    recurrent state that is carried along the column passes through it unchanged.
+    If the environment has several agents, each agent has a column: N is the number of copies times `len(service.seats)`, and
+    the columns of a copy are adjacent. Then a row that isn't valid may also belong to an agent that waits for others or has
+    left: carry returns and recurrent states through such a row unchanged.
 
     >>> import millrace
     >>> with millrace.RolloutService("CartPole-v1", workers=1, envs=2, lanes=1, rollout_steps=8) as service:
@@ -71,23 +71,28 @@ class RolloutBatch(Batch, frozen=True, kw_only=True, eq=False):
     >>> isinstance(batch, millrace.RolloutBatch), batch.obs.shape, batch.action.shape
     (True, (9, 2, 4), (8, 2))
 
-    Beside the fields below it has `action` [T, N, *action] (int64 counted from 0, or float32 before clipping), `reward`
-    [T, N] float32 (raw), `terminated`, `truncated` and `valid` [T, N] bool, `state` [N, S] float32 before `obs[0]`, `lane`
-    [N] int64, `fresh` [N] bool (False where a column continues the batch before), `columns_per_rollout`
-    (those of a lane are adjacent), `mask` [T+1, N, choices] bool of the actions that were allowed (None without action
-    masks), and `episodes`, which have `reward` (the return, of all agents together), `length`, `seconds` and `facts`. With
-    several agents, `resets` [T+1, env copies] bool says which steps only reset a copy; the last row is of the next batch's
-    first step.
+    In addition to the fields below, a batch has
+
+    - `action` [T, N, *action]: int64 counted from 0, or float32 before clipping;
+    - `reward` [T, N] float32: raw rewards;
+    - `terminated`, `truncated` and `valid`, each [T, N] bool;
+    - `state` [N, S] float32: the state of the policy before `obs[0]`;
+    - `lane` [N] int64: the lane of each column; `columns_per_rollout`: the number of columns of a lane, which are adjacent;
+    - `fresh` [N] bool: False where a column continues the batch before;
+    - `mask` [T+1, N, choices] bool: the actions that were allowed; None without action masks;
+    - `episodes`: the episodes that ended, with `reward` (the return, summed over all agents), `length`, `seconds`, `facts`;
+    - `resets` [T+1, env copies] bool, if there are several agents: which steps only reset a copy; the last row is about the
+      first step of the next batch.
     """
 
     obs: Any
-    """[T+1, N, *shape]; for a Dict or Tuple observation a dict with such an array for each leaf, by its path `a/b`"""
+    """[T+1, N, *shape]; for a Dict or Tuple observation, a dict with such an array for each leaf, by its path `a/b`"""
     log_prob: Any
-    """[T, N] float32 of the action, under the policy that acted; None if it is your own and does not return it"""
+    """[T, N] float32: log-probability of the action under the policy that acted; None if an `OwnPolicy` doesn't return it"""
     extras: Any
-    """further arrays that your own policy returned, by name: {name: [T, N, *shape]}; empty for built-in policies"""
+    """further arrays that an `OwnPolicy` returned, by name: {name: [T, N, *shape]}; empty for built-in policies"""
     version: Ints
-    """[N] int64, the version of the weights that acted"""
+    """[N] int64: version of the weights that chose the actions"""
 
     def __repr__(self) -> str:
         T, N = self.reward.shape
@@ -95,18 +100,19 @@ class RolloutBatch(Batch, frozen=True, kw_only=True, eq=False):
 
 
 class RolloutService:
-    """Collects rollouts of one policy with worker processes, here or elsewhere, for your own learner.
+    """Collects rollouts of one policy with worker processes, on this machine or elsewhere, for your own learner.
 
-    Use it in a `with` statement and from one thread. While you compute, a thread of the service answers the workers, so a
-    long computation loses none of them.
+    Use it in a `with` statement and from one thread. While your code computes, a thread of the service answers the workers,
+    so that none of them is lost during a long computation.
 
-    `publish` sets the weights: the flat float32 vector [P] of the policy, or an array for each of its pieces. Iterating, or
-    `gather`, gives a `RolloutBatch` for each update: T = `rollout_steps` rows of `envs` env copies. It waits until one
-    rollout of each lane has arrived. The batch was collected with the weights that were the newest when `gather` was called
-    `max_lag` batches earlier: with 0, with those that you published last.
+    `publish` sets the weights: the flat float32 vector [P] of the policy, or an array for each of its pieces. `gather`, or
+    one iteration over the service, waits until one rollout of each lane has arrived, and returns them as a `RolloutBatch` of
+    T = `rollout_steps` rows of `envs` env copies. The batch was collected with the weights that were the newest when
+    `gather` was called `max_lag` batches earlier; with `max_lag=0`, these are the weights that you published last.
 
-    After `close`, and from another thread, every method raises `UsageError`. `gather` and `evaluate` raise `RunError` if no
-    batch can come: `NoWorkers`, `Stalled`, `EnvironmentFailed` or `PolicyFailed`. Ctrl-C raises `KeyboardInterrupt`.
+    `publish`, `gather`, `evaluate` and `save` raise `UsageError` after `close`, and if they are called from another thread.
+    `gather` and `evaluate` raise a `RunError` if no further rollout can arrive: `NoWorkers`, `Stalled`, `EnvironmentFailed`
+    or `PolicyFailed`. Ctrl-C raises `KeyboardInterrupt`.
 
     >>> import millrace
     >>> with millrace.RolloutService("CartPole-v1", millrace.MLP(64), workers=1, envs=4, rollout_steps=8) as service:
@@ -133,20 +139,20 @@ class RolloutService:
         """Start the workers and wait until they have joined.
 
         Args:
-            env: an id that `gymnasium.make` takes, a `gymnasium.envs.registration.EnvSpec`, or a callable that returns an
-                environment; it may be defined only in your script or notebook. It may be a PettingZoo environment, with
+            env: an id that `gymnasium.make` accepts, a `gymnasium.envs.registration.EnvSpec`, or a callable that returns an
+                environment. The environment may be defined in your script or notebook, and it may be PettingZoo's, with
                 several agents.
-            wrappers: applied to every env copy in its worker, the first one innermost: classes, functions, or names as
-                "gymnasium.wrappers:FlattenObservation".
             policy: `MLP`, `CNN`, `Recurrent` or your `OwnPolicy`; by default `MLP(64, 64)`.
-            rollout_steps: T, env steps of an env copy in a batch.
-            restore: a file that `save` wrote; `restored` then has its arrays.
-            **settings: those of `millrace train` for environments, workers, network and timeouts, with the same names and
-                defaults: `envs=8`, `lanes=4`, `max_lag=0`. With `bind="tcp://0.0.0.0:5555"` no worker is
+            wrappers: applied to every env copy in its worker, the first one innermost: classes, functions, or names such as
+                "gymnasium.wrappers:FlattenObservation".
+            rollout_steps: T, the number of steps of each env copy in a batch.
+            restore: a file that `save` wrote, from which to continue. Your arrays in it are then in `restored`.
+            **settings: the settings of `millrace train` for environments, workers, network and timeouts, with the same names
+                and defaults, such as `envs=8`, `lanes=4` and `max_lag=0`. With `bind="tcp://0.0.0.0:5555"` no worker is
                 started here: workers elsewhere join with `millrace worker`.
 
         Raises `UsageError` if an argument is wrong, `NoWorkers` if too few workers join in time, `EnvironmentFailed` if the
-        environment cannot be made, and `PolicyFailed` if your `OwnPolicy` cannot.
+        environment can't be made, and `PolicyFailed` if your `OwnPolicy` can't be made.
         """
         listens = bool(settings.get("bind"))
         config = _config(env, wrappers, dict(settings))
@@ -157,11 +163,11 @@ class RolloutService:
             )
         check_at_least("rollout_steps", rollout_steps, 1)
         self.restored: dict[str, Array] = {}
-        """The arrays of the file that was restored, by name."""
+        """The arrays that you passed to `save`, by name, if the service was restored; otherwise empty."""
         past: PastRollouts | None = None
         self._version = -1
         self.env_steps: int = 0
-        """Env steps in all batches so far, those before a restore included."""
+        """Env steps in all batches so far, including those before a restore."""
         state: ServiceState | None = None
         if restore is not None:
             state, self.restored = read(Path(restore))
@@ -169,7 +175,7 @@ class RolloutService:
             self._version = max(state.version - 1, -1)
             self.env_steps = state.env_steps
         self.config: RolloutConfig = config
-        """All settings of collecting rollouts."""
+        """All settings of the service."""
         self._interrupts = Interrupts()
         self._lock = threading.Lock()
         self._over = threading.Event()
@@ -206,7 +212,7 @@ class RolloutService:
         self.policy: PolicyParameters = PolicyParameters(self.run.policy)
         """Names, shapes and offsets of the parameters in the flat vector, and initial values."""
         self.seats: tuple[str, ...] = self.run.seats
-        """The agents of each env copy, in the order of their columns; none if the environment is gymnasium's."""
+        """The names of the agents of each env copy, in the order of their columns; empty for an environment of one agent."""
         self.observation_space: gymnasium.Space[Any] = described.observation_space
         """The space of a single env copy, or of a single agent."""
         self.action_space: gymnasium.Space[Any] = described.action_space
@@ -218,7 +224,7 @@ class RolloutService:
 
     @property
     def version(self) -> int:
-        """The version of the newest weights; -1 before the first were published.
+        """The version of the newest weights, counted from 0; -1 before any were published.
 
         >>> import millrace
         >>> with millrace.RolloutService("CartPole-v1", workers=1, envs=2, lanes=1, rollout_steps=8) as service:
@@ -231,9 +237,10 @@ class RolloutService:
     def publish(self, parameters: Mapping[str, Array] | Array, buffers: Mapping[str, Array] | Array | None = None) -> int:
         """Set the newest weights, with which rollouts are collected from the next `gather` on. Returns their version.
 
-        `parameters`: the flat vector [P], or an array for each name in `policy.layout`. `buffers` likewise, for a policy
-        that normalizes observations; by default those of `normalizer`. They are copied.
-        Raises `UsageError` for wrong shapes, or numbers that are not finite.
+        `parameters`: the flat vector [P], or an array for each name in `policy.layout`. `buffers`: likewise, flat or by the
+        names in `policy.buffers`, for a policy that normalizes observations; by default `normalizer.buffers()` if you have
+        used `normalizer`, otherwise mean 0 and standard deviation 1. All arrays are copied.
+        Raises `UsageError` for wrong shapes, or numbers that aren't finite.
 
         >>> import millrace
         >>> with millrace.RolloutService("CartPole-v1", workers=1, envs=2, lanes=1, rollout_steps=8) as service:
@@ -253,8 +260,10 @@ class RolloutService:
 
     @property
     def normalizer(self) -> Normalizer:
-        """Running mean and standard deviation of observations and returns, as in the built-in trainer. It is made, and torch
-        imported, when it is first asked for; `publish` then sends its numbers to a policy that normalizes observations.
+        """Running mean and standard deviation of observations and returns, as in the built-in trainer.
+
+        The first access makes it, and imports torch. From then on, `publish` sends its mean and standard deviation to a
+        policy that normalizes observations.
 
         >>> import millrace
         >>> with millrace.RolloutService("CartPole-v1", workers=1, envs=2, lanes=1, rollout_steps=8) as service:
@@ -270,11 +279,11 @@ class RolloutService:
         return self._normalizer
 
     def gather(self) -> RolloutBatch:
-        """Wait for the next batch.
+        """Wait for the next batch, and return it.
 
-        Raises `NoWorkers` if there has been none for `no_workers_timeout_s`, `EnvironmentFailed` or `PolicyFailed` if it
-        failed more often than `max_env_failures` allows, `Stalled` if no env step has ended for ten minutes (or as long as
-        one may take), and `UsageError` before the first `publish`.
+        Raises `NoWorkers` if there has been no worker for `no_workers_timeout_s`, `EnvironmentFailed` or `PolicyFailed` if
+        the environment or the policy failed more often than `max_env_failures` allows, `Stalled` if no env step has ended
+        for ten minutes (or for as long as one env step may take), and `UsageError` before the first `publish`.
 
         >>> import millrace
         >>> with millrace.RolloutService("CartPole-v1", workers=1, envs=2, lanes=1, rollout_steps=8) as service:
@@ -295,16 +304,16 @@ class RolloutService:
         return batch
 
     def __iter__(self) -> Iterator[RolloutBatch]:
-        """Batches without end: `gather` again and again."""
+        """Yield batches forever: each one is the result of `gather`."""
         while True:
             yield self.gather()
 
     @checked
     def evaluate(self, episodes: int = 100, *, seed: int = 1_000_000, max_steps: int = 1_000_000) -> Evaluation:
-        """Let the workers play greedy episodes with the newest weights, on other env copies than those of the rollouts.
+        """Let the workers play greedy episodes with the newest weights, on env copies that aren't used for rollouts.
 
-        The result does not depend on the number of workers. `max_steps`: env steps of the whole evaluation at most; each
-        episode gets an equal share.
+        The result does not depend on the number of workers. `seed`: seed of the episodes. `max_steps`: the largest number of
+        env steps of all episodes together; each episode gets an equal share, and is cut at that step.
 
         >>> import millrace
         >>> with millrace.RolloutService("CartPole-v1", workers=1, envs=2, lanes=1, rollout_steps=8) as service:
@@ -328,12 +337,12 @@ class RolloutService:
     def save(self, path: str | os.PathLike[str], **arrays: object) -> None:
         """Write the service's state and your arrays into one .npz file, atomically.
 
-        Call it right after `publish`. `RolloutService(..., restore=path)` continues from it: ledger, versions, rounds and
-        normalizer continue, and `restored` has the arrays. Workers repeat the episodes that ran when the last batch was
-        gathered, and continue from there. If the environment repeats itself, the next batches are those that this service
-        returns next.
+        Call it right after `publish`. `RolloutService(..., restore=path)` continues from this file: it restores the ledger,
+        versions, rounds and normalizer, and puts your arrays into `restored`. Its workers first replay the episodes that
+        were running when the last batch was gathered. If the environment is deterministic, the restored service returns the
+        same batches as this service would return next.
 
-        Raises `UsageError` for arrays that are not of numbers, and `RunError` if the file cannot be written.
+        Raises `UsageError` for arrays that don't consist of numbers, and `RunError` if the file can't be written.
 
         >>> import millrace
         >>> with millrace.RolloutService("CartPole-v1", workers=1, envs=2, lanes=1, rollout_steps=8) as service:
@@ -361,7 +370,7 @@ class RolloutService:
         write(Path(path), state, arrays)
 
     def ledger(self) -> dict[str, int]:
-        """What became of every ticket and every transition: `used`, `lost` and so on.
+        """Number of tickets and transitions by what became of them, such as `used` and `lost`.
 
         >>> import millrace
         >>> with millrace.RolloutService("CartPole-v1", workers=1, envs=2, lanes=1, rollout_steps=8) as service:
@@ -374,7 +383,7 @@ class RolloutService:
             return self._hub.snapshot().ledger.counts()
 
     def lags(self) -> dict[str, int]:
-        """Number of rollouts used, by lag.
+        """Number of rollouts in the batches so far, by lag (how many versions newer the newest weights were).
 
         >>> import millrace
         >>> with millrace.RolloutService("CartPole-v1", workers=1, envs=2, lanes=1, rollout_steps=8) as service:
@@ -398,7 +407,7 @@ class RolloutService:
             return sorted(self._hub.snapshot().roles)
 
     def close(self, reason: str = "the learner has ended") -> None:
-        """Ask the workers to leave, and release everything. Does nothing the second time.
+        """Ask the workers to leave, and release all resources. A second call does nothing. `reason`: told to the workers.
 
         >>> import millrace
         >>> service = millrace.RolloutService("CartPole-v1", workers=1, envs=2, lanes=1)
@@ -426,7 +435,7 @@ class RolloutService:
     # ---------------------------------------------------------------- inside
 
     def _answer_workers(self) -> None:
-        """Answer the workers while the user computes. `publish`, `gather` and `evaluate` also do it."""
+        """Answer the workers while the user's code computes. `publish`, `gather` and `evaluate` also answer them."""
         while not self._over.wait(PULSE_S):
             with self._lock:
                 self._hub.pulse()
@@ -449,7 +458,7 @@ class RolloutService:
         )
 
     def _progress(self, lags: Ints) -> Progress:
-        """The progress for `millrace status` after a batch with these lags [N]."""
+        """The progress that `millrace status` shows after a batch whose columns have these lags [N]."""
         return Progress(
             env_steps=self.env_steps,
             steps_per_s=steps_per_second(self.env_steps - self._steps_before, time.monotonic() - self._began_s),
@@ -472,7 +481,7 @@ class RolloutService:
 
 
 def _config(env: EnvLike, wrappers: Sequence[WrapperLike], settings: dict[str, Any]) -> RolloutConfig:
-    """The settings as a record, checked. Raises `UsageError`."""
+    """The settings as a checked record. Raises `UsageError`."""
     known = RolloutConfig.__struct_fields__
     if unknown := [name for name in settings if name not in known]:
         known = (*known, "rollout_steps")

@@ -1,4 +1,4 @@
-"""A run in Python: `millrace.train` makes it, and `millrace.Run` reads its folder whenever you access it.
+"""Runs in Python: `millrace.train` makes a run, and `millrace.Run` reads the run folder at each access.
 
 Rule: parts that a run folder lacks are None or empty, and an unreadable file is an error of one line. The repr never raises.
 """
@@ -51,8 +51,9 @@ _Played = TypeVar("_Played", RunEvaluateKeywords, RunRecordKeywords)
 class Metrics(dict[str, Array]):
     """The metrics of a run: a numpy array [updates] for each name, such as `metrics["rollout/ep_rew_mean"]`.
 
-    Whole numbers are int64. Other columns are float64, with NaN where an update has no such number, for example no
-    evaluation. The names are those of metrics.jsonl, which are Stable-Baselines3's where it has one.
+    Columns of whole numbers are int64. Other columns are float64, with NaN where an update lacks the number, for example
+    because it had no evaluation. The names are those in metrics.jsonl. If Stable-Baselines3 logs the same number, the name
+    is the same as there.
 
     >>> import millrace
     >>> metrics = millrace.Run(run).metrics
@@ -86,18 +87,18 @@ class Picture(Protocol):
         """The representation in a notebook."""
 
     def png(self) -> bytes:
-        """The picture as a PNG. Raises `UsageError` if its packages are not installed."""
+        """The picture as the bytes of a PNG file. Raises `UsageError` if the packages for this are not installed."""
 
     def save(self, out: str | os.PathLike[str]) -> Path:
-        """Write it to a file, whose name ends in .svg or .png. Raises `UserFacingError`, with a one-line message."""
+        """Write the picture to a file, whose name ends in .svg or .png. Raises `UserFacingError` with a one-line message."""
 
 
 class Run(os.PathLike[str]):
-    """A run folder: its results, and methods to use its policy. `millrace.train` returns one.
+    """A run folder: its results, and methods that use its policy. `millrace.train` returns one.
 
-    Everything is read from the folder at each access, so the `Run` of a run that still trains shows how far it is.
-    `os.fspath(run)` is its folder: you can pass a run wherever a path is expected. Raises `UsageError`, with a message of
-    one line, if `path` isn't a run folder.
+    Everything is read from the folder at each access, so you can follow a run that is still training. `os.fspath(run)` is
+    the folder: you can pass a `Run` wherever a path is expected. Raises `UsageError`, with a message of one line, if `path`
+    isn't a run folder.
 
     >>> import millrace
     >>> millrace.Run(run).summary.env
@@ -112,7 +113,9 @@ class Run(os.PathLike[str]):
 
     @classmethod
     def _trained(cls, path: Path, given: Mapping[str, Any]) -> Run:
-        """A run that was just trained. `given`: environment and algorithm, if they are objects of the caller's program."""
+        """The `Run` of a run that was just trained. `given`: the environment, wrappers and algorithm that were passed to
+        `train` as objects instead of names.
+        """
         run = cls.__new__(cls)
         run.path = path
         run._given = dict(given)
@@ -140,7 +143,7 @@ class Run(os.PathLike[str]):
 
     @property
     def metrics(self) -> Metrics:
-        """The metrics of every update, as columns. Rows that cannot be read are left out and counted.
+        """The metrics of every update, as columns. Unreadable rows are left out, and counted in `metrics.unreadable`.
 
         >>> import millrace
         >>> millrace.Run(run).metrics["rollout/ep_rew_mean"].dtype
@@ -155,7 +158,7 @@ class Run(os.PathLike[str]):
 
     @checked
     def evaluate(self, episodes: int | None = None, **keywords: Unpack[RunEvaluateKeywords]) -> Evaluation:
-        """Play greedy episodes of the newest policy: `millrace.evaluate` of this run, with the same keywords.
+        """Play greedy episodes of the newest policy: `millrace.evaluate(run, …)`, with the same keywords.
 
         >>> import millrace
         >>> result = millrace.Run(run).evaluate(episodes=2, workers=1)
@@ -166,7 +169,7 @@ class Run(os.PathLike[str]):
 
     @checked
     def record(self, out: str, steps: int = 50_000, **keywords: Unpack[RunRecordKeywords]) -> RecordedDataset:
-        """Write episodes of the newest policy as a Minari dataset: `millrace.record` of this run, with the same keywords.
+        """Write episodes of the newest policy as a Minari dataset: `millrace.record(run, …)`, with the same keywords.
 
         >>> import millrace
         >>> millrace.Run(run).record("cartpole/of-a-run-v0", steps=20).dataset_id
@@ -176,10 +179,10 @@ class Run(os.PathLike[str]):
 
     @checked
     def resume(self, **keywords: Unpack[ResumeKeywords]) -> Run:
-        """Continue the run from its newest checkpoint: `millrace.train(resume=run)`, with the same keywords.
+        """Continue the run from its newest checkpoint: `millrace.train(resume=run, …)`, with the same keywords.
 
-        If you passed the environment or algorithm to `train` as an object, it is passed again. Returns the run, which has
-        the same folder. A run that has reached its `steps` ends at once, so pass a larger number.
+        If you passed the environment, the wrappers or the algorithm to `train` as an object, this method passes it again.
+        Returns a `Run` with the same folder. A run that has reached its `steps` ends at once, so pass a larger `steps`.
 
         >>> import millrace
         >>> millrace.Run(run).resume(steps=96, progress=False).summary.updates
@@ -189,10 +192,10 @@ class Run(os.PathLike[str]):
 
     @checked
     def plot(self, out: str | os.PathLike[str] | None = None) -> Picture:
-        """Draw the learning curve, as `millrace plot` does. Returns a picture, which a notebook shows.
+        """Plot the learning curve, as `millrace plot` does. Returns a picture, which a notebook shows.
 
-        `out`: also write it to this file, whose name ends in .svg, or in .png (pip install pillow resvg_py). Raises
-        `UsageError` if no episode has ended.
+        `out`: also write the picture to this file, whose name ends in .svg, or in .png (pip install pillow resvg_py). Raises
+        `UsageError` if no episode has ended yet.
 
         >>> import millrace
         >>> picture = millrace.Run(run).plot("curve.svg")
@@ -218,14 +221,14 @@ class Run(os.PathLike[str]):
         return f"<run {self.path}: {', '.join(facts.values())}>"
 
     def _repr_html_(self) -> str:
-        """A small table, for notebooks."""
+        """The representation in a notebook: a small table."""
         rows = {**self._facts(), "folder": str(self.path)}
         cells = [(escape(name), escape(fact.removeprefix(f"{name} "))) for name, fact in rows.items()]
         left = "style='text-align:left'"
         return f"<table>{''.join(f'<tr><th {left}>{name}</th><td {left}>{fact}</td></tr>' for name, fact in cells)}</table>"
 
     def _with_given(self, keywords: _Played) -> _Played:
-        """These keywords, and the objects that were passed to `train` unless the keywords replace them."""
+        """These keywords, plus the environment and wrappers that were passed to `train` unless the keywords replace them."""
         keywords.setdefault("env", self._given.get("env"))
         keywords.setdefault("wrappers", self._given.get("wrappers"))
         return keywords
@@ -260,27 +263,27 @@ def train(
     progress: bool = True,
     **settings: Unpack[TrainKeywords],
 ) -> Run:
-    """Train a policy on this machine: the learner runs in this process, the workers in processes that it starts.
+    """Train a policy on this machine. The learner runs in this process, and starts worker processes.
 
     Arguments:
-        env: An id that `gymnasium.make` takes, a `gymnasium.envs.registration.EnvSpec`, or a callable that returns an
-            environment; it may be defined only in your script or notebook. A resumed run finds it by its name, or you pass
-            it again.
-        wrappers: Applied to every env copy, also in evaluations, the first one innermost: classes, functions, or names as
-            "gymnasium.wrappers:FlattenObservation".
+        env: An id that `gymnasium.make` accepts, a `gymnasium.envs.registration.EnvSpec`, or a callable that returns an
+            environment. The environment may be defined in your script or notebook. A resumed run finds the environment by
+            its name; if it has no importable name, pass it again.
+        wrappers: Applied to every env copy, including those of evaluations, the first one innermost: classes, functions, or
+            names such as "gymnasium.wrappers:FlattenObservation".
         config: A TOML file of settings.
-        resume: A run, or its folder, to continue from its newest checkpoint; or "auto": the newest run of this environment,
-            algorithm and seed if there is one, else a new run.
-        preset: The name of a preset (`millrace presets` lists them); "auto" takes that of `env`; "none" takes none.
-        callbacks: Callbacks between updates, which may also end the run: objects with some of the methods of `Callback`;
-            names as "my_module:factory", which a resumed run finds again; and functions, which get a `Progress` after each
-            update, and several times a second during an evaluation or a long wait.
-        progress: Show how far the run is: in one display in a notebook, in place on a terminal, otherwise as a line every 5
-            s.
-        **settings: The flags of `millrace train`, with the same names: `learning_rate=1e-3`. `algo` may be your own class
-            (`millrace.algorithms`). If it is defined in a script or a notebook, pass it again on resume. Type checkers don't
-            know settings that only your class has: pass them as `**own`, a `dict[str, Any]`. `start_from` may be a `Run`:
-            the new run begins with its policy (`--from`).
+        resume: A `Run` or run folder, to continue from its newest checkpoint; or "auto", to continue the newest run of this
+            environment, algorithm and seed if there is one, and otherwise start a new run.
+        preset: The name of a preset (`millrace presets` lists them); "auto": the preset of `env`, if there is one; "none":
+            no preset.
+        callbacks: Called between updates; they may also end the run. A callback is an object with some of the methods of
+            `Callback`; a name such as "my_module:factory", which a resumed run finds again; or a function, which gets a
+            `Progress` after each update, and several times a second during an evaluation or a long wait.
+        progress: Show the progress: in one display in a notebook, in place on a terminal, otherwise as a line every 5 s.
+        **settings: The flags of `millrace train`, with the same names, such as `learning_rate=1e-3`. `algo` may be your own
+            class (`millrace.algorithms`). If the class is defined in a script or a notebook, pass it again on resume. Type
+            checkers don't know settings that only your class has: pass them as `**own`, a `dict[str, Any]`. `start_from`
+            may be a `Run`: the new run begins with the policy of that run (`--from`).
 
     Returns the `Run`. Raises `UserFacingError` with a message of one line.
 
@@ -319,7 +322,7 @@ def train(
 
 
 def _newest_figures(metrics: Metrics) -> dict[str, str]:
-    """The newest figures of a run that has not ended."""
+    """The newest figures of a run that has not ended, by name."""
     facts = {"env steps": f"{int(metrics[ENV_STEPS_KEY][-1]):,} env steps"} if ENV_STEPS_KEY in metrics else {}
     returns = metrics.get(RETURN_KEY)
     if returns is not None and np.isfinite(returns[-1]):

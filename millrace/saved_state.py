@@ -1,4 +1,4 @@
-"""The file of a `RolloutService`: its state and the user's own arrays in one .npz, written atomically."""
+"""The file that `RolloutService.save` writes: the service's state and the user's own arrays in one .npz."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from millrace.protocol.errors import CheckpointError, UsageError
 from millrace.protocol.messages import LanePast, Weights
 from millrace.protocol.specs import PolicySpec
 
-OURS = "millrace"  # name of millrace's entry, JSON as bytes; the user's arrays have other names
-OF_NUMPY = ("file", "allow_pickle")  # arguments of numpy.savez, which can't be names of arrays
+OURS = "millrace"  # name of the entry with the state, as JSON bytes; the user's arrays must have other names
+OF_NUMPY = ("file", "allow_pickle")  # parameters of numpy.savez, so the user's arrays can't have these names
 FORMAT = 1
 
 
 class ServiceState(msgspec.Struct, frozen=True, kw_only=True):
-    """The state that a service continues from."""
+    """The state from which a restored service continues."""
 
     env: str
     """id or name of the environment"""
@@ -40,28 +40,28 @@ class ServiceState(msgspec.Struct, frozen=True, kw_only=True):
     env_steps: Past
     ledger: Ledger
     incarnations: list[Past]
-    """the next incarnation of each lane"""
+    """number of the next incarnation of each lane"""
     rounds: RoundsState
     lanes: bytes
-    """the past of each lane, packed"""
+    """the past of each lane (`LanePast`), packed"""
     acting: bytes
-    """the weights of open rounds, without the newest, packed"""
+    """the weights with which open rounds are collected, except the newest weights, packed"""
     normalizer: dict[str, Any] | None = None
     """the state of the normalizer, as plain data; None if it was not used"""
     format: int = FORMAT
 
     @property
     def past(self) -> PastRollouts:
-        """The state from which the hub continues. Raises like `unpacked`."""
+        """The state from which the hub continues. Raises what `unpacked` raises."""
         lanes = unpacked(LanePast, np.frombuffer(self.lanes, np.uint8))
         acting = unpacked(Weights, np.frombuffer(self.acting, np.uint8))
         return PastRollouts(self.ledger, self.incarnations, self.rounds, lanes, acting)
 
 
 def digest(policy: PolicySpec) -> str:
-    """A short text that differs for different policies.
+    """A hash of the policy's specification, as 32 hexadecimal digits.
 
-    For a user-defined policy, it covers the name and layout, not the code.
+    For a user-defined policy, it covers the name and the declared arrays, but not the code.
     """
     if policy.own is not None:
         policy = msgspec.structs.replace(policy, own=msgspec.structs.replace(policy.own, code=None))
@@ -69,7 +69,10 @@ def digest(policy: PolicySpec) -> str:
 
 
 def write(path: Path, state: ServiceState, arrays: Mapping[str, Any]) -> None:
-    """Write the state and the user's arrays. Raises `UsageError` for unsupported arrays, and `RunError`."""
+    """Write the state and the user's arrays, atomically.
+
+    Raises `UsageError` for unsupported arrays, and `RunError` if the file can't be written.
+    """
     kept = {}
     for name, value in arrays.items():
         array = np.asarray(value)
@@ -82,10 +85,13 @@ def write(path: Path, state: ServiceState, arrays: Mapping[str, Any]) -> None:
 
 
 def read(path: Path) -> tuple[ServiceState, dict[str, Array]]:
-    """The state, and the user's arrays by name. Its ledger has no outstanding tickets. Raises `CheckpointError`."""
+    """Read the state, and the user's arrays by name. The ledger of the state has no outstanding tickets.
+
+    Raises `CheckpointError` if the file is missing, damaged or of another format.
+    """
     try:
         descriptor = open_regular(path.resolve())
-        # Opened here, because numpy leaves a damaged file open.
+        # The file is opened here, because numpy wouldn't close a damaged one.
         with os.fdopen(descriptor, "rb") as opened, np.load(opened, allow_pickle=False) as file:
             if any(entry.compress_type != zipfile.ZIP_STORED for entry in file.zip.infolist()):
                 raise ValueError("it is compressed, which millrace never does")  # a few bytes could fill the memory

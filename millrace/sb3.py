@@ -1,6 +1,6 @@
 """A Stable-Baselines3 `VecEnv` whose env copies live in worker processes. It needs the pip extra `peers`.
 
-It replaces `SubprocVecEnv`: a process steps many env copies, and it may run on another machine.
+It replaces `SubprocVecEnv`: one worker process steps several env copies, and workers may run on other machines.
 
 from millrace.sb3 import make_vec_env
 model = PPO("MlpPolicy", make_vec_env("CartPole-v1", n_envs=8, workers=2))
@@ -46,18 +46,19 @@ def make_vec_env(
     """Make a vector environment, as `stable_baselines3.common.env_util.make_vec_env` does.
 
     Args:
-        env_id: as in `millrace.make_vec`. If it has several agents, which must all act at every step, each agent is a row.
+        env_id: `env` of `millrace.make_vec`. If the environment has several agents, each agent is a row of the `VecEnv`, and
+            all of them must act at every step.
         n_envs: number of env copies; by default 1, or the length of the list.
         seed: seed of the first reset, in which copy n gets `seed + n`, and of samples of `action_space`.
-        monitor: record the return and length of each episode, for `rollout/ep_rew_mean`, of the environment without
-            `wrapper_class`, as SB3 does.
-        wrapper_class: called with each env copy, in the workers: a wrapper, or a function that applies several. It is code,
-            so it is sent over TCP only to workers that have a key.
+        monitor: record the return and length of each episode, for `rollout/ep_rew_mean`. As in SB3, these are recorded
+            inside `wrapper_class`, so they are those of the environment without it.
+        wrapper_class: called in the workers with each env copy: a wrapper, or a function that applies several. Because it is
+            code, it is sent over TCP only to workers that have a key.
         env_kwargs: keyword arguments of the environment.
         wrapper_kwargs: keyword arguments of `wrapper_class`.
-        keywords: those of `millrace.make_vec`.
+        keywords: further keyword arguments of `millrace.make_vec`.
 
-    Raises the errors of `millrace.make_vec`.
+    Raises the errors that `millrace.make_vec` raises.
 
     env = make_vec_env("CartPole-v1", 8, wrapper_class=TimeLimit, wrapper_kwargs={"max_episode_steps": 100}, workers=2)
     """
@@ -79,16 +80,17 @@ def make_vec_env(
 
 
 class Sb3VecEnv(VecEnv):
-    """The SB3 interface of a vector environment whose autoreset mode is `SameStep`.
+    """Gives a vector environment whose autoreset mode is `SameStep` the interface of SB3's `VecEnv`.
 
-    With seats, `num_envs` counts the agents of all copies, which must all act at every step: SB3 doesn't support others.
+    If the environment has several agents, `num_envs` counts the agents of all copies. All agents must act at every step,
+    because SB3 doesn't support anything else.
     """
 
     def __init__(self, env: ZmqVectorEnv, *, monitored: bool = False) -> None:
         """`monitored`: the workers record episodes as `Monitor` does. Raises `UsageError` for another autoreset mode."""
         if env.autoreset_mode is not AutoresetMode.SAME_STEP:
             raise UsageError(f"Sb3VecEnv: expected autoreset_mode SameStep, got {env.autoreset_mode.value}")
-        env.merge_infos = False  # merged infos have one dtype and shape for all copies
+        env.merge_infos = False  # in merged infos, all copies would have the same dtype and shape
         self.env = env
         self._monitored = monitored
         self._rows_of_copy = max(1, len(env.seats))
@@ -99,9 +101,9 @@ class Sb3VecEnv(VecEnv):
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
-        """Set the seeds of the next reset: copy n gets `seed + n`, however many agents it has.
+        """Set the seeds of the next reset: copy n gets `seed + n`, whatever the number of agents.
 
-        Returns the seed of each row.
+        Returns the seed of each row [num_envs].
         """
         first, *_ = super().seed(seed)
         if first is not None:
@@ -109,7 +111,7 @@ class Sb3VecEnv(VecEnv):
         return self._seeds
 
     def reset(self) -> Any:
-        """Begin episodes in all env copies, with the seeds and options that were set. Returns the observations."""
+        """Begin episodes in all env copies, with the seeds and options that were set before. Returns the observations."""
         seeds = self._seeds[:: self._rows_of_copy] if any(seed is not None for seed in self._seeds) else None
         options = [each or None for each in self._options[:: self._rows_of_copy]] if any(self._options) else None
         observation, infos = self.env.reset(seed=seeds, options=options)
@@ -120,14 +122,16 @@ class Sb3VecEnv(VecEnv):
         return observation
 
     def step_async(self, actions: Array | Sequence[Any]) -> None:
-        """Order every env copy to step with its element of `actions`, which may be an array or a list."""
+        """Start a step of every env copy with its element of `actions`, an array or a list."""
         if self._nested_actions:
             leaves = zip(*map(self._flatten, actions), strict=True)
-            actions = self._unflatten([np.asarray(leaf) for leaf in leaves])  # gymnasium's batch: an array for each leaf
+            actions = self._unflatten([np.asarray(leaf) for leaf in leaves])  # as gymnasium batches: an array for each leaf
         self.env.step_async(actions)
 
     def step_wait(self) -> Any:
-        """Observations, rewards (float32), dones and a list with one info for each env copy."""
+        """Wait until the step has ended. Returns observations, rewards [num_envs] float32, dones [num_envs] bool, and a list
+        with the info of each row.
+        """
         observation, reward, terminated, truncated, infos = self.env.step_wait()
         self._check_all_act(infos)
         done = terminated | truncated
@@ -154,15 +158,15 @@ class Sb3VecEnv(VecEnv):
             )
 
     def close(self) -> None:
-        """Close the vector environment; its local workers end."""
+        """Close the vector environment, and end its local workers."""
         self.env.close()
 
     def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
-        """An attribute of each env copy."""
+        """The value of an attribute in each env copy."""
         return self._call_each(indices, attr_name)
 
     def has_attr(self, attr_name: str) -> bool:
-        """Whether every env copy has this attribute. A method is not called."""
+        """Whether every env copy has this attribute. If it is a method, it isn't called."""
         return all(self._call_each(None, "has_wrapper_attr", attr_name))
 
     def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:
@@ -171,11 +175,11 @@ class Sb3VecEnv(VecEnv):
         self.env.calls.assign(copies, attr_name, [value] * len(copies))
 
     def env_method(self, method_name: str, *method_args: Any, indices: Indices = None, **method_kwargs: Any) -> list[Any]:
-        """Call a method of each env copy."""
+        """Call a method of each env copy. Returns the results."""
         return self._call_each(indices, method_name, *method_args, **method_kwargs)
 
     def env_is_wrapped(self, wrapper_class: type, indices: Indices = None) -> list[bool]:
-        """Whether each env copy is in such a wrapper, by the name of its class."""
+        """Whether each env copy is wrapped in `wrapper_class`, compared by the name of the class."""
         copies = self._copies(indices)
         if self._monitored and issubclass(Monitor, wrapper_class):
             return [True for _ in copies]
@@ -189,23 +193,23 @@ class Sb3VecEnv(VecEnv):
         return self.env.render() if self.render_mode == "rgb_array" else [None] * self.num_envs
 
     def _call_each(self, indices: Indices, name: str, *args: Any, **kwargs: Any) -> list[Any]:
-        """The result of each env copy, in the order of `indices`."""
+        """The attribute `name` of each env copy, called if it is a method, in the order of `indices`."""
         copies = self._copies(indices)
         ascending = sorted(set(copies))
         results = dict(zip(ascending, self.env.calls.call(ascending, name, args, kwargs), strict=True))
         return [results[n] for n in copies]
 
     def _copies(self, indices: Indices) -> list[int]:
-        """The numbers of the copies of these rows, as plain integers. As in a list, -1 is the last one."""
+        """The number of each row's copy, as plain integers. As in a list, row -1 is the last one."""
         return [range(self.num_envs)[n] // self._rows_of_copy for n in self._get_indices(indices)]
 
     def _info_list(self) -> list[dict[str, Any]]:
-        """The newest infos: a dict for each env copy, as its environment returned it."""
+        """The newest info of each row, as the environment returned it."""
         return [self.env.infos_by_row.get(n, {}) for n in range(self.num_envs)]
 
 
 class _Wrapping:
-    """Makes factories of wrapped environments, one for each environment."""
+    """Makes a factory that wraps the environment with `wrapper_class`, for each environment of a list."""
 
     def __init__(
         self, wrapper_class: Callable[..., gymnasium.Env[Any, Any]], keywords: dict[str, Any], monitor: bool
@@ -216,7 +220,7 @@ class _Wrapping:
         self._made: dict[object, Callable[..., gymnasium.Env[Any, Any]]] = {}
 
     def __call__(self, env: EnvLike) -> Callable[..., gymnasium.Env[Any, Any]]:
-        """A factory of this environment, wrapped. The same one for the same environment, so that it is sent once."""
+        """A factory for this environment, wrapped. Equal environments get the same factory, so that it is sent only once."""
         key = env if isinstance(env, str) else id(env)  # gymnasium's specs aren't hashable
         if key not in self._made:
             self._made[key] = _wrapped(env, self._wrapper_class, self._keywords, self._monitor)
@@ -226,7 +230,9 @@ class _Wrapping:
 def _wrapped(
     env: EnvLike, wrapper_class: Callable[..., gymnasium.Env[Any, Any]], keywords: dict[str, Any], monitor: bool
 ) -> Callable[..., gymnasium.Env[Any, Any]]:
-    """A factory that a worker can call without this module, which needs Stable-Baselines3: it is a nested function."""
+    """A factory for the wrapped environment. It is a nested function, so that a worker can call it without importing this
+    module, which needs Stable-Baselines3.
+    """
     inner = EnvSpec.of(env)
 
     def make(render_mode: str | None = None, **kwargs: Scalar) -> gymnasium.Env[Any, Any]:

@@ -1,6 +1,6 @@
 """A curve as one line of text: blocks of five heights, over the run so far. Pure.
 
-Rule: its memory is bounded. The run is divided into equal parts, and only the last point of each is kept.
+Rule: a curve's memory is bounded. The run is divided into equal parts, and only the last point of each part is kept.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ MOST_POINTS = 1_000
 
 
 class Sparkline:
-    """The values of a number that grew with `x`."""
+    """A curve of values `y` over a growing `x`. `str` renders it as one line."""
 
     def __init__(self, blocks: str = BLOCKS) -> None:
-        """`blocks`: characters, the lowest first."""
+        """`blocks`: the characters to draw with, the lowest first."""
         self._blocks = blocks
         self._points: list[tuple[float, float]] = []
 
     def add(self, x: float, y: float | None) -> None:
-        """Add the value `y` at `x`, unless it is None or `x` has not grown."""
+        """Add the value `y` at `x`, unless `y` is None or not finite, or `x` has not grown."""
         if y is not None and math.isfinite(y) and (not self._points or x > self._points[-1][0]):
             self._points.append((x, y))
             if len(self._points) > MOST_POINTS:
@@ -38,7 +38,7 @@ class Sparkline:
         return "".join(self._blocks[round((y - low) / step)] for y in values)
 
     def _last_of_parts(self, parts: int) -> list[tuple[float, float]]:
-        """The last point of each of equal parts of the run; the newest point counts as a part by itself."""
+        """The last point of each of `parts` equal parts of the run; the newest point is a part by itself."""
         first = self._points[0][0]
         last = self._points[-1][0]
         return list({int((parts - 1) * (x - first) / (last - first)): (x, y) for x, y in self._points}.values())

@@ -1,8 +1,8 @@
 """Shows the progress of a run: as a live block on a terminal, as one display in a notebook, as lines elsewhere, or as JSON.
 
-Rule: it never slows the run (at most five redraws a second), and the last progress is always shown. Warnings of the log are
-shown above the block. No text is interpreted as markup or terminal control. `millrace.learner.standard_streams` ensures that
-a full or closed stream doesn't end the run.
+Rule: showing progress never slows the run (at most five redraws a second), and the last progress is always shown. Warnings
+in the log are shown above the block. No text is interpreted as markup or terminal control.
+`millrace.learner.standard_streams` ensures that a full or closed stream doesn't end the run.
 """
 
 from __future__ import annotations
@@ -47,8 +47,8 @@ from millrace.sparkline import ASCII, BLOCKS, Sparkline
 REDRAW_EVERY_S = 0.2
 NOTEBOOK_EVERY_S = 0.5
 LINE_EVERY_S = 5.0
-GAP = "   "  # between the figures of a row
-MOST_REASON = 80  # characters; an error has its own line below the block
+GAP = "   "  # separates the figures in a row
+MOST_REASON = 80  # characters of the reason why a run ended; an error also gets a line of its own below the block
 
 
 class ProgressView:
@@ -58,7 +58,7 @@ class ProgressView:
         """Show this progress now."""
 
     def print_line(self, line: str) -> None:
-        """Print a line that is not redrawn."""
+        """Print a line that stays, unlike the redrawn block."""
 
     def close(self) -> None:
         """Restore the terminal."""
@@ -68,9 +68,10 @@ class ProgressView:
 def progress_view(
     log_json: bool = False, clock: Callable[[], float] = time.monotonic, *, may_fail: bool = True
 ) -> Iterator[Callable[[Progress], None]]:
-    """A context manager that returns a function to call with each progress.
+    """A context manager that yields a function to call with each progress.
 
-    While it is entered, millrace's log is shown too. `may_fail`: raise errors of showing. Otherwise they are dropped.
+    Within the context, millrace's log is shown too. `may_fail`: raise exceptions that occur while progress is shown;
+    otherwise ignore them.
     """
     view, every_s = _view(log_json)
     if not may_fail:
@@ -95,9 +96,10 @@ def progress_view(
 def count_line(
     doing: str, clock: Callable[[], float] = time.monotonic, *, show: bool = True
 ) -> Iterator[Callable[[str], None]]:
-    """Gives a function that shows a text after `doing`: in place on a terminal or in a notebook, else as occasional lines.
+    """A context manager that yields a function, which shows `doing` and a text.
 
-    Outside a notebook it writes to stderr. `show`: whether anything is shown at all.
+    The text is updated in place on a terminal or in a notebook; elsewhere a line is printed now and then. Outside a notebook
+    it goes to stderr. `show`: whether to show anything at all.
     """
     notebook = NotebookCell() if show and in_notebook() else None
     live = notebook is None and _is_terminal(sys.stderr)
@@ -123,7 +125,7 @@ def count_line(
 
 
 def in_notebook() -> bool:
-    """Whether this program is a notebook's kernel (ipykernel). IPython on a terminal is a terminal."""
+    """Whether this program is a notebook's kernel (ipykernel). IPython on a terminal counts as a terminal."""
     ipython = sys.modules.get("IPython")
     shell = ipython.get_ipython() if ipython is not None else None
     return getattr(shell, "kernel", None) is not None
@@ -145,7 +147,7 @@ def _write_to_stderr(text: str) -> None:
 
 
 def _view(log_json: bool) -> tuple[ProgressView, float]:
-    """The way to show progress here, and the least seconds between two updates."""
+    """The view for this program's output, and the least number of seconds between two updates of it."""
     if log_json:
         return JsonEvents(), LINE_EVERY_S
     if in_notebook():
@@ -156,7 +158,7 @@ def _view(log_json: bool) -> tuple[ProgressView, float]:
 
 
 class DroppingView(ProgressView):
-    """Shows progress, and drops errors: standard output may be full, closed, or replaced by the user."""
+    """Wraps another view and ignores its exceptions: standard output may be full, closed, or replaced by the user."""
 
     def __init__(self, view: ProgressView) -> None:
         self._view = view
@@ -167,7 +169,7 @@ class DroppingView(ProgressView):
             self._view.show(progress)
 
     def print_line(self, line: str) -> None:
-        """Print a line that is not redrawn."""
+        """Print a line that stays, unlike the redrawn block."""
         with suppress(Exception):
             self._view.print_line(line)
 
@@ -178,9 +180,9 @@ class DroppingView(ProgressView):
 
 
 class RateLimitedView:
-    """Shows the first progress, then at most one in `every_s`, and the last one.
+    """Shows the first progress, then at most one every `every_s` seconds, and always the last one.
 
-    A new note is printed at once. While the run makes no update, lines that aren't redrawn become less frequent.
+    A new note is printed at once. A view that prints lines prints them less and less often while the run makes no update.
     """
 
     def __init__(self, view: ProgressView, every_s: float, clock: Callable[[], float]) -> None:
@@ -190,11 +192,11 @@ class RateLimitedView:
         self._shown_s = -every_s
         self._waiting: Progress | None = None
         self._updates = -1
-        self._updated_s = 0.0  # since when the number of updates has not changed
+        self._updated_s = 0.0  # when the number of updates last changed
         self._note = ""
 
     def __call__(self, progress: Progress) -> None:
-        """Take a new progress of the run."""
+        """Show this progress, now or later, unless a newer one replaces it."""
         if progress.note and progress.note != self._note:
             self._view.print_line(progress.note)
         self._note = progress.note
@@ -207,7 +209,7 @@ class RateLimitedView:
             self._show()
 
     def close(self) -> None:
-        """Show the last progress, if it was not shown yet."""
+        """Show the last progress, if it hasn't been shown yet."""
         self._show()
 
     def _show(self) -> None:
@@ -221,7 +223,7 @@ class PlainLines(ProgressView):
     """Plain lines, for logs, pipes and batch systems."""
 
     def show(self, progress: Progress) -> None:
-        """Print one line; at the end also which part is the slowest, and what went wrong."""
+        """Print one line. When the run has ended, it also names the slowest part and what went wrong."""
         ended = bool(progress.stop_reason)
         said = slowest_part(progress.stages) if ended else who_waits(progress)
         parts = [main_figures(progress), said, went_wrong(progress.ledger) if ended else ""]
@@ -233,13 +235,13 @@ class PlainLines(ProgressView):
 
 
 class NotebookCell:
-    """One display of a notebook's cell, which is updated in place."""
+    """One display in the output of a notebook's cell, which is updated in place."""
 
     def __init__(self) -> None:
         self._handle: Any = None
 
     def show(self, text: str, html: str) -> None:
-        """Replace the display by this. `text` is for notebooks that can't show HTML."""
+        """Replace the content of the display. `text` is for notebooks that can't show HTML."""
         content = {"text/plain": text, "text/html": html}
         if self._handle is None:
             from IPython.display import display
@@ -249,13 +251,13 @@ class NotebookCell:
             self._handle.update(content, raw=True)
 
     def clear(self) -> None:
-        """Show nothing."""
+        """Empty the display."""
         if self._handle is not None:
             self.show("", "")
 
 
 class NotebookBlock(PlainLines):
-    """A block that is updated in the cell's output. Notes are lines below it."""
+    """A block that is updated in place in the cell's output. Notes are printed as lines below it."""
 
     def __init__(self, cell: NotebookCell) -> None:
         self._cell = cell
@@ -275,7 +277,7 @@ class NotebookBlock(PlainLines):
 
 
 class JsonEvents(ProgressView):
-    """JSON lines on stderr, for programs. Notes are part of the progress, and the log has its own handler."""
+    """JSON lines on stderr, for programs. Each line contains the progress's note; another handler writes the log."""
 
     def show(self, progress: Progress) -> None:
         """Print one line."""
@@ -300,7 +302,7 @@ class LiveBlock(ProgressView):
     def show(self, progress: Progress) -> None:
         """Redraw the block."""
         self._returns.add(progress.env_steps, progress.return_mean)
-        room = self._console.width - 2  # for the terminal's ^C, which would begin a new line
+        room = self._console.width - 2  # room for the terminal's ^C, which would otherwise begin a new line
         self._live.update(Constrain(render_block(progress, self._returns), room), refresh=True)
 
     def print_line(self, line: str) -> None:
@@ -327,7 +329,7 @@ def main_figures(progress: Progress) -> str:
 
 
 def block_rows(progress: Progress, returns: Sparkline) -> dict[str, str]:
-    """The rows of a block below its head, as text by name. `returns`: returns of the run so far."""
+    """The rows of a block below its head, as text by name. `returns`: the curve of returns so far."""
     best = progress.best
     speed = f"{per_second(progress.steps_per_s)} a second"
     evaluated = "" if best is None else f"best evaluation {best[0]:,.1f} at {best[1]:,} env steps"
@@ -344,7 +346,10 @@ def block_rows(progress: Progress, returns: Sparkline) -> dict[str, str]:
 
 
 def how_far(progress: Progress) -> tuple[float | None, str]:
-    """The share of the run that is done, and words about it. For a run that ended early, no share, and why it ended."""
+    """The share of the run that is done, from 0 to 1, and a text about it.
+
+    If the run ended early, the share is None, and the text says why it ended.
+    """
     took = _clock_time(progress.wall_s)
     if progress.stop_reason == ALL_STEPS_DONE:
         return 1.0, f"100%  done in {took}"
@@ -356,7 +361,7 @@ def how_far(progress: Progress) -> tuple[float | None, str]:
 
 
 def render_block(progress: Progress, returns: Sparkline) -> RenderableType:
-    """A progress bar, or how the run ended; then the rows."""
+    """The block: a progress bar, or how the run ended, followed by the rows."""
     share, said = how_far(progress)
     head: RenderableType = Text(escaped(said), style="bold")
     if share is not None:
@@ -374,7 +379,7 @@ def render_block(progress: Progress, returns: Sparkline) -> RenderableType:
 
 
 def _strength(progress: Progress) -> str:
-    """Score and rating against opponents, if there are any."""
+    """Score and Elo rating against opponents; empty if there are none."""
     if (elo := progress.metrics.get(ELO_KEY)) is None:
         return ""
     return f"score {progress.facts[SCORE]}, Elo {elo:,.0f}"
@@ -387,7 +392,7 @@ def _clock_time(seconds: float) -> str:
 
 
 class _WarningHandler(logging.Handler):
-    """Prints warnings, errors and notices of the log in the view."""
+    """Prints warnings, errors and notices from the log in the view."""
 
     def __init__(self, view: ProgressView) -> None:
         super().__init__(logging.WARNING)

@@ -1,4 +1,4 @@
-"""The workers that this program starts for a learner: how many, their flags, their logs and their cores."""
+"""Describes the workers that this program starts for a learner: their number, flags, log files and CPU cores."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ from millrace.workers.supervise.supervisor import core_flags
 
 @dataclass(frozen=True)
 class InheritedByWorkers:
-    """Shared memory and wake pipes, which local workers inherit before the sizes of the arrays are known."""
+    """Shared memory and wake pipes that local workers inherit. They exist before the sizes of the arrays are known."""
 
     memory_fd: int
     to_workers: Mapping[str, WakePipe]
     """the pipe that wakes each worker, by its name"""
     to_learner: WakePipe
-    """one for all workers: the last worker to finish a step writes to it"""
+    """the pipe that wakes the learner; the last worker to finish a step writes to it"""
 
     def of(self, worker: str) -> InheritedDescriptors:
         """The file descriptors that this worker inherits."""
         return InheritedDescriptors(self.memory_fd, self.to_workers[worker].read_fd, self.to_learner.write_fd)
 
     def close(self) -> None:
-        """Close all file descriptors. The memory is freed with its last view."""
+        """Close all file descriptors. The memory itself is freed when its last view is."""
         os.close(self.memory_fd)
         for pipe in (*self.to_workers.values(), self.to_learner):
             pipe.close()
@@ -45,27 +45,28 @@ class Crew:
 
     count: int = 0
     evaluating: int = 0
-    """this many of them, the last ones, only evaluate"""
+    """how many of the workers only evaluate: the last ones"""
     logs: Path | None = None
-    """the folder of their logs; None: they write to this process's stderr"""
+    """the folder of the workers' logs; None: workers write to this process's stderr"""
     cores: Sequence[int] = ()
-    """the cores that they are pinned to, in turn; empty: they are not pinned"""
+    """the cores to which workers are pinned, in turn; empty: workers aren't pinned"""
     inherited: InheritedByWorkers | None = None
+    """what the workers' processes inherit; None: nothing"""
 
     def evaluates(self, worker: str) -> bool:
         """Whether this worker only evaluates."""
         return int(worker.removeprefix("w")) >= self.count - self.evaluating
 
     def log_of(self, worker: str) -> Path | None:
-        """The file for this worker's stderr."""
+        """The file to which this worker's stderr goes; None: to this process's stderr."""
         return None if self.logs is None else self.logs / f"{worker}.log"
 
     def descriptors_of(self, worker: str) -> InheritedDescriptors | None:
-        """The file descriptors that this worker inherits."""
+        """The file descriptors that this worker inherits, if any."""
         return None if self.inherited is None else self.inherited.of(worker)
 
     def flags_of(self, worker: str) -> list[str]:
-        """The flags of this worker's process."""
+        """The command-line flags of this worker's process."""
         flags = [*core_flags(self.cores, worker), "--join-timeout-s", str(LEARNER_STARTED_IT_S)]
         if self.evaluates(worker):
             flags.append("--evaluate")
@@ -75,9 +76,9 @@ class Crew:
 
 
 def crew_of_run(config: Config, run: Path) -> Crew:
-    """The workers of a run on this machine, whose logs are in the run folder.
+    """The workers of a run on this machine, whose logs go to the run folder.
 
-    Raises `UsageError` if the logs can't be there.
+    Raises `UsageError` if the logs can't be written there.
     """
     count = local_workers(config) + config.eval_workers
     if config.transport == "inproc":
@@ -87,7 +88,7 @@ def crew_of_run(config: Config, run: Path) -> Crew:
 
 
 def _log_folder(run: Path) -> Path:
-    """The folder of the workers' logs, which are regular files or don't exist yet."""
+    """The folder of the workers' logs. Raises `UsageError` unless existing logs in it are regular files."""
     try:
         logs = subfolder(run, "workers")
         for log in logs.glob("*.log"):
@@ -98,12 +99,12 @@ def _log_folder(run: Path) -> Path:
 
 
 def worker_cores(config: RolloutConfig) -> list[int]:
-    """The cores that local workers are pinned to, in turn; empty if they are not pinned.
+    """The cores to which local workers are pinned, in turn; empty if they aren't pinned.
 
     New weights wake all workers at once, while the learner still runs. Linux then often puts two workers on one core and
-    leaves another core idle, for too short a time to move them. If there are fewer workers than cores, they are not
-    pinned: Linux finds a free core for each, and pinned workers could share a core with the workers of another run. With a
-    lag they aren't pinned either, because it gains nothing.
+    leaves another core idle, for too short a time to move a worker there. Workers aren't pinned if they are fewer than the
+    cores: Linux finds a free core for each, and pinned workers might share a core with the workers of another run. They
+    aren't pinned in a run with a lag either, because nothing would be gained.
     """
     if not hasattr(os, "sched_setaffinity"):
         return []

@@ -25,24 +25,27 @@ from millrace.workers.supervise.supervisor import STOP_WITHIN_S
 
 @dataclass(frozen=True)
 class PlayingWorkers:
-    """The workers that play."""
+    """Settings of the workers that play the episodes."""
 
     workers: int = 2
     """Number of local workers to start."""
     transport: Literal["inproc", "ipc", "tcp"] = "ipc"
     bind: str = ""
-    """Address at which workers from elsewhere join. Then no local worker is started."""
+    """Address at which workers from elsewhere join. If it isn't empty, no local worker is started."""
     inference: Literal["workers", "learner"] = "workers"
     """Where the policy acts: in each worker, or in this process."""
     copies: int = 1
-    """Episodes that are played at the same time, if the policy acts in this process."""
+    """Number of episodes that are played at the same time if the policy acts in this process."""
     settings: RolloutConfig = field(default_factory=RolloutConfig)
-    """Timeouts, and how many failures are allowed."""
+    """Timeouts, and the number of failures that are allowed."""
 
 
 @contextmanager
 def policy_player(policy: SavedPolicy, which: PlayingWorkers, watch: Callable[[str], None]) -> Iterator[PolicyPlayer]:
-    """A player with its workers. `watch` gets the progress. Raises `UserFacingError`, or `KeyboardInterrupt`."""
+    """A context manager that starts the workers and yields a `PolicyPlayer`, which plays episodes with them.
+
+    `watch` is called with the progress, as text. Raises `UserFacingError`, or `KeyboardInterrupt` after a signal.
+    """
     with ExitStack() as stack:
         interrupts = stack.enter_context(Interrupts())
         if which.inference == "learner" or which.transport == "inproc":
@@ -103,5 +106,5 @@ def _pool(policy: SavedPolicy, which: PlayingWorkers) -> AbstractContextManager[
 
 
 def _log_folder(which: PlayingWorkers, stack: ExitStack) -> Path | None:
-    """A folder for the logs of local workers, which is removed at the end."""
+    """A folder for the logs of local workers, which `stack` removes; None if there are no local workers."""
     return None if which.bind else Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="millrace-")))

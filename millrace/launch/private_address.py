@@ -1,4 +1,4 @@
-"""The address where local workers join: a socket file, TCP on loopback, or within this process.
+"""The address where local workers join: a socket file, a TCP port on loopback, or an address within this process.
 
 Rule: a socket file is in its own folder, which only this user can enter (0700). The folder is removed with it.
 """
@@ -13,7 +13,7 @@ from contextlib import ExitStack
 
 from millrace.protocol.errors import UsageError, safe_repr
 
-LONGEST_FOLDER = 80  # bytes of its path: the path of a socket file in it has at most 107
+LONGEST_FOLDER = 80  # bytes in the path of the folder for temporary files; the path of a socket file has at most 107
 
 
 def private_address(transport: str, stack: ExitStack) -> str:
@@ -25,7 +25,7 @@ def private_address(transport: str, stack: ExitStack) -> str:
             return "tcp://127.0.0.1:*"
         case "ipc":
             room = len(os.fsencode(tempfile.gettempdir())) <= LONGEST_FOLDER
-            # 0700: the operating system decides who may connect
+            # mkdtemp makes the folder with mode 0700, so only this user can connect
             folder = tempfile.mkdtemp(prefix="millrace-", dir=None if room else "/tmp")
             stack.callback(shutil.rmtree, folder, ignore_errors=True)
             return f"ipc://{folder}/learner"

@@ -1,4 +1,4 @@
-"""Start a rollout service: with worker processes on this machine, or with workers that are started elsewhere."""
+"""Starts a rollout service, with worker processes on this machine or with workers that are started elsewhere."""
 
 from __future__ import annotations
 
@@ -36,9 +36,10 @@ def start(
     listens: bool,
     past: PastRollouts | None = None,
 ) -> tuple[Hub, RunSpec, DescribedEnv]:
-    """A hub whose workers have joined, with its run and environment. Closing `resources` releases everything.
+    """Start a hub and wait until its workers have joined. Returns the hub, the run and the described environment.
 
-    `listens`: wait for workers elsewhere at `config.bind`, instead of starting some. Raises `UserFacingError`.
+    Closing `resources` releases everything. `listens`: wait for workers from elsewhere at `config.bind`, instead of starting
+    local ones. `past`: the state of a saved service to continue from. Raises `UserFacingError`.
     """
     workers = workers_to_wait_for(config, None if listens else local_workers(config))
     code = env.called_code or ("a policy's factory" if isinstance(policy, OwnPolicy) else "")

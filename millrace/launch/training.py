@@ -1,4 +1,4 @@
-"""A run: the learner in this process, and workers that are started on this machine or join from elsewhere."""
+"""Trains a run: the learner is in this process, and workers are started on this machine or join from elsewhere."""
 
 from __future__ import annotations
 
@@ -43,18 +43,19 @@ log = logging.getLogger("millrace.learner")
 
 
 def train(config: Config, resume: Path | None, watch: Watch, env: EnvSpec | None = None, *, elsewhere: bool = False) -> Path:
-    """Train. Returns the run folder. `env`: the environment, unless the settings name one that workers find.
+    """Train a policy. Returns the run folder.
 
-    `elsewhere`: the workers are started elsewhere and join at `config.bind`. Raises `UserFacingError`, or `Interrupted` if
-    the user stopped the run.
+    `env`: the environment, unless workers find it by the name in the settings. `elsewhere`: workers are started elsewhere
+    and join at `config.bind`. Raises `UserFacingError`, or `Interrupted` if the user stopped the run.
 
-    In a run with shards, only rank 0 of the learner processes does this; the others take part in its updates.
+    In a run with shards, rank 0 of the learner processes has the workers and the run folder; the other ranks take part in
+    its updates.
     """
     place = _place(config)
     if config.shards == 1 and (line := trains_alone(os.environ)):
         log.warning("%s", line)
     check_loopback(place, insecure=config.insecure_shards)
-    if place.rank > 0:  # perhaps on a machine without the folder of the run, or of the run that it starts from
+    if place.rank > 0:  # its machine may have neither the run folder nor the folder of the run to start from
         from millrace.learner.shards.roles import follow  # imports PyTorch
 
         return follow(config, place)
@@ -86,7 +87,7 @@ def _train(
     env = env or named_environment(config)
     acts = config.inference == "learner"
     if not elsewhere:
-        check_copies(config, LIMIT_VARIABLE, copies_per_machine())  # all copies of the run are on this machine
+        check_copies(config, LIMIT_VARIABLE, copies_per_machine())  # this machine will have all env copies of the run
         if not acts and (line := uneven_lanes(config)):
             log.warning("%s", line)
     here = local_workers(config)
@@ -107,7 +108,7 @@ def _train(
         lobby = pool.begin(known.described, masked=known.spaces.masked)
         interrupts = Interrupts(config.grace_s)
         stack.callback(lambda: pool.stop(interrupts.at_most(STOP_WITHIN_S)))
-        folder = folder or stack.enter_context(run_folder(config, None))  # not before a worker elsewhere has joined
+        folder = folder or stack.enter_context(run_folder(config, None))  # if workers are elsewhere, once one has joined
         from millrace.learner.open_run import (
             open_run,  # imports PyTorch, unless it was imported while a worker described the environment
         )
@@ -127,14 +128,14 @@ def _train(
 
 
 def _tell_finished(config: Config, place: Place) -> None:
-    """Tell the others, which can't know it, that there is nothing to do."""
+    """Tell the other learner processes, which don't have the run folder, that the run was already finished."""
     with _learners(config, place, lambda: None) as learners:
         if learners is not None:
             learners.end("the run was finished before")
 
 
 def _learners(config: Config, place: Place, poll: Callable[[], None]) -> AbstractContextManager[Learners | None]:
-    """The processes that share the updates, while it is entered; None in a run without shards."""
+    """A context manager: the connected learner processes that share the updates; None in a run without shards."""
     if config.shards == 1:
         return nullcontext()
     from millrace.learner.shards.learners import connected  # imports PyTorch
@@ -144,10 +145,10 @@ def _learners(config: Config, place: Place, poll: Callable[[], None]) -> Abstrac
 
 
 def _pool(config: Config, env: EnvSpec, workers: int, *, elsewhere: bool) -> AbstractContextManager[WorkerPool]:
-    """Where the workers of the run join; the first rollouts wait for this number of `workers`."""
+    """The pool of the run's workers. The first rollouts wait until this number of `workers` has joined."""
     where = BindSettings(config.bind if elsewhere else "", config.keys, config.insecure, config.advertise)
     if config.inference == "workers":
-        # Workers elsewhere decide for themselves whether they take code.
+        # Workers elsewhere decide for themselves whether to accept code.
         code = "" if elsewhere else env.called_code or ("an encoder" if config.algorithm.encoder else "")
         return open_worker_pool(where, config.transport, code)
     from millrace.launch.learner_inference import open_stepping_pool, settings_of_run

@@ -1,4 +1,4 @@
-"""Start a vector environment: with worker processes on this machine, or with workers that are started elsewhere.
+"""Starts a vector environment, with worker processes on this machine or with workers that are started elsewhere.
 
 Rule: whatever happens, no worker, socket file or folder is left behind.
 """
@@ -40,9 +40,9 @@ from millrace.protocol.specs import StepSpec, WaitSpec
 from millrace.protocol.wire.shared_memory import SUPPORTED, SharedMemory, new_memory
 from millrace.protocol.wire.wake_up import SPIN_S, WakePipe
 
-CLOSE_TIMEOUT_S = 5.0  # seconds for workers to leave; then local workers are killed
-JOIN_TIMEOUT_S = 60.0  # seconds for local workers to join
-LEARNER_TIMEOUT_S = 600.0  # a worker elsewhere joins again if it hears nothing from the learner for this long
+CLOSE_TIMEOUT_S = 5.0  # time for workers to leave at `close`; local workers that are still there are killed
+JOIN_TIMEOUT_S = 60.0  # time for local workers to join
+LEARNER_TIMEOUT_S = 600.0  # a worker elsewhere joins again if it receives nothing from the learner for this long
 STEP_TIMEOUT_LEAST_S = 60.0
 STEP_TIMEOUT_MOST_S = 1e6
 
@@ -72,49 +72,49 @@ def make_vec(
 ) -> ZmqVectorEnv:
     """Make a `gymnasium.vector.VectorEnv` whose env copies live in worker processes.
 
-    Its results are, bit for bit, those of `gymnasium.vector.SyncVectorEnv` for the same seeds and actions.
+    For the same seeds and actions, its results are bit for bit those of `gymnasium.vector.SyncVectorEnv`.
 
     Args:
-        env: anything `gymnasium.make` takes, a callable that returns an environment, or a list with one of these for each
-            env copy. If only your script or notebook has the environment (as a callable or a registered id), it is sent as
-            code: over TCP only to workers that have a key.
-        num_envs: number of env copies; by default 1, or the length of the list. With several agents, as in PettingZoo's
-            environments, each agent of a copy has its own row, and the attribute `num_envs` counts rows; see `step`.
+        env: anything that `gymnasium.make` accepts, a callable that returns an environment, or a list with one of these for
+            each env copy. If the environment is defined only in your script or notebook (as a callable or a registered id),
+            it is sent to the workers as code: over TCP only to workers that have a key.
+        num_envs: number of env copies; by default 1, or the length of the list. If the environment has several agents, as
+            PettingZoo's have, each agent of a copy has its own row, and the attribute `num_envs` counts rows; see `step`.
         workers: number of worker processes to start on this machine; by default one for each core that this process may
             use, at most `num_envs`. They end with the vector environment.
-        lanes: number of groups of env copies. A group is in one worker. By default there is one for each worker.
-        bind: an address for workers that are started elsewhere with `millrace worker ADDRESS`. By default, local workers are
-            started.
-        keys: the folder of the keys. An address that other machines can reach needs keys; they are made if there are none.
+        lanes: number of groups of env copies; by default one for each worker. Each group is stepped by one worker.
+        bind: an address at which workers join that are started elsewhere with `millrace worker ADDRESS`. By default, local
+            workers are started.
+        keys: the folder of the keys. An address that other machines can reach needs keys; if there are none, they are made.
         insecure: use no keys.
-        advertise: host name of this machine for other machines.
-        transport: how messages are sent to local workers. With `inproc` the worker is a thread of this process,
-            which then runs the environment. Otherwise only workers do.
-        shared_memory: local workers get actions and return results through shared memory, which is faster and gives equal
+        advertise: the host name by which other machines reach this machine.
+        transport: how messages are sent to local workers. With `inproc`, the worker is a thread of this process, so the
+            environment runs in this process; otherwise it runs only in worker processes.
+        shared_memory: pass actions and results of local workers through shared memory, which is faster and gives the same
             results.
         autoreset_mode: as in gymnasium: "NextStep", "SameStep" or "Disabled".
-        observation_mode: as in gymnasium: with "different", the bounds of observations may differ between env copies, and a
-            tuple has the observation spaces of the batch and of a single copy.
-        on_worker_loss: "truncate" returns the env copies of a lost worker as truncated, with `worker_lost` in their infos,
-            and continues with new copies on another worker. "raise" raises `WorkerLost`.
-        timeout: seconds that a worker may take to answer; after that it counts as lost.
-        max_env_failures: how many times workers may die in the environment's code, counted as in a training run: in a row
-            and, in proportion to env copies and hours, within an hour.
-        copy: return copies of the observations. Without it the next step overwrites them.
+        observation_mode: as in gymnasium: "same"; "different", if the bounds of observations may differ between env copies;
+            or a tuple of the observation spaces of the batch and of a single copy.
+        on_worker_loss: what to do if a worker is lost. "truncate" returns its env copies as truncated, with `worker_lost` in
+            their infos, and continues with new copies on another worker. "raise" raises `WorkerLost`.
+        timeout: how many seconds a worker may take to answer before it counts as lost.
+        max_env_failures: how often workers may die in the environment's code, counted as in a training run: consecutively,
+            and within an hour (in proportion to env copies and hours).
+        copy: return copies of the observations. If False, the next step overwrites them.
         render_mode: passed on to the environment.
-        wrappers: applied to every env copy in its worker, the first one innermost: classes, functions, or names as
+        wrappers: applied to every env copy in its worker, the first one innermost: classes, functions, or names such as
             "gymnasium.wrappers:FlattenObservation".
         kwargs: passed on to the environment.
 
     A worker elsewhere also counts as lost if it sends no heartbeat for 5 s while this process waits for it. A long step does
-    not stop heartbeats, unless it holds Python's global interpreter lock. The time between two calls is not limited for
-    local workers. Workers elsewhere wait for ten minutes; then they join again, and their env copies are lost.
+    not stop heartbeats, unless it holds Python's global interpreter lock. Local workers wait for the next call without a
+    limit. Workers elsewhere wait for ten minutes; then they join again, and their env copies are lost.
 
     Raises:
         UsageError: an argument is wrong.
         NoWorkers: too few workers joined in time.
-        EnvironmentFailed: an environment raised, and the error has the worker's traceback; or it ended its worker too often;
-            or env copies differ in their spaces.
+        EnvironmentFailed: an environment raised (the error has the worker's traceback), or killed its worker too often, or
+            the env copies have different spaces.
         WorkerLost: see `on_worker_loss`.
 
     >>> import millrace
@@ -148,7 +148,7 @@ def make_vec(
 
 
 def start_vector_env(settings: VectorEnvSettings, crew: Crew) -> ZmqVectorEnv:
-    """Start a vector environment and wait for its workers, which have the logs and cores of this crew.
+    """Start a vector environment and wait for its workers, which get the log files and cores of `crew`.
 
     Raises `UsageError`, `NoWorkers` and `EnvironmentFailed`.
     """
@@ -156,7 +156,7 @@ def start_vector_env(settings: VectorEnvSettings, crew: Crew) -> ZmqVectorEnv:
 
     def died(event: Failed) -> None:
         for lane in event.lanes if event.worked_s is not None else ():
-            deaths.collected(lane)  # every step is a result by itself
+            deaths.collected(lane)  # the worker has made steps, and here each step counts as a result
         if line := deaths.count(event, time.monotonic()):
             logging.getLogger("millrace.learner").warning("%s", line)
 
@@ -187,7 +187,7 @@ def start_vector_env(settings: VectorEnvSettings, crew: Crew) -> ZmqVectorEnv:
 
 
 class VectorEnvPool:
-    """The pool of a vector environment, which is made once one of its workers has described the environment."""
+    """The worker pool of a vector environment. `vector_env` makes the latter once a worker has described the environment."""
 
     def __init__(
         self, settings: VectorEnvSettings, requested: RequestedCopies, pool: ActingPool, resources: ExitStack
@@ -201,21 +201,24 @@ class VectorEnvPool:
 
     @property
     def bound(self) -> Bound:
-        """The address where workers join, and who may."""
+        """The address where workers join, and which workers may join."""
         return self._pool.bound
 
     @property
     def expected(self) -> int:
-        """Number of workers that are started here."""
+        """Number of workers that are started on this machine."""
         return self._settings.local_workers
 
     def start(self, crew: Crew, before: LobbySettings) -> AbstractContextManager[Lobby]:
-        """The lobby of the workers: as many as the settings say, with the logs and cores of this crew. Call it once."""
+        """Start the number of workers in the settings, with the log files and cores of `crew`. Call it once.
+
+        Returns a context manager: the lobby of these workers.
+        """
         crew = replace(crew, count=self.expected, inherited=self._inherited)
         return self._pool.start(crew, replace(before, wait=self.requested.wait))
 
     def vector_env(self, described: DescribedEnv) -> ZmqVectorEnv:
-        """The vector environment. Call it once; it does not wait until workers have joined."""
+        """Make the vector environment, without waiting until workers have joined. Call it once."""
         settings = self._settings
         lobby = self._pool.lobby
         assert lobby is not None, "start comes first"
@@ -240,7 +243,7 @@ class VectorEnvPool:
         )
 
     def _new_inherited(self) -> InheritedByWorkers | None:
-        """Shared memory, if local processes can use it."""
+        """Shared memory and wake pipes for local worker processes; None if they can't or shouldn't use them."""
         settings = self._settings
         if not (settings.shared_memory and SUPPORTED and self.expected) or settings.transport == "inproc":
             return None
@@ -259,14 +262,14 @@ class VectorEnvPool:
 
 
 def open_vector_env_pool(settings: VectorEnvSettings, resources: ExitStack) -> VectorEnvPool:
-    """Bind the address. Closing `resources`, or the environment that is made, releases all that was acquired.
+    """Bind the address where workers join. Closing `resources`, or the vector environment, releases everything.
 
     Raises `UsageError`.
     """
     where = settings.listen
     if where.bind and settings.workers:
         raise UsageError(f"workers: expected 0, got {settings.workers}; with a bind address, start the workers yourself")
-    # Local workers end with this process, and this process notices at once if one of them ends. So no timeout is needed.
+    # Local workers need no timeout: they end with this process, and this process notices at once if one of them ends.
     requested = requested_copies(settings, LEARNER_TIMEOUT_S if where.bind else math.inf)
     if where.bind:
         check_address(advertised_address("tcp://*:1", where.advertise, "machine"))
@@ -276,10 +279,10 @@ def open_vector_env_pool(settings: VectorEnvSettings, resources: ExitStack) -> V
 
 
 def call_timeouts_of(timeout_s: float) -> CallTimeouts:
-    """How long a call of the environment may take before its worker is ended.
+    """How long a call of the environment may take before the worker's supervisor kills the worker.
 
-    This is longer than `timeout_s`, after which the learner gives the worker up, and kills it if it is local. So it matters
-    only for a worker elsewhere, and if the learner does not wait.
+    This is longer than `timeout_s`, after which the learner treats the worker as lost, and kills it if it is local. So it
+    only matters for a worker elsewhere, and while the learner isn't waiting.
     """
     seconds = max(STEP_TIMEOUT_LEAST_S, 2 * timeout_s) if timeout_s < STEP_TIMEOUT_MOST_S else 0.0
     return CallTimeouts(seconds, seconds)

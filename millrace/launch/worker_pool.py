@@ -1,11 +1,11 @@
-"""The pool of workers of a learner: they are started here, or join from elsewhere.
+"""The pool of a learner's workers, which are started on this machine or join from elsewhere.
 
-The order is: open the pool, which binds its address; make or open the folder that the workers write to; `start` the workers,
-or log how to start one elsewhere; let a worker in the lobby describe the environment; `begin` with the workers that collect.
+The order is: open the pool, which binds its address; make or open the folder to which workers write; `start` the workers, or
+log how to start one elsewhere; let a worker in the lobby describe the environment; `begin` with the workers that collect.
 
-Rule: whatever happens, no worker or thread outlives `start`, and no socket file or folder outlives the pool. Workers that
-still run at the end of `start` are stopped at once. So code that lets them work calls `stop` first, with the time that they
-may take.
+Rule: whatever happens, no worker or thread outlives the context of `start`, and no socket file or folder outlives the pool.
+Workers that still run at the end of this context are stopped almost at once. To give them time to finish their work, call
+`stop` before.
 """
 
 from __future__ import annotations
@@ -34,58 +34,58 @@ from millrace.workers.supervise.supervisor import Running, Supervisor
 from millrace.workers.supervise.worker_process import WorkerCommand, WorkerProcess
 from millrace.workers.worker_thread import WorkerThread
 
-STOP_BEFORE_RUN_S = 0.5  # if no run has begun: a worker in the constructor of its environment doesn't listen
+STOP_BEFORE_RUN_S = 0.5  # short, because a worker that is still constructing its environment can't answer anyway
 
 
 class WorkerPool(Protocol):
-    """The workers of a learner. The policy acts in them, or in this process (`learner_inference.py`)."""
+    """The workers of a learner. The policy acts in these workers, or in this process (`learner_inference.py`)."""
 
     @property
     def bound(self) -> Bound:
-        """The address where workers join, and who may."""
+        """The address where workers join, and which workers may join."""
         ...
 
     def start(self, crew: Crew, before: LobbySettings) -> AbstractContextManager[Lobby]:
-        """The lobby of these workers, which are started, or join from elsewhere.
+        """Start the workers of this crew, or let workers join from elsewhere. Call it once.
 
-        Call it once. `before`: settings until the run begins.
+        Returns a context manager: the lobby of the workers. `before`: settings that apply until the run begins.
         """
         ...
 
     def begin(self, described: DescribedEnv, *, masked: bool) -> Lobby:
-        """Let the run begin.
+        """Begin the run. Call it once.
 
-        Returns the lobby of the workers that collect for it. Call it once. `described`: the environment as a worker in the
-        first lobby described it. `masked`: whether masks are used.
+        Returns the lobby of the workers that collect rollouts for the run. `described`: the environment, as a worker in the
+        lobby of `start` described it. `masked`: whether action masks are used.
         """
         ...
 
     def report(self, status: Callable[[float], Status]) -> None:
-        """Answer `millrace status` with the run's status from now on."""
+        """From now on, answer `millrace status` with the run's status. `status` takes the time and returns it."""
         ...
 
     def stop(self, within_s: float) -> None:
-        """Ask all local workers and threads to leave, and end those that still run after this time."""
+        """Ask all local workers and threads to leave, and kill those that still run after `within_s`."""
         ...
 
 
 @dataclass
 class ActingPool:
-    """A pool whose workers act."""
+    """A pool whose workers act with the policy themselves."""
 
     bound: Bound
     where: BindSettings
-    """Where workers from elsewhere join, if they do."""
+    """Where workers from elsewhere join; without a bind address, local workers are started."""
     token: Token | None
-    """Token of local workers."""
+    """Token with which local workers join, if keys are used."""
     processes: WorkerProcesses = field(default_factory=WorkerProcesses)
-    """The workers that were started here."""
+    """The local workers."""
     lobby: Lobby | None = None
-    """Their lobby, once they were started."""
+    """The lobby of the workers, after `start`."""
 
     @contextmanager
     def start(self, crew: Crew, before: LobbySettings) -> Iterator[Lobby]:
-        """The lobby of the workers. None is started here if they join at `where`."""
+        """A context manager: starts the local workers, unless workers join from elsewhere, and yields the lobby."""
         if self.where.bind:
             self.bound.announce(self.where.advertise)
         else:
@@ -97,20 +97,20 @@ class ActingPool:
             self.stop(STOP_BEFORE_RUN_S)
 
     def begin(self, described: DescribedEnv, *, masked: bool) -> Lobby:
-        """The same lobby: these workers collect."""
+        """Returns the lobby of `start`, because its workers also collect."""
         assert self.lobby is not None, "start comes first"
         return self.lobby
 
     def report(self, status: Callable[[float], Status]) -> None:
-        """Do nothing: the hub of the run answers at this address."""
+        """Do nothing, because the run's hub answers `millrace status` at this address."""
 
     def stop(self, within_s: float) -> None:
-        """Stop the workers that were started here."""
+        """Stop the local workers."""
         self.processes.stop(within_s)
 
 
 def _started(bound: Bound, token: Token | None, crew: Crew, name: str) -> Running:
-    """A worker of this crew: a thread of this process if the address is within it, else a process."""
+    """Start the worker of this name: a thread if the address is within this process, otherwise a process."""
     address = bound.link.address
     if address.startswith("inproc://"):
         return WorkerThread(address, name, bound.context, evaluates=crew.evaluates(name))
@@ -120,7 +120,7 @@ def _started(bound: Bound, token: Token | None, crew: Crew, name: str) -> Runnin
 
 @contextmanager
 def open_worker_pool(where: BindSettings, transport: str, code: str = "") -> Iterator[ActingPool]:
-    """Bind `where.bind`, or if it is empty an address of this transport for local workers.
+    """A context manager that binds `where.bind`, or if it is empty an address of this transport for local workers.
 
     `code`: see `millrace.learner.members.bound.bind`. Raises `UsageError`.
     """
@@ -135,7 +135,7 @@ def open_worker_pool(where: BindSettings, transport: str, code: str = "") -> Ite
 
 
 def _temporary_keys(transport: str, keys: str, *, insecure: bool) -> tuple[Keyring | None, Token | None]:
-    """Keys for this run only, if it uses TCP and a key folder was named; else None."""
+    """Keys for this run only, if local workers use TCP and a key folder was chosen; otherwise None."""
     encrypted = transport == "tcp" and chosen_key_folder(keys) is not None and not insecure
     return generate_run_keys("local", datetime.now(UTC)) if encrypted else (None, None)
 
@@ -144,7 +144,7 @@ class _LocalProcesses(WorkerProcesses):
     """The processes or threads of a crew."""
 
     def __init__(self, crew: Crew, start: Callable[[str], Running]) -> None:
-        """Starts them all. `start`: starts the worker of this name."""
+        """Starts all of them. `start` starts the worker of a given name."""
         self.expected = crew.count
         self.most_copies = copies_per_machine() if crew.count else 0
         self._crew = crew
@@ -160,7 +160,7 @@ class _LocalProcesses(WorkerProcesses):
         return self._supervisor.said()
 
     def left(self, *, collecting: bool) -> float:
-        if not self.expected:  # no local ones were requested: others join
+        if not self.expected:  # no local workers were requested: workers join from elsewhere
             return math.inf
         return sum(not (collecting and self._crew.evaluates(name)) for name in self._supervisor.names)
 

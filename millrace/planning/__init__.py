@@ -1,1 +1,1 @@
-"""What to choose for an environment, and what to expect: `millrace.plan`."""
+"""Measures an environment and recommends settings for a run, with the speed to expect: `millrace.plan`."""

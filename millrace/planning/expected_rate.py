@@ -1,10 +1,10 @@
-"""How many env steps/s a run will make, by a small queueing model. Pure.
+"""Predicts the env steps/s of a run with a small queueing model. Pure.
 
-A round is a rollout of each lane: T steps of all env copies. A worker steps the copies of its lanes one after another, so
-its round takes T times what they take together, and a round of the run ends with the slowest worker's. Then comes the
-update. With lag 0, collecting and updates take turns. With lag L, workers collect up to L rounds ahead.
+A round is one rollout of each lane: T steps of all env copies. A worker steps the copies of its lanes one after another, so
+its round takes T times the sum of their step times. A round of the run ends when the slowest worker's round ends; then the
+learner updates the policy. With lag 0, collecting and updating take turns. With lag L, workers collect up to L rounds ahead.
 
-Rule: whatever computes needs a core. A round never takes less than all CPU time in it, divided by the cores.
+Rule: all computation needs a core. A round never takes less than the CPU time used in it, divided by the number of cores.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ import numpy as np
 from millrace.planning.measurements import Machine, Measurements, Overheads
 from millrace.protocol.arrays import Doubles
 
-ROUNDS = 60  # that are simulated
-WARM_UP = 10  # rounds of these that are not counted
-SHARPNESS = 4.0  # of the change from a run that waits to one that computes all the time
+ROUNDS = 60  # number of simulated rounds
+WARM_UP = 10  # number of first rounds that aren't counted
+SHARPNESS = 4.0  # the larger, the closer `_larger` is to the maximum of two times
 
 
 class Sizes(msgspec.Struct, frozen=True, kw_only=True):
-    """What decides how fast a run collects."""
+    """The settings that determine how fast a run collects env steps."""
 
     workers: int
     envs: int
@@ -33,7 +33,7 @@ class Sizes(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def most_lanes(self) -> int:
-        """Lanes of the worker that has the most."""
+        """The largest number of lanes that a worker has."""
         return math.ceil(self.lanes / self.workers)
 
     @property
@@ -43,36 +43,36 @@ class Sizes(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Situation(msgspec.Struct, frozen=True, kw_only=True):
-    """What was measured, where the run will be."""
+    """The measurements, and the machines on which the run will be."""
 
     measured: Measurements
     overheads: Overheads
     machine: Machine
     machines: int = 1
-    """machines that step env copies, all like this one; the learner is on one of them"""
+    """number of machines that step env copies, all like this one; the learner runs on one of them"""
     resets_ahead: bool = False
-    """whether copies are reset in the background, as `millrace:ResetAhead` does it"""
+    """whether copies are reset in the background, as with `millrace:ResetAhead`"""
 
     @property
     def cores(self) -> int:
-        """Of all machines."""
+        """Number of cores of all machines together."""
         return self.machine.cores * self.machines
 
 
 class _RoundOfWorker(msgspec.Struct, frozen=True, kw_only=True):
-    """What a round takes a worker, if cores are free."""
+    """The time that a worker needs for a round, if cores are free."""
 
     mean_s: float
     std_s: float
     cpu_s: float
     resets: float
-    """mean number of resets in it"""
+    """mean number of resets in a round"""
     reset_s: float
-    """time for which it waits in each of them"""
+    """time for which the worker waits in each reset"""
 
 
 def steps_per_s(sizes: Sizes, situation: Situation, sampled: np.random.Generator) -> float:
-    """The env steps/s to expect. `sampled`: random numbers for the times of rounds; equal ones give equal results."""
+    """The env steps/s to expect. `sampled`: generator for the times of rounds; the same seed gives the same result."""
     measured = situation.measured
     per_round = sizes.steps_per_round * _share_of_steps(measured)
     lanes_of = _lanes_of_workers(sizes)
@@ -94,7 +94,7 @@ def steps_per_s(sizes: Sizes, situation: Situation, sampled: np.random.Generator
 
 
 def _share_of_steps(measured: Measurements) -> float:
-    """The share of the rows that are env steps: after the last step of an episode, a row only resets the copy."""
+    """The share of rows that are env steps: the row after the last step of an episode only resets the copy."""
     return measured.ends_every / (measured.ends_every + 1) if math.isfinite(measured.ends_every) else 1.0
 
 
@@ -125,17 +125,20 @@ def _worker(sizes: Sizes, situation: Situation, lanes: int) -> _RoundOfWorker:
 
 
 def _times_of_rounds(worker: _RoundOfWorker, sampled: np.random.Generator) -> Doubles:
-    """[ROUNDS] seconds."""
+    """Sample the durations of the rounds of a worker: [ROUNDS] seconds."""
     steps_s = np.maximum(worker.mean_s / 2, sampled.normal(worker.mean_s, worker.std_s, ROUNDS))
     times_s: Doubles = steps_s + worker.reset_s * sampled.poisson(worker.resets, ROUNDS)
     return times_s
 
 
 def _round_with_lag_s(times_s: Doubles, learner_s: float, max_lag: int) -> float:
-    """Mean time of a round with lag `max_lag`. `times_s`: [workers, rounds]. `learner_s`: of each update."""
+    """Mean time of a round with lag `max_lag`.
+
+    `times_s`: [workers, rounds], the time that each worker needs for each round. `learner_s`: the time of each update.
+    """
     workers, rounds = times_s.shape
-    ready_s = np.zeros(workers)  # when each worker has collected its newest round
-    updated_s: list[float] = []  # when each update has ended
+    ready_s = np.zeros(workers)  # when each worker finished its newest round
+    updated_s: list[float] = []  # when each update ended
     for number in range(rounds):
         opened_s = updated_s[number - max_lag - 1] if number > max_lag else 0.0  # the lag rule
         ready_s = np.maximum(ready_s, opened_s) + times_s[:, number]
@@ -145,9 +148,9 @@ def _round_with_lag_s(times_s: Doubles, learner_s: float, max_lag: int) -> float
 
 
 def _stretched_s(collecting_s: float, busy: float, learner_s: float, cores: int) -> float:
-    """Time of a round in which `busy` workers compute in the mean while the learner updates, if all get equal shares.
+    """Time of a round in which on average `busy` workers compute while the learner updates, if all get equal CPU shares.
 
-    While both go on, each is slower by `stretch`; what is left of the longer one then goes on alone.
+    While workers and learner both compute, each is slower by `stretch`. Then the one that takes longer continues alone.
     """
     stretch = max(1.0, (busy + 1) / cores)
     if learner_s > collecting_s:
@@ -156,5 +159,7 @@ def _stretched_s(collecting_s: float, busy: float, learner_s: float, cores: int)
 
 
 def _larger(a: float, b: float) -> float:
-    """About the larger of two times, and a little more if they are alike: then each is now and then the larger one."""
+    """A smooth maximum of two times. It is a little larger than both if they are similar, because then each of them is the
+    larger one in some rounds.
+    """
     return math.pow(math.pow(a, SHARPNESS) + math.pow(b, SHARPNESS), 1 / SHARPNESS)

@@ -1,4 +1,4 @@
-"""What was measured of an environment, of this machine and of millrace on it. Plain data; times are in seconds."""
+"""Measurements of an environment, of this machine, and of millrace on this machine. Plain data; times are in seconds."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Literal
 
 import msgspec
 
-COMPUTES = 0.5  # with a larger share of CPU time
+COMPUTES = 0.5  # if the share of CPU time in a step is larger, the step counts as computing, otherwise as waiting
 WORKER_BYTES = 50 << 20
 """Memory of a worker without an env copy."""
 
@@ -15,33 +15,33 @@ ActionKind = Literal["box", "discrete", "other"]
 
 
 class StepCosts(msgspec.Struct, frozen=True, kw_only=True):
-    """What a step costs while some workers step side by side, each one copy, or several if steps are short."""
+    """The costs of an env step while some workers step side by side, each with one copy, or several if steps are short."""
 
     workers: int
     """number of workers"""
     steps: int
-    """number of steps that were measured, of all copies"""
+    """number of measured steps of all copies"""
     mean_s: float
     median_s: float
     p95_s: float
-    """95 of 100 steps take no longer"""
+    """95th percentile of the step time"""
     std_s: float
-    """standard deviation"""
+    """standard deviation of the step time"""
     cpu_s: float
-    """CPU time of a step, with that of the processes which the environment has started"""
+    """CPU time of a step, including that of processes which the environment has started"""
     delay_s: float = 0.0
-    """time in which it could go on and had no core, because others had them all"""
+    """time in which the step was ready to run but had to wait for a core"""
     slowest_copy: float = 1.0
     """mean step time of the slowest copy, divided by that of the median copy"""
 
     @property
     def wait_s(self) -> float:
-        """The part of a step in which the copy waits for something else than a core."""
+        """The part of a step in which the copy waits for something other than a core."""
         return max(0.0, self.mean_s - self.cpu_s - self.delay_s)
 
     @property
     def own_s(self) -> float:
-        """What a step takes if a core is free."""
+        """The time of a step if a core is free."""
         return self.cpu_s + self.wait_s
 
     @property
@@ -51,81 +51,81 @@ class StepCosts(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def computes(self) -> bool:
-        """Whether a step computes for most of its time; else it waits."""
+        """Whether a step computes for most of its time; otherwise it mostly waits."""
         return self.cpu_share > COMPUTES
 
     @property
     def steps_per_s(self) -> float:
-        """Env steps/s of these workers, if none of them ever waits for another one."""
+        """Env steps/s of these workers, if no worker waits for another one."""
         return self.workers / max(self.mean_s, 1e-12)
 
 
 class Measurements(msgspec.Struct, frozen=True, kw_only=True):
-    """What was measured of an environment, with random actions."""
+    """Measurements of an environment, made with random actions."""
 
     env: str
     agents: int = 1
     action: ActionKind = "other"
     images: bool = False
     goals: bool = False
-    """whether its observations have goals, as hindsight needs them"""
+    """whether its observations contain goals, as hindsight replay needs them"""
     observation_bytes: int = 0
     side_by_side: tuple[StepCosts, ...]
-    """by number of workers, the least first; never empty"""
+    """costs of a step for each number of workers that was tried, in ascending order; never empty"""
     reset_s: float = 0.0
     """mean wall time of a reset"""
     reset_cpu_s: float = 0.0
     resets: int = 0
-    """number of resets that were measured"""
+    """number of measured resets"""
     episode_steps: float | None = None
-    """mean length of an episode, or the time limit if no episode has ended; None: neither is known"""
+    """mean length of an episode, or the time limit if no episode has ended; None if neither is known"""
     start_s: float = 0.0
-    """from the start of a worker until its copy is made"""
+    """time from the start of a worker until its env copy is made"""
     worker_bytes: int = 0
-    """memory of a worker with one copy, and of what the copy has started"""
+    """memory of a worker with one copy, including the processes that the copy has started"""
     repeats: bool | None = None
-    """whether another copy shows and gives the same for the same seed and actions; None: nobody knows"""
+    """whether another copy returns the same for the same seed and actions; None if it isn't known"""
     findings: tuple[str, ...] = ()
-    """what else was found, each in a line: a crash, a step that hung"""
+    """problems that were found, such as a crash or a step that hung; one line each"""
 
     @property
     def alone(self) -> StepCosts:
-        """The costs of a step of one copy alone."""
+        """The costs of a step while only one worker steps."""
         return self.side_by_side[0]
 
     @property
     def ends_every(self) -> float:
-        """Steps between two resets of a copy; infinite if none is known."""
+        """Number of steps between two resets of a copy; infinite if it isn't known."""
         return self.episode_steps or float("inf")
 
     @property
     def step_with_reset_s(self) -> float:
-        """Mean time of a step if a core is free, with its share of a reset."""
+        """Mean time of a step if a core is free, plus its share of a reset."""
         return self.alone.own_s + self.reset_s / self.ends_every
 
     def costs(self, workers: int) -> StepCosts:
-        """Those that were measured with as many workers, or with the next larger number; else with the most."""
+        """The costs measured with this number of workers, or the next larger number; otherwise with the largest number."""
         return next((each for each in self.side_by_side if each.workers >= workers), self.side_by_side[-1])
 
 
 class Machine(msgspec.Struct, frozen=True, kw_only=True):
-    """What this machine, or the job or container here, leaves to a run."""
+    """The resources that a run may use on this machine, or in this job or container."""
 
     cores: int
     free_bytes: int | None = None
-    """None: the system does not say"""
+    """free memory; None if the system doesn't report it"""
     most_copies: int = 0
-    """so many env copies are allowed at the same time, as by licences; 0: any number"""
+    """how many env copies may run at the same time, for example because of licences; 0: any number"""
     load: float = 0.0
-    """the load average of the minute before: processes of others that used a core or waited for one"""
+    """load average over the minute before: the number of other processes that used a core or waited for one"""
 
 
 class Overheads(msgspec.Struct, frozen=True, kw_only=True):
-    """What millrace itself takes on this machine, with an environment that does nothing.
+    """The time that millrace itself needs on this machine, measured with an environment that does nothing.
 
-    A worker that holds l lanes with n copies in all takes `row_s + l · lane_row_s + n · copy_row_s` for a step of all of
-    them, and `l · sent_s` for their rollouts. A round of L lanes and R env steps then takes the learner
-    `round_s + L · rollout_s + R · received_s` until all of it is gathered, and `R · update_s` for the update.
+    A worker that has l lanes with n copies in total needs `row_s + l · lane_row_s + n · copy_row_s` for one step of all its
+    copies, and `l · sent_s` to send their rollouts. For a round of L lanes and R env steps, the learner needs
+    `round_s + L · rollout_s + R · received_s` to gather the rollouts, and `R · update_s` for the update.
     """
 
     row_s: float
@@ -139,12 +139,12 @@ class Overheads(msgspec.Struct, frozen=True, kw_only=True):
     update_cores: float = 1.0
     """cores that an update keeps busy"""
     acting_bytes: int = 0
-    """memory that a worker needs in addition if it acts with this policy"""
+    """additional memory that a worker needs to act with this policy"""
 
     def worker_s(self, lanes: int, copies: int, steps: int) -> float:
-        """What a round takes a worker with so many lanes and copies, without the time of the copies."""
+        """The time that a round of `steps` steps takes in a worker with these lanes and copies, except in the env copies."""
         return steps * (self.row_s + lanes * self.lane_row_s + copies * self.copy_row_s) + lanes * self.sent_s
 
     def gathering_s(self, lanes: int, steps: float) -> float:
-        """What a round of so many lanes and env steps takes the learner until all of it is gathered."""
+        """The time that the learner needs to gather a round of this many lanes and env steps."""
         return self.round_s + lanes * self.rollout_s + steps * self.received_s

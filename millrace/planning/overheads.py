@@ -1,7 +1,9 @@
-"""Measures what millrace itself takes on this machine: collecting and updates, with an environment that does nothing.
+"""Measures the time that millrace itself needs on this machine for collecting and updates.
 
-Rule: nothing is assumed of the machine. Rounds of different sizes are timed, and what a row, a lane, a copy and a rollout
-take follows from them. CPU time is what counts, so that other programs on this machine change little.
+The environment that it collects from does nothing.
+
+Rule: nothing is assumed about the machine. Rounds of different sizes are timed, and the times of a row, a lane, a copy and a
+rollout are computed from the differences. CPU time is measured, so that other programs on this machine change little.
 """
 
 from __future__ import annotations
@@ -29,27 +31,27 @@ from millrace.protocol.rollout import Batch
 from millrace.protocol.specs import ActionSpec, ExtraArray, Leaf, PolicySpec
 from millrace.rollout_service import RolloutBatch, RolloutService
 
-EACH_S = 0.4  # of collecting, for each size
+EACH_S = 0.4  # how long rounds of each size are measured
 LEAST_ROUNDS = 3
-OF_UPDATES_S = 1.5
-MINIBATCHES = 4  # of an update that is measured
+OF_UPDATES_S = 1.5  # how long updates are measured
+MINIBATCHES = 4  # number of minibatches in a measured update
 COPIES = 8
-LONG, SHORT = 48, 8  # steps of a rollout
+LONG, SHORT = 48, 8  # numbers of steps in a rollout
 MOST_WAITING_S = 0.001
-TORCH_BYTES = 200 << 20  # of a worker that acts on images, because it imports torch
+TORCH_BYTES = 200 << 20  # additional memory of a worker that acts on images, because it imports torch
 
 
 class StoodFor(NamedTuple):
-    """The environment in whose place a stand-in is stepped."""
+    """The environment that a stand-in replaces during the measurement."""
 
     observation: gymnasium.Space[Any]
     action: gymnasium.Space[Any]
     seats: tuple[str, ...] = ()
     wait_s: float = 0.0
-    """for how long its step waits"""
+    """how long a step of the environment waits for something other than a core"""
 
     def stand_in(self) -> Callable[[], Any]:
-        """Makes an environment with these spaces."""
+        """A factory that makes a stand-in with these spaces."""
         wait_s = min(self.wait_s, MOST_WAITING_S)
         if self.seats:
             return partial(StandInOfAgents, self.observation, self.action, wait_s, agents=self.seats)
@@ -57,7 +59,7 @@ class StoodFor(NamedTuple):
 
 
 class _PolicyOf(NamedTuple):
-    """The policy that an algorithm trains, as a rollout service takes it."""
+    """The policy that the configured algorithm trains, in the form that `RolloutService` accepts."""
 
     config: Config
 
@@ -76,25 +78,25 @@ class _Size(NamedTuple):
 
 
 class _Round(NamedTuple):
-    """What a round takes one worker and the learner."""
+    """The time that a round takes, in one worker and in the learner."""
 
     worker_s: float
-    """CPU time"""
+    """CPU time of the worker"""
     learner_s: float
-    """CPU time"""
+    """CPU time of the learner"""
     wall_s: float
-    """the least"""
+    """wall time; of several rounds, the shortest"""
 
 
 def overheads(config: Config, env: StoodFor) -> Overheads:
-    """Measure them for runs with these settings. It takes some seconds. Raises `UserFacingError`."""
+    """Measure the overheads for runs with these settings. This takes some seconds. Raises `UserFacingError`."""
     one_long = _round(config, env, _Size(1, 1, LONG))
     one_short = _round(config, env, _Size(1, 1, SHORT))
     many_long = _round(config, env, _Size(COPIES, COPIES, LONG))
     many_short = _round(config, env, _Size(COPIES, COPIES, SHORT))
     one_lane = _round(config, env, _Size(1, COPIES, LONG))
     awake = _round(config, env._replace(wait_s=0.0), _Size(1, 1, SHORT))
-    # A worker takes base + l · per_lane + T · (row_s + l · lane_row_s + n · copy_row_s).
+    # A worker's CPU time is base + l · per_lane + T · (row_s + l · lane_row_s + n · copy_row_s).
     row_of_one_s = _slope(one_long.worker_s - one_short.worker_s, LONG - SHORT)
     row_of_many_s = _slope(many_long.worker_s - many_short.worker_s, LONG - SHORT)
     base_s = max(0.0, one_long.worker_s - LONG * row_of_one_s)
@@ -102,7 +104,7 @@ def overheads(config: Config, env: StoodFor) -> Overheads:
     copy_row_s = _slope(row_of_one_lane_s - row_of_one_s, COPIES - 1)
     lane_row_s = _slope(row_of_many_s - row_of_one_lane_s, COPIES - 1)
     sending_s = _slope(many_long.worker_s - LONG * row_of_many_s - base_s, COPIES - 1)
-    # The learner takes base + l · per_lane + n · T · received_s.
+    # The learner's CPU time is base + l · per_lane + n · T · received_s.
     received_s = _slope(many_long.learner_s - many_short.learner_s, COPIES * (LONG - SHORT))
     taken_in_s = _slope(many_short.learner_s - one_short.learner_s - (COPIES - 1) * SHORT * received_s, COPIES - 1)
     on_the_way_s = max(0.0, awake.wall_s - awake.worker_s - awake.learner_s)
@@ -122,7 +124,7 @@ def overheads(config: Config, env: StoodFor) -> Overheads:
 
 
 def _slope(difference: float, by: float) -> float:
-    """Times that were measured may differ by less than they vary; none is negative."""
+    """A difference of measured times, divided by `by`. Noise may make the difference negative; then the slope is 0."""
     return max(0.0, difference) / by
 
 
@@ -132,7 +134,7 @@ def _service(config: Config, env: StoodFor, size: _Size) -> RolloutService:
 
 
 def _round(config: Config, env: StoodFor, size: _Size) -> _Round:
-    """What a round of this size takes."""
+    """Measure the time of a round of this size."""
     found: list[_Round] = []
     with _service(config, env, size) as service:
         parameters = service.policy.initial()
@@ -154,7 +156,7 @@ def _round(config: Config, env: StoodFor, size: _Size) -> _Round:
 
 
 def _update(config: Config, env: StoodFor) -> tuple[UpdateTime, bool]:
-    """What updates take, and whether the policy has convolutions."""
+    """Measure the time of updates. Also returns whether the policy has convolutions."""
     size = _Size(1, config.envs, _steps_of_update(config))
     with _service(config, env, size) as service:
 
@@ -168,10 +170,10 @@ def _update(config: Config, env: StoodFor) -> tuple[UpdateTime, bool]:
 
 
 def _steps_of_update(config: Config) -> int:
-    """Steps of a rollout, fewer than in a run if an update of fewer takes in proportion less."""
+    """Number of steps in a measured rollout. It is smaller than in a run if the time of an update is proportional to it."""
     steps = config.algorithm.rollout_steps
     match config.algorithm:
-        case QLearningConfig():  # whose number of gradient steps in an update is a setting
+        case QLearningConfig():  # a setting determines the number of gradient steps in an update
             return steps
         case OffPolicyConfig():
             return max(1, steps // 4)
@@ -180,6 +182,6 @@ def _steps_of_update(config: Config) -> int:
 
 
 def _as_algorithms_take_it(batch: RolloutBatch) -> Batch:
-    """The same batch, with the leaves of its observations in a tuple."""
+    """The same batch, with the leaves of its observations in a tuple, as algorithms expect them."""
     leaves = tuple(batch.obs.values()) if isinstance(batch.obs, dict) else (batch.obs,)
     return Batch(**{name: getattr(batch, name) for name in Batch.__struct_fields__} | {"obs": leaves})

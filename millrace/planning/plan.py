@@ -1,4 +1,4 @@
-"""`millrace.plan`: measures an environment and this machine, and says what to choose and what to expect."""
+"""`millrace.plan`: measures an environment and this machine, and recommends settings, with the speed to expect."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ from millrace.protocol.random_streams import Purpose, generator
 from millrace.workers.machine_slots import copies_per_machine
 
 SECONDS = 30.0
-OF_PROBE = 0.7  # of the seconds; then millrace's own part is measured
+OF_PROBE = 0.7  # share of the time in which the environment is measured; millrace's own part is measured in the rest
 LEAST_S = 5.0
 EVALUATION_COPIES = Config().eval_copies
 MACHINES = (1, 2, 10)
-BUSY = 0.5  # load average, divided by the cores
-RESETS_COUNT = 1.1  # resets in the background are worth a line if they make a run faster by this factor
+BUSY = 0.5  # load average divided by the number of cores, above which the machine counts as busy
+RESETS_COUNT = 1.1  # resets in the background are advised if they make a run faster by at least this factor
 SLOW_START_S = 10.0
 
 
@@ -56,21 +56,23 @@ def plan(
     max_env_copies: int = 0,
     seconds: float = SECONDS,
 ) -> RunPlan:
-    """Step an environment in workers of this machine, and say what to choose for a run and what to expect of it.
+    """Measure an environment on this machine, and recommend settings for a run, with the speed to expect.
 
-    Its actions are random. One copy is stepped, then several side by side; then millrace's own part is measured, with an
-    environment that does nothing. Your environment runs in workers only, so that a crash or a hang is a line of `advice`.
+    The environment is stepped with random actions, first one copy, then several side by side. Then millrace's own part is
+    measured, with an environment that does nothing. Your environment runs only in worker processes, so that a crash or a
+    hang becomes a line of `advice`.
 
     Args:
-        env: an id that `gymnasium.make` takes, a `gymnasium.envs.registration.EnvSpec`, or a callable that returns an
-            environment. It may be of PettingZoo's, with several agents.
+        env: an id that `gymnasium.make` accepts, a `gymnasium.envs.registration.EnvSpec`, or a callable that returns an
+            environment. The environment may be PettingZoo's, with several agents.
         env_kwargs: keyword arguments of the environment.
-        wrappers: as of `millrace.train`.
-        max_env_copies: most env copies that may run at the same time, as for floating licences. 0: any number.
-        seconds: about how long it may take. Give it more if a step or a start takes seconds.
+        wrappers: as in `millrace.train`.
+        max_env_copies: how many env copies may run at the same time, for example because of floating licences. 0: any
+            number.
+        seconds: about how long the measurement may take. Allow more time if a step, or the start of a copy, takes seconds.
 
-    Raises `UsageError` if an argument is wrong or the environment cannot be found, and `RunError`, such as
-    `EnvironmentFailed`, if it could make no step.
+    Returns a `RunPlan`. Raises `UsageError` if an argument is wrong or the environment can't be found, and a `RunError`,
+    such as `EnvironmentFailed`, if the environment made no step.
 
     >>> import millrace
     >>> plan = millrace.plan("Pendulum-v1", seconds=6)
@@ -82,7 +84,7 @@ def plan(
 
 
 def plan_of(env: ProbedEnv, *, max_env_copies: int, seconds: float, say: Callable[[str], None]) -> RunPlan:
-    """As `plan`. `say` is told what is measured next."""
+    """Does the work of `plan`. `say` is called with a line about what is measured next."""
     if seconds < LEAST_S:
         raise UsageError(f"plan: seconds: expected at least {LEAST_S:g}, got {seconds:g}")
     if max_env_copies < 0:
@@ -112,7 +114,7 @@ def plan_of(env: ProbedEnv, *, max_env_copies: int, seconds: float, say: Callabl
 
 
 def _limits(max_env_copies: int, allowed: int) -> list[ChosenSetting]:
-    """The settings that keep a run within the number of copies that are allowed."""
+    """The settings that limit a run to the number of env copies that are allowed."""
     found = []
     if max_env_copies:
         found.append(ChosenSetting("max_env_copies", max_env_copies, "with those of evaluations"))
@@ -123,7 +125,7 @@ def _limits(max_env_copies: int, allowed: int) -> list[ChosenSetting]:
 
 
 def _evaluation_copies(allowed: int) -> int:
-    """How many of the copies that are allowed play evaluations: the default number, unless that would be a third of them."""
+    """How many of the allowed copies play evaluations: the default number, or 1 if that were more than a third of them."""
     return EVALUATION_COPIES if not allowed or allowed >= 3 * EVALUATION_COPIES else 1
 
 
@@ -134,7 +136,10 @@ def _decided(
     first: Sequence[ChosenSetting],
     others: Sequence[ChosenSetting],
 ) -> RunPlan:
-    """The plan that follows from all that was measured. `first`, `others`: what is chosen before and after the sizes."""
+    """The plan that follows from the measurements.
+
+    `first` and `others`: settings that are listed before and after the numbers of workers, copies and lanes, and the lag.
+    """
     has_replay = isinstance(config.algorithm, OffPolicyConfig)
     default_steps = config.algorithm.rollout_steps
     rows = config.envs * default_steps if has_replay else None
@@ -187,7 +192,7 @@ def _expected(sizes: Sizes, learning: Learning, situation: Situation, needed: in
 
 
 def _advice(sizes: Sizes, situation: Situation, rate: float) -> list[str]:
-    """What else to know."""
+    """The lines of `RunPlan.advice`."""
     measured = situation.measured
     machine = situation.machine
     lines = list(measured.findings)

@@ -1,7 +1,7 @@
-"""Steps an environment in workers, with random actions, and measures what it takes.
+"""Steps an environment in workers, with random actions, and measures the time and memory that it needs.
 
-Rule: its code runs in workers, never in this process. Everything has a deadline. What goes wrong once a step was made is a
-finding, in one line; before that, it is the error.
+Rule: the environment's code runs in workers, never in this process. Everything has a deadline. An error before the first
+step is raised; a later one becomes a finding of one line.
 """
 
 from __future__ import annotations
@@ -34,25 +34,25 @@ from millrace.protocol.envs.wrappers import WrapperLike
 from millrace.protocol.errors import MillraceError, RunError, UsageError, first_line
 from millrace.protocol.policy.masks import MASK
 
-LEAST_STEPS = 8  # of a copy alone, even if they take longer than planned
-SCRIPT = 1009  # random actions, which copies take in the same order again and again
+LEAST_STEPS = 8  # number of steps that each copy makes, even if they take longer than planned
+SCRIPT = 1009  # number of random actions, which all copies take in the same order, again and again
 SEED = 1
-WARM_UP = 2  # steps of a copy that are not counted
-OF_ALONE = 0.15  # of the seconds
-OF_SIDE_BY_SIDE = 0.9  # of the seconds, until the last copies are started
-EACH_S = 2.0  # of stepping copies side by side
-MOST_PER_CORE = 8  # copies that are tried
-MOST_AT_LEAST = 16
-SHORT_S = 1e-3  # steps that take less are measured in workers with several copies, as a run steps them
-COPIES_OF_SHORT = 8
+WARM_UP = 2  # number of first steps of a copy that aren't counted
+OF_ALONE = 0.15  # share of the time in which one copy steps alone
+OF_SIDE_BY_SIDE = 0.9  # share of the time after which no more copies are started
+EACH_S = 2.0  # how long each number of workers is measured
+MOST_PER_CORE = 8  # largest number of workers to try, for each core
+MOST_AT_LEAST = 16  # number of workers to try even if `MOST_PER_CORE` allows fewer
+SHORT_S = 1e-3  # shorter steps are measured in workers with several copies, because a run steps them in this way
+COPIES_OF_SHORT = 8  # number of copies in a worker if steps are short
 OF_ITS_OWN = "if a copy needs a port, a folder or a licence of its own, see docs/how-to/simulators.md"
-GROWTH = 4  # from one number of workers to the next
-WORTH_WHILE = 1.1  # if more copies do not make more env steps by this factor, no more are tried
-OF_MEMORY = 0.7  # of what is free is used
+GROWTH = 4  # factor between two numbers of workers that are tried
+WORTH_WHILE = 1.1  # if more workers don't make more env steps/s by this factor, no more are tried
+OF_MEMORY = 0.7  # share of the free memory that is used
 
 
 class ProbedEnv(NamedTuple):
-    """The environment that is measured."""
+    """The environment to measure."""
 
     env: EnvLike
     kwargs: Mapping[str, Scalar]
@@ -60,7 +60,7 @@ class ProbedEnv(NamedTuple):
 
     @property
     def name(self) -> str:
-        """As a run is told it."""
+        """The environment's id, as `millrace train` takes it."""
         return EnvSpec.of(self.env).id
 
     def in_wrapper(self, wrapper: str) -> EnvSpec:
@@ -69,7 +69,7 @@ class ProbedEnv(NamedTuple):
 
 
 class Probed(NamedTuple):
-    """What was measured, and the spaces of the environment."""
+    """The measurements, and the environment's spaces and agents."""
 
     measured: Measurements
     observation_space: gymnasium.Space[Any]
@@ -78,7 +78,7 @@ class Probed(NamedTuple):
 
 
 def probe(env: ProbedEnv, machine: Machine, seconds: float) -> Probed:
-    """Step one copy, then several side by side, for about so many seconds.
+    """Step one copy, then several side by side, for about this many seconds in total.
 
     Raises `UserFacingError` if no step could be made.
     """
@@ -121,7 +121,7 @@ def _ladder(measured: Measurements, machine: Machine) -> Iterator[int]:
         limit = min(limit, int(OF_MEMORY * machine.free_bytes / max(measured.worker_bytes, WORKER_BYTES)))
     if machine.most_copies:
         limit = min(limit, machine.most_copies)
-    # More copies than cores are tried only if they wait.
+    # Try more copies than cores only if steps spend time waiting rather than computing.
     limit = min(limit, machine.cores if alone.computes else math.ceil(machine.cores / max(alone.cpu_share, 1e-3)))
     workers = max(2, machine.cores)
     while workers < limit:
@@ -135,14 +135,14 @@ def _ladder(measured: Measurements, machine: Machine) -> Iterator[int]:
 
 
 class _SteppedCopies(NamedTuple):
-    """What some copies did side by side."""
+    """The record of a session in which some copies were stepped side by side."""
 
     times: list[CopyTimes]
     traces: list[list[int]]
-    """for each copy, a number for all that each step showed and gave"""
+    """for each copy and step, a checksum of the observation, reward and flags that it returned"""
     start_s: float
     wrong: str
-    """what went wrong, in a line; empty if nothing did"""
+    """what went wrong, as one line; empty if nothing did"""
     observation_space: gymnasium.Space[Any]
     action_space: gymnasium.Space[Any]
     seats: tuple[str, ...]
@@ -150,13 +150,13 @@ class _SteppedCopies(NamedTuple):
 
     @property
     def is_whole(self) -> bool:
-        """Whether all copies have made steps, and nothing went wrong."""
+        """Whether all copies made steps and nothing went wrong."""
         stepped = sum(len(each.steps) > WARM_UP for each in self.times)
         return stepped == len(self.traces) and not self.wrong
 
     @property
     def finding(self) -> str:
-        """What went wrong, and in which circumstances, in a line; empty if nothing did."""
+        """What went wrong, and with how many copies, as one line; empty if nothing did."""
         copies = len(self.traces)
         if not self.wrong:
             return ""
@@ -168,7 +168,7 @@ class _SteppedCopies(NamedTuple):
 def _session(env: ProbedEnv, workers: int, seconds: float, give_up_at_s: float, each: int = 1) -> _SteppedCopies:
     """Step copies for some seconds, `each` of them in each worker.
 
-    Raises `UserFacingError` if they cannot be made and there is one alone.
+    Raises `UserFacingError` if there is only one copy and it can't be made.
     """
     copies = workers * each
     with TemporaryDirectory(prefix="millrace-plan-") as folder:
@@ -207,7 +207,7 @@ def _session(env: ProbedEnv, workers: int, seconds: float, give_up_at_s: float, 
 
 
 def _step(envs: ZmqVectorEnv, traces: list[list[int]], end_at_s: float, give_up_at_s: float) -> None:
-    """Step all copies until then, each as soon as it has come back."""
+    """Step all copies until `end_at_s`, each one again as soon as its step has ended."""
     agents = max(1, len(envs.seats))
     envs.single_action_space.seed(SEED)
     script = [envs.single_action_space.sample() for _ in range(SCRIPT)]
@@ -233,7 +233,7 @@ def _step(envs: ZmqVectorEnv, traces: list[list[int]], end_at_s: float, give_up_
 
 
 def _allowed(script: Sequence[Any], number: int, mask: Array | None, space: gymnasium.Space[Any]) -> Any:
-    """The action of this number, or another one if the mask does not allow it."""
+    """The action with this number in the script, or another one if the mask doesn't allow it."""
     action = script[number % SCRIPT]
     if mask is None or not isinstance(space, spaces.Discrete) or not np.any(mask):
         return action
@@ -261,7 +261,7 @@ def _digest(arrays: Sequence[Array]) -> int:
 
 
 def _repeats(traces: Sequence[Sequence[int]]) -> bool | None:
-    """Whether all copies showed and gave the same, as far as two of them came."""
+    """Whether all copies returned the same, as far as they were stepped; None if fewer than two were."""
     traces = [trace for trace in traces if trace]
     if len(traces) < 2:
         return None
@@ -273,7 +273,7 @@ def _repeats(traces: Sequence[Sequence[int]]) -> bool | None:
 
 
 def _measured_alone(env: ProbedEnv, session: _SteppedCopies) -> Measurements:
-    """What one copy shows."""
+    """The measurements that a session with one copy gives."""
     leaves = observation_leaves(session.observation_space)
     keys = session.observation_space.spaces if isinstance(session.observation_space, spaces.Dict) else {}
     return Measurements(
@@ -290,11 +290,11 @@ def _measured_alone(env: ProbedEnv, session: _SteppedCopies) -> Measurements:
 
 
 def _with_all(measured: Measurements, sessions: Sequence[_SteppedCopies]) -> Measurements:
-    """With what all sessions together show. The first reset of a copy may take longer than the others do."""
+    """Add the measurements that need all sessions. First resets aren't counted if there are later ones: they may be slower."""
     times = [each for session in sessions for each in session.times]
     later = [each.resets[1:] for each in times if len(each.resets) > 1]
     resets = np.concatenate(later or [each.resets for each in times])
-    steps = sum(int(np.count_nonzero(each.steps[:, 0] < each.resets[-1, 0])) for each in times)  # of whole episodes
+    steps = sum(int(np.count_nonzero(each.steps[:, 0] < each.resets[-1, 0])) for each in times)  # of complete episodes
     share = max(each.others_cpu_share for each in times)
     return msgspec.structs.replace(
         measured,
@@ -317,7 +317,7 @@ def _kind(space: gymnasium.Space[Any]) -> ActionKind:
 
 
 def _costs(workers: int, times: Sequence[CopyTimes]) -> StepCosts:
-    """The costs of a step of these copies."""
+    """The costs of a step, computed from the times of these copies."""
     counted = [each.steps[WARM_UP:] if len(each.steps) > WARM_UP else each.steps for each in times]
     wall_s = np.concatenate([each[:, 1] for each in counted])
     cpu_s = np.concatenate(

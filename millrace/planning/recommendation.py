@@ -1,8 +1,8 @@
-"""What to choose for an environment that was measured: algorithm, env copies, workers, lanes and lag, and why. Pure.
+"""Recommends settings for a measured environment, with reasons: algorithm, env copies, workers, lanes and lag. Pure.
 
-Rule: of all sizes whose expected env steps/s are within `AS_GOOD` of the best, those with the least lag are chosen, then the
-fewest env copies, then the fewest workers. The rules of docs/how-to/algorithms.md and docs/how-to/slow_environments.md are
-those that decide here.
+Rule: of all sizes whose expected env steps/s are at least `AS_GOOD` times the best, choose the ones with the least lag, then
+the fewest env copies, then the fewest workers. These are the rules of docs/how-to/algorithms.md and
+docs/how-to/slow_environments.md.
 """
 
 from __future__ import annotations
@@ -17,22 +17,22 @@ from millrace.planning.in_words import counted, number_in_words, time_in_words
 from millrace.planning.measurements import WORKER_BYTES, Machine, Measurements
 
 AS_GOOD = 0.95
-SLOW_S = 0.005  # a step, divided by the copies that run at once: above it, an algorithm with a replay buffer is done sooner
-SLOW_WITH_IMAGES_S = 0.05
-MOST_ENVS = 64  # of steps that compute: more of them gain little
-UNEVEN = 3.0  # a step of 95 of 100, divided by the median one
+SLOW_S = 0.005  # if step time / copies that run at once is larger, an algorithm with a replay buffer finishes sooner
+SLOW_WITH_IMAGES_S = 0.05  # the same limit for continuous actions and images
+MOST_ENVS = 64  # if steps compute, more env copies gain little
+UNEVEN = 3.0  # steps are uneven if the 95th percentile of the step time, divided by the median, is larger
 LEARNER_BYTES = 500 << 20
-TRANSITION_BYTES = 24  # besides its observation
+TRANSITION_BYTES = 24  # memory of a transition in addition to its observation
 REPLAY_SIZES = (1_000_000, 500_000, 200_000, 100_000, 50_000, 20_000, 10_000)
-OF_MEMORY = 0.8  # of what is free is used
-OF_MEMORY_FOR_REPLAY = 0.4
+OF_MEMORY = 0.8  # share of the free memory that a run may use
+OF_MEMORY_FOR_REPLAY = 0.4  # share of the free memory that the replay buffer may use
 LAGS = (0, 1, 2)
 NEEDED_STEPS = {"xqc": 100_000, "rainbow": 100_000, "sac": 300_000, "ppo": 1_000_000}
-"""Env steps that tasks such as MuJoCo's took, about. They say how long a run may be, and not how long yours will."""
+"""About how many env steps tasks such as MuJoCo's took with each algorithm. Other tasks may take more or fewer."""
 
 
 class ChosenSetting(msgspec.Struct, frozen=True):
-    """A setting of `millrace train`, its value, and why."""
+    """A setting of `millrace train`, with the recommended value and the reason for it."""
 
     name: str
     value: int | str
@@ -40,31 +40,31 @@ class ChosenSetting(msgspec.Struct, frozen=True):
 
 
 class Limit(NamedTuple):
-    """A largest number, and what sets it."""
+    """An upper limit, and the reason for it."""
 
     number: int
     why: str
 
 
 class Learning(NamedTuple):
-    """How the algorithm that was chosen is run."""
+    """How a run with the chosen algorithm is usually set up."""
 
     envs: int
     """the usual number of env copies"""
     rollout_steps: int
-    """the usual number with so many copies"""
+    """the usual number of steps in a rollout, with this number of copies"""
     rows_of_update: int | None
-    """env steps between two updates, if there must not be more: it learns from a replay buffer; else None"""
+    """the largest number of env steps between two updates, if the algorithm learns from a replay buffer; otherwise None"""
     acting_bytes: int = 0
-    """memory that a worker needs in addition to act"""
+    """additional memory that a worker needs to act with the policy"""
 
     def steps(self, envs: int) -> int:
-        """The steps of a rollout with so many env copies."""
+        """The number of steps in a rollout with this number of env copies."""
         return self.rollout_steps if self.rows_of_update is None else max(1, self.rows_of_update // envs)
 
 
 def copies_at_once(measured: Measurements, machine: Machine, acting_bytes: int = 0) -> Limit:
-    """How many env copies can make steps at the same time here."""
+    """How many env copies can be stepped at the same time on this machine."""
     tried = measured.side_by_side[-1]
     faster = tried.steps_per_s / measured.alone.steps_per_s
     made = f"so many were tried side by side, and made {faster:.1f} times the env steps of one"
@@ -91,7 +91,7 @@ def copies_at_once(measured: Measurements, machine: Machine, acting_bytes: int =
 
 
 def choose_algorithm(measured: Measurements, machine: Machine) -> ChosenSetting:
-    """The algorithm, by the three questions of docs/how-to/algorithms.md."""
+    """Choose the algorithm by the three questions in docs/how-to/algorithms.md."""
     at_once = copies_at_once(measured, machine).number
     slow_s = SLOW_WITH_IMAGES_S if measured.images and measured.action == "box" else SLOW_S
     each_s = measured.step_with_reset_s / at_once
@@ -121,7 +121,7 @@ def choose_algorithm(measured: Measurements, machine: Machine) -> ChosenSetting:
 
 
 def choose_replay_size(default: int, measured: Measurements, machine: Machine) -> ChosenSetting | None:
-    """A smaller replay buffer than `default`, if that would take too much of the memory."""
+    """A smaller replay buffer, if one of `default` transitions would need too much memory; otherwise None."""
     if machine.free_bytes is None:
         return None
     of_one = measured.observation_bytes + TRANSITION_BYTES
@@ -137,7 +137,7 @@ def choose_replay_size(default: int, measured: Measurements, machine: Machine) -
 
 
 def candidates(learning: Learning, measured: Measurements, machine: Machine) -> Iterator[Sizes]:
-    """All sizes of a run among which one is chosen."""
+    """All sizes of a run to choose from."""
     at_once = copies_at_once(measured, machine, learning.acting_bytes).number
     for envs in _numbers_of_envs(measured, machine, learning, at_once):
         for workers in sorted({1, min(machine.cores, envs), min(at_once, envs)}):
@@ -147,12 +147,12 @@ def candidates(learning: Learning, measured: Measurements, machine: Machine) -> 
 
 
 def _lanes_for(workers: int, envs: int) -> int:
-    """The least number of lanes that gives each worker as many, if there is one."""
+    """The least number of lanes that divides `envs` and gives all workers equally many; `envs` if there is none."""
     return next((lanes for lanes in range(workers, envs + 1, workers) if envs % lanes == 0), envs)
 
 
 def _numbers_of_envs(measured: Measurements, machine: Machine, learning: Learning, at_once: int) -> list[int]:
-    """Numbers of env copies, ascending."""
+    """The numbers of env copies to consider, ascending."""
     if not measured.alone.computes:
         return sorted({min(learning.envs * 2**n, at_once) for n in range(at_once.bit_length() + 1)})
     most = machine.most_copies or max(MOST_ENVS, learning.envs)
@@ -165,14 +165,14 @@ def _numbers_of_envs(measured: Measurements, machine: Machine, learning: Learnin
 
 
 def best(rates: Mapping[Sizes, float]) -> Sizes:
-    """The sizes to choose, of these with the env steps/s that are expected of each."""
+    """Choose sizes by the rule of this file. `rates`: the expected env steps/s of each candidate."""
     enough = AS_GOOD * max(rates.values())
     good = [sizes for sizes, rate in rates.items() if rate >= enough]
     return min(good, key=lambda sizes: (sizes.max_lag, sizes.envs, sizes.workers, -sizes.lanes))
 
 
 def on_machines(sizes: Sizes, machines: int, learning: Learning) -> Sizes:
-    """The same on each of so many machines."""
+    """The sizes of a run in which each of `machines` machines has these sizes."""
     envs = sizes.envs * machines
     return Sizes(
         workers=sizes.workers * machines,
@@ -189,7 +189,7 @@ def on_machines(sizes: Sizes, machines: int, learning: Learning) -> Sizes:
 def reasons(
     sizes: Sizes, learning: Learning, situation: Situation, rate: Callable[[Sizes], float]
 ) -> tuple[ChosenSetting, ...]:
-    """The sizes, and why each is as it is. `rate`: the env steps/s that are expected of sizes."""
+    """The sizes as settings, with the reason for each. `rate` returns the expected env steps/s of given sizes."""
     measured = situation.measured
     return (
         ChosenSetting("workers", sizes.workers, _why_workers(sizes, measured, situation.machine)),

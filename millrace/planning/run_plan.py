@@ -1,6 +1,6 @@
-"""The plan of a run: what was measured, what to choose and why, what to expect, and the command to type.
+"""The plan of a run: the measurements, the recommended settings with reasons, the expected speed, and the command to type.
 
-Rule: the text for a terminal and the record for programs say the same.
+Rule: the text for a terminal and the record for programs have the same content.
 """
 
 from __future__ import annotations
@@ -21,29 +21,31 @@ from millrace.planning.measurements import Machine, Measurements, Overheads
 from millrace.planning.recommendation import ChosenSetting
 from millrace.protocol.env_spec import Scalar
 
-WIDTH = 110  # of a plan as text
+WIDTH = 110  # columns of the plan as text
 LEARNER_IS_THE_LIMIT = 0.8
 INDENTED = (0, 0, 0, 2)
 BLOCK = (0, 0, 1, 2)  # with an empty line below
 
 
 class ExpectedSpeed(msgspec.Struct, frozen=True, kw_only=True):
-    """What to expect on so many machines such as this one."""
+    """The speed to expect on one or more machines like this one."""
 
     machines: int
+    """number of machines"""
     workers: int
-    """of all machines"""
+    """number of workers on all machines together"""
     envs: int
+    """number of env copies on all machines together"""
     steps_per_s: float
-    """env steps/s"""
+    """env steps/s of all machines together"""
     learner_share: float
-    """share of the time for which the learner updates: if it is about 1, more env copies are no help"""
+    """share of the time in which the learner is busy; if it is about 1, more env copies don't help"""
     needed_s: float
-    """seconds for `RunPlan.needed_steps`"""
+    """seconds that `RunPlan.needed_steps` env steps take"""
 
 
 class RunPlan(msgspec.Struct, frozen=True, kw_only=True):
-    """What to choose for an environment, and what to expect on this machine. `print` shows it as `millrace plan` does.
+    """Recommended settings for an environment, and the speed to expect. `print` shows it as `millrace plan` does.
 
     >>> import millrace
     >>> plan = millrace.plan("Pendulum-v1", seconds=6)
@@ -54,22 +56,25 @@ class RunPlan(msgspec.Struct, frozen=True, kw_only=True):
     env: str
     """the environment's name"""
     chosen: tuple[ChosenSetting, ...]
-    """`name`, `value` and `why` of each setting"""
+    """the recommended settings, each with its `name`, its `value` and the reason `why`"""
     expected: tuple[ExpectedSpeed, ...]
-    """on one, two and ten machines such as this one"""
+    """the expected speed on one, two and ten machines like this one"""
     needed_steps: int
-    """env steps that tasks such as MuJoCo's took with this algorithm; yours may take more or fewer"""
+    """about how many env steps tasks such as MuJoCo's took with this algorithm; yours may take more or fewer"""
     advice: tuple[str, ...]
-    """what else to know, each in a line"""
+    """problems that were found, and further advice; one line each"""
     command: str
-    """the command to type"""
+    """the command that trains with these settings"""
     measured: Measurements
+    """measurements of the environment"""
     overheads: Overheads
+    """measurements of millrace itself"""
     machine: Machine
+    """the resources of this machine"""
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Keyword arguments of `millrace.train`."""
+        """The recommended settings as keyword arguments of `millrace.train`."""
         return {each.name: each.value for each in self.chosen}
 
     @property
@@ -86,7 +91,7 @@ class RunPlan(msgspec.Struct, frozen=True, kw_only=True):
 def train_command(
     env: str, env_kwargs: Mapping[str, Scalar], wrappers: tuple[str, ...], chosen: tuple[ChosenSetting, ...]
 ) -> str:
-    """The command that trains with what was chosen."""
+    """The command that trains with the chosen settings."""
     words = ["millrace", "train", env]
     if env_kwargs:
         words += ["--env-kwargs", *(str(word) for pair in env_kwargs.items() for word in pair)]
@@ -101,7 +106,7 @@ def train_command(
 
 
 def screen(plan: RunPlan) -> RenderableType:
-    """The plan for a terminal, in one screen."""
+    """The plan for a terminal, which fits on one screen."""
     found = Table.grid(padding=(0, 2))
     for name, value in _found(plan.measured):
         found.add_row(Text(name, style="dim"), Text(value))
@@ -148,7 +153,7 @@ def _about_steps(plan: RunPlan) -> str:
 
 
 def _found(measured: Measurements) -> Iterator[tuple[str, str]]:
-    """What was measured, as names and values."""
+    """The measurements, as names and values."""
     alone = measured.alone
     most = measured.side_by_side[-1]
     does = f"computes for {min(alone.cpu_share, 1):.0%}" if alone.computes else f"waits for {1 - alone.cpu_share:.0%}"

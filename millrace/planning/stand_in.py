@@ -1,8 +1,8 @@
-"""An environment that has the spaces of another one and does nothing: what is left is the time of millrace itself.
+"""An environment that has the spaces of another one and does nothing, so that only the time of millrace itself is measured.
 
-Rule: it shows the same observation at each step, and never ends. A step may wait, because a process that was asleep computes
-more slowly for a while, as in an environment that waits. The rewards of a step are the seconds of CPU time that the worker
-took since the step before.
+Rule: it returns the same observation at each step, and its episode never ends. A step waits if those of the real environment
+wait, because a process that was asleep computes more slowly for a while. The sum of rewards in a step is the CPU time in
+seconds that the worker has used since the step before.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from millrace.protocol.policy.masks import MASK
 
 
 class _WorkerHere:
-    """The worker in whose process this is. All its copies share it."""
+    """The CPU time of this worker's process, which all its env copies share."""
 
     def __init__(self) -> None:
         self._cpu_s = time.process_time()
 
     def cpu_s(self, wait_s: float) -> float:
-        """Wait for so long. Returns the CPU time since this was last called, by any copy."""
+        """Wait for `wait_s`. Returns the CPU time of the process since the last call by any copy."""
         if wait_s:
             time.sleep(wait_s)
         before_s = self._cpu_s
@@ -35,29 +35,29 @@ _worker = _WorkerHere()
 
 
 class StandIn(gymnasium.Env[Any, Any]):
-    """In place of an environment of gymnasium's."""
+    """Stands in for a gymnasium environment."""
 
     def __init__(
         self, observation_space: gymnasium.Space[Any], action_space: gymnasium.Space[Any], wait_s: float = 0.0
     ) -> None:
-        """`wait_s`: for so long a step waits."""
+        """`wait_s`: how long a step waits."""
         self.observation_space = observation_space
         self.action_space = action_space
         self._wait_s = wait_s
         self._shown = shown(observation_space)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
-        """Show the observation."""
+        """Return the observation."""
         super().reset(seed=seed)
         return self._shown, {}
 
     def step(self, action: Any) -> Any:
-        """Show it again."""
+        """Return the same observation again, and the CPU time as the reward."""
         return self._shown, _worker.cpu_s(self._wait_s), False, False, {}
 
 
 class StandInOfAgents:
-    """In place of an environment of several agents, which all act at each step."""
+    """Stands in for an environment of several agents, which all act at each step."""
 
     metadata: dict[str, Any] = {}
 
@@ -69,7 +69,7 @@ class StandInOfAgents:
         *,
         agents: tuple[str, ...],
     ) -> None:
-        """As `StandIn`."""
+        """`wait_s`: how long a step waits."""
         self._wait_s = wait_s
         self.possible_agents = list(agents)
         self.agents = list(agents)
@@ -77,29 +77,29 @@ class StandInOfAgents:
         self._shown = dict.fromkeys(agents, shown(observation_space))
 
     def observation_space(self, agent: str) -> gymnasium.Space[Any]:
-        """Of each agent."""
+        """The observation space, which is the same for all agents."""
         return self._spaces[0]
 
     def action_space(self, agent: str) -> gymnasium.Space[Any]:
-        """Of each agent."""
+        """The action space, which is the same for all agents."""
         return self._spaces[1]
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
-        """Show each agent the observation."""
+        """Return the observation for each agent."""
         return self._shown, {agent: {} for agent in self.agents}
 
     def step(self, actions: Any) -> Any:
-        """Show it again."""
+        """Return the same observation again. The agents' rewards sum up to the CPU time."""
         goes_on = dict.fromkeys(self.agents, False)
         cpu_s = _worker.cpu_s(self._wait_s) / len(self.agents)
         return self._shown, dict.fromkeys(self.agents, cpu_s), goes_on, goes_on, {agent: {} for agent in self.agents}
 
     def close(self) -> None:
-        """Nothing is to do."""
+        """Do nothing."""
 
 
 def shown(space: gymnasium.Space[Any]) -> Any:
-    """An observation of this space, which allows every action."""
+    """A random observation of this space. If it has an action mask, the mask allows every action."""
     observation = space.sample()
     if isinstance(observation, dict) and MASK in observation:
         observation[MASK] = np.ones_like(observation[MASK])

@@ -1,7 +1,7 @@
-"""A wrapper that notes how long an env copy takes: the wall time and the CPU time of each step and reset, and the memory.
+"""A wrapper that records the wall time and CPU time of each step and reset of an env copy, and its memory.
 
-Rule: it changes nothing that the environment gets or gives. It runs in the worker's process, and its notes go to a file of
-the copy, so what a copy did until it crashed or hung can be read.
+Rule: it changes nothing that the environment gets or returns. It runs in the worker's process, and writes its notes to a
+file for each copy, so that the notes can be read even if the copy crashed or hung.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ from millrace.protocol.envs.seats import has_seats
 from millrace.protocol.machine.core_delay import CoreDelay
 from millrace.workers.supervise.process_group import live_members, process_stat
 
-STEP, RESET, PROCESSES = 0.0, 1.0, 2.0  # what a note is of
+STEP, RESET, PROCESSES = 0.0, 1.0, 2.0  # kinds of notes
 FLUSH_S = 0.25
-UTIME, STIME, RSS = 11, 12, 21  # fields of `process_stat`
+UTIME, STIME, RSS = 11, 12, 21  # indices of fields of `process_stat`
 
 
 class Notes:
-    """Writes the notes of one copy: rows [5] of float64.
+    """Writes the notes of one copy. A note is a row of 5 numbers (float64).
 
-    A step or reset: its kind, when it began (monotonic), wall seconds, CPU seconds of this process, and seconds in which it
-    could go on and had no core. `PROCESSES`: the kind,
-    when, 0, CPU seconds so far of the other processes of the worker's session, and the memory of the session in bytes.
+    For a step or reset: the kind, the time of its beginning (monotonic), its wall seconds, CPU seconds of this process, and
+    the seconds in which it was ready to run but had no core. For `PROCESSES`: the kind, the time, 0, the CPU seconds so far
+    of the other processes in the worker's session, and the memory of the whole session in bytes.
     """
 
     def __init__(self, folder: str) -> None:
@@ -43,7 +43,7 @@ class Notes:
         self._looked_at_s = time.monotonic()
 
     def timed(self, kind: float, call: Callable[[], Any]) -> Any:
-        """What `call` returns. A call that raises is noted, too."""
+        """Time a call, and return its result. A call that raises is also noted."""
         delay_s = self._delay.seconds()
         cpu_s = time.process_time()
         began_s = time.monotonic()
@@ -54,19 +54,19 @@ class Notes:
             cpu_s = time.process_time() - cpu_s
             self._rows += (kind, began_s, ended_s - began_s, cpu_s, self._delay.seconds() - delay_s)
             self._calls += 1
-            # Those of a copy that crashes soon are written at 1, 2, 4, 8 calls, and so on.
+            # Also write after 1, 2, 4, 8, … calls, so that there are notes even if the copy crashes early.
             if ended_s > self._flush_at_s or self._calls & (self._calls - 1) == 0:
                 self._flush(ended_s)
 
     def close(self) -> None:
-        """Write what is left."""
+        """Write the remaining notes."""
         self._look(time.monotonic())
         self._flush(time.monotonic())
         self._file.close()
         self._delay.close()
 
     def _flush(self, now_s: float) -> None:
-        if now_s - self._looked_at_s >= self._look_after_s:  # more and more rarely, because it reads all of /proc
+        if now_s - self._looked_at_s >= self._look_after_s:  # less and less often, because it reads all of /proc
             self._look(now_s)
             self._look_after_s *= 2
         self._file.write(np.array(self._rows).tobytes())
@@ -88,7 +88,7 @@ class Notes:
 
 
 class _Timed(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """Of a gymnasium environment."""
+    """Times a gymnasium environment."""
 
     def __init__(self, env: gymnasium.Env[Any, Any], notes: Notes) -> None:
         super().__init__(env)
@@ -106,14 +106,14 @@ class _Timed(gymnasium.Wrapper[Any, Any, Any, Any]):
 
 
 class _TimedAgents:
-    """Of an environment of several agents, in one of PettingZoo's interfaces."""
+    """Times an environment of several agents, which has one of PettingZoo's interfaces."""
 
     def __init__(self, env: Any, notes: Notes) -> None:
         self.env = env
         self._notes = notes
 
     def __getattr__(self, name: str) -> Any:
-        if name == "env":  # it is not set yet
+        if name == "env":  # not set yet; getattr(self.env, …) would recurse
             raise AttributeError(name)
         return getattr(self.env, name)
 
@@ -129,24 +129,24 @@ class _TimedAgents:
 
 
 def stopwatch(env: Any, folder: str) -> Any:
-    """The environment, whose calls are noted in a file of this folder."""
+    """Wrap the environment so that its calls are noted in a file of this folder."""
     notes = Notes(folder)
     return _TimedAgents(env, notes) if has_seats(env) else _Timed(env, notes)
 
 
 class CopyTimes(NamedTuple):
-    """What one copy did."""
+    """The times of one copy's steps and resets, and its memory."""
 
     steps: Doubles
-    """[steps, 4]: when it began, wall seconds, CPU seconds of its process, seconds in which it had no core"""
+    """[steps, 4]: time of the beginning, wall seconds, CPU seconds of the worker's process, seconds ready without a core"""
     resets: Doubles
-    """[resets, 4], the same"""
+    """[resets, 4]: the same numbers for resets"""
     processes: Doubles
-    """[looks, 3]: when, CPU seconds so far of the other processes that it has started, bytes of all"""
+    """[samples, 3]: time, CPU seconds so far of the processes that the copy has started, bytes of all processes"""
 
     @property
     def others_cpu_share(self) -> float:
-        """Cores that the processes which the copy has started kept busy."""
+        """How many cores the processes that the copy has started kept busy, on average."""
         if len(self.processes) < 2:
             return 0.0
         first, last = self.processes[0], self.processes[-1]
@@ -154,7 +154,7 @@ class CopyTimes(NamedTuple):
 
     @property
     def bytes(self) -> int:
-        """The most memory that was seen of it."""
+        """The largest memory that was measured."""
         return int(self.processes[:, 2].max()) if len(self.processes) else 0
 
 
@@ -165,7 +165,7 @@ def read_notes(folder: Path) -> list[CopyTimes]:
 
 def _times(numbers: Array) -> CopyTimes:
     rows = numbers[: len(numbers) // 5 * 5].reshape(-1, 5)
-    # A call may be interrupted before its wall time begins; then it has waited for a core outside of it.
+    # A call may be interrupted just before its wall time begins. Its delay then exceeds its waiting time, so it is clipped.
     kinds = rows[:, 0]
     rows[:, 4] = np.where(kinds == PROCESSES, rows[:, 4], np.clip(rows[:, 4], 0.0, np.maximum(0.0, rows[:, 2] - rows[:, 3])))
     calls = rows[:, 1:]
