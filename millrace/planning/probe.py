@@ -290,7 +290,7 @@ def _measured_alone(env: ProbedEnv, session: _SteppedCopies) -> Measurements:
 
 
 def _with_all(measured: Measurements, sessions: Sequence[_SteppedCopies]) -> Measurements:
-    """Add the measurements that need all sessions. First resets aren't counted if there are later ones: they may be slower."""
+    """Add the measurements that need all sessions. If possible, first resets aren't counted, because they may be slower."""
     times = [each for session in sessions for each in session.times]
     later = [each.resets[1:] for each in times if len(each.resets) > 1]
     resets = np.concatenate(later or [each.resets for each in times])

@@ -1,1 +1,1 @@
-"""The conformance test of a client, a worker in any language: `millrace conform`."""
+"""The conformance test for clients, which are workers written in any language: `millrace conform`."""

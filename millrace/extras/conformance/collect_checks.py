@@ -1,6 +1,7 @@
 """The checks of the collector profile: the client chooses actions with the weights, and sends rollouts.
 
-Each function is one check (`script.py`). The watch recomputes what it can of every rollout (`lane_rows.py`).
+Each check is a function that `profiles.py` lists (`script.py`). Its docstring says what the learner does to the client. In
+every check, the watch also recomputes what it can of every rollout (`lane_rows.py`).
 """
 
 from __future__ import annotations
@@ -58,54 +59,54 @@ from millrace.protocol.wire.codec import encode
 from millrace.protocol.wire.plain_values import pack
 from millrace.protocol.wire.weight_dtypes import to_wire_dtype
 
-STEPS = 32  # T of most checks
-TIMED_STEPS = 200  # T of a rollout that tells how fast the client is
+STEPS = 32  # T, the steps of a rollout in most checks
+TIMED_STEPS = 200  # T of a rollout that measures how fast the client is
 TIMED_ROLLOUTS = 3
 LONG_S = 1.0  # duration of a long rollout
-LONGEST_STEPS = 50_000  # T of a long rollout, at most
+LONGEST_STEPS = 50_000  # largest T of a long rollout
 NET = (16, 16)
-LONG_NET = (256, 256)  # of long rollouts: a compiled client would make 50,000 steps by a small one in a few milliseconds
+LONG_NET = (256, 256)  # for long rollouts: with a small net, a compiled client would make 50,000 steps in milliseconds
 EVALUATED_STEPS = 40
-APART_ROLLOUTS = 3  # of each lane, after which copies must differ
+APART_ROLLOUTS = 3  # number of rollouts of each lane after which env copies must differ
 
 
 class Collecting:
-    """A session of the collector profile, with the messages that checks need."""
+    """A session of the collector profile. It makes and sends the messages that checks need."""
 
     def __init__(self, learner: Learner, run: RunSpec) -> None:
         self.learner = learner
         self.run = run
-        self._sequences = Counter[tuple[int, int]]()  # of the next permit, by lane and incarnation
+        self._sequences = Counter[tuple[int, int]]()  # sequence number of the next permit, by lane and incarnation
 
     def random_parameters(self, seed: int) -> Floats:
-        """Parameters [P] of a policy that prefers some actions."""
+        """Random parameters [P] float32, of a policy that prefers some actions."""
         size = acting_size(self.run.policy)
         return np.random.default_rng(seed).normal(0, 0.3, size).astype(np.float32)
 
     def weights(
         self, version: int, parameters: Floats | None = None, attributes: Mapping[str, float] | None = None
     ) -> Weights:
-        """Weights of this version, random if no parameters are given. `attributes`: of the environment."""
+        """Weights of this version, with random parameters by default. `attributes`: attributes to set in env copies."""
         chosen = self.random_parameters(version) if parameters is None else parameters
         packed = None if attributes is None else np.frombuffer(pack(attributes), np.uint8)
         return Weights(version, chosen, np.zeros(buffer_size(self.run.policy), np.float32), packed)
 
     def permit(self, lane: int = 0, incarnation: int = 0) -> Permit:
-        """The next ticket, for this lane. In a higher incarnation, all its copies are to start anew."""
+        """The next permit for this lane. The first one of a higher incarnation tells the client to restart all its copies."""
         sequence = self._sequences[lane, incarnation]
         self._sequences[lane, incarnation] += 1
         permit = Permit(next(self.learner.tickets), lane, incarnation, sequence, round=sequence)
         if incarnation and not sequence and self.learner.hello is not None and self.learner.hello.continues:
-            return permit.of_new_episodes(self.run.copies)  # a client that continues no lane begins them by itself
+            return permit.of_new_episodes(self.run.copies)  # a client that can't continue lanes restarts them anyway
         return permit
 
     def order(self, *permits: Permit, version: int = 1, keep: Iterable[int] = ()) -> None:
-        """Send a Collect, without the weights that it names. `keep`: versions to hold although no ticket names them."""
+        """Send a Collect, without the weights that it names. `keep`: versions to keep although no ticket names them."""
         watch = self.learner.watch
         self.learner.send(Collect(self.learner.session, version, permits, watch.received(), watch.to_keep(version, *keep)))
 
     def give(self, weights: Weights) -> None:
-        """Send these weights, unless their version was sent in this session."""
+        """Send these weights, unless their version was already sent in this session."""
         if weights.version not in self.learner.watch.versions:
             self.learner.send(weights)
 
@@ -116,16 +117,19 @@ class Collecting:
 
     @property
     def rollout_s(self) -> float:
-        """How long the client takes for a rollout, in a session of `collecting_at_length`."""
+        """How long the client needs for a rollout, in a session that `collecting_at_length` began."""
         return self.learner.step_s * self.run.rollout_steps
 
     def begin(self, *permits: Permit) -> Script[None]:
-        """Deal permits of rollouts that last, and wait until the first is in progress."""
+        """Deal permits for long rollouts, and wait until the client is collecting the first one."""
         self.deal(*permits)
         yield Wait(self.rollout_s / 5)
 
     def rollout(self, permit: Permit, rule: Rule | None = None) -> Script[Rollout]:
-        """The rollout of a permit that was dealt, or has come. If none comes, this rule or the likely one is broken."""
+        """The rollout for a permit that was dealt; wait for it if it hasn't arrived yet.
+
+        If it doesn't arrive, raises `Broken` with `rule`, or by default with the rule that was probably broken.
+        """
         rule = rule or self.learner.watch.rule_of_missing(permit.ticket, Rule.TICKETS)
         if isinstance(answer := self.learner.watch.answers.get(permit.ticket), Rollout):
             return answer
@@ -134,13 +138,13 @@ class Collecting:
         return (yield from self.learner.expect(Rollout, rule, text, within_s=within_s, ticket=permit.ticket))
 
     def collect(self, permit: Permit | None = None, version: int = 1, keep: Iterable[int] = ()) -> Script[Rollout]:
-        """Deal one permit, or the next of lane 0, and wait for its rollout."""
+        """Deal this permit (by default, the next one for lane 0), and wait for its rollout."""
         permit = permit or self.permit()
         self.deal(permit, version=version, keep=keep)
         return (yield from self.rollout(permit))
 
     def nothing_of(self, permit: Permit, rule: Rule, whose: str) -> Script[None]:
-        """No rollout of this permit has arrived in this session, and none arrives."""
+        """Check that no rollout for this permit has arrived in this session, and that none arrives for a while."""
         expected = f"no rollout of ticket {permit.ticket}, {whose}"
         if (answer := self.learner.watch.answers.get(permit.ticket)) is not None:
             raise Broken(rule, expected, brief(answer))
@@ -148,7 +152,7 @@ class Collecting:
 
 
 def run_spec(learner: Learner, steps: int = STEPS, **policy_fields: Any) -> Script[RunSpec]:
-    """A run of the client's environment. `policy_fields`: of `PolicySpec`."""
+    """The specification of a run with the client's environment. `policy_fields`: fields of its `PolicySpec`."""
     env = yield from described(learner)
     fields = {"net": NET} | policy_fields
     try:
@@ -172,7 +176,7 @@ def run_spec(learner: Learner, steps: int = STEPS, **policy_fields: Any) -> Scri
 
 
 def collecting(learner: Learner, steps: int = STEPS, **policy_fields: Any) -> Script[Collecting]:
-    """A new session of the collector profile."""
+    """Begin a new session of the collector profile."""
     run = yield from run_spec(learner, steps, **policy_fields)
     yield from learner.joining()
     learner.welcome(run)
@@ -180,23 +184,23 @@ def collecting(learner: Learner, steps: int = STEPS, **policy_fields: Any) -> Sc
 
 
 def begins_in_its_session(learner: Learner) -> Script[None]:
-    """The client waits for the run, which begins in the same session."""
+    """Let the client wait for the run, then begin the run in the same session."""
     run = yield from run_spec(learner)
     yield from begins(learner, run)
     yield from Collecting(learner, run).collect()
 
 
 def collecting_at_length(learner: Learner, lasts_s: float = LONG_S) -> Script[Collecting]:
-    """A session with rollouts that last, so that something can happen while one is in progress."""
+    """Begin a session with long rollouts, so that something can happen while the client is collecting one."""
     if not learner.step_s:
         session = yield from collecting(learner, TIMED_STEPS, net=LONG_NET)
-        yield from session.collect()  # opens the lane
+        yield from session.collect()  # opens the lane, so isn't measured
         took_s = []
         for _ in range(TIMED_ROLLOUTS):
             began_s = learner.now
             yield from session.collect()
             took_s.append(learner.now - began_s)
-        learner.step_s = max(min(took_s), 1e-3) / TIMED_STEPS  # what else the machine did made the others longer
+        learner.step_s = max(min(took_s), 1e-3) / TIMED_STEPS  # the fastest: other programs may have slowed the others
     return (yield from collecting(learner, min(max(int(lasts_s / learner.step_s), STEPS), LONGEST_STEPS), net=LONG_NET))
 
 
@@ -204,7 +208,7 @@ def collecting_at_length(learner: Learner, lasts_s: float = LONG_S) -> Script[Co
 
 
 def acts_as_its_policy_says(learner: Learner) -> Script[None]:
-    """The other activation; then observations that are normalized, many of them so far that they are clipped."""
+    """Collect with the activation relu; then with normalized observations, many of them so large that they are clipped."""
     relu = yield from collecting(learner, activation="relu")
     permit = relu.permit()
     relu.deal(permit)
@@ -228,7 +232,7 @@ def _rollout_or_declined(learner: Learner, permit: Permit) -> Script[None]:
 
 
 def sets_attributes(learner: Learner) -> Script[None]:
-    """A pole without forces under one version, still without them under the next, and with force under the last."""
+    """Set attributes so that the cart isn't pushed under version 1; set none with version 2; push again under version 3."""
     env = yield from described(learner)
     if not is_gymnasium_pole(env):
         raise Skipped("the environment is not gymnasium's CartPole")
@@ -248,23 +252,23 @@ def sets_attributes(learner: Learner) -> Script[None]:
 
 
 def collects(learner: Learner) -> Script[None]:
-    """Rollouts of one lane, one after the other."""
+    """Collect rollouts of one lane, one after the other."""
     session = yield from collecting(learner)
     for _ in range(4):
         yield from session.collect()
 
 
 def _repeats(one: Rollout, other: Rollout) -> bool:
-    """Whether the copies saw and did the same in both, step by step."""
+    """Whether all observations and actions of two rollouts are the same, bit for bit."""
     return all(a.tobytes() == b.tobytes() for a, b in zip((*one.obs, one.action), (*other.obs, other.action), strict=True))
 
 
 def keeps_rows(learner: Learner) -> Script[None]:
-    """Rollouts in which episodes end."""
+    """Collect short rollouts until enough episodes have ended in them, including some in a last row."""
     session = yield from collecting(learner, steps=7)
     ends = 0
     between = False  # whether an episode ended in the last row of a rollout
-    around: list[tuple[bytes, bytes]] = []  # the last observation of an episode, the first one of the next
+    around: list[tuple[bytes, bytes]] = []  # the last observation of an episode, the first one of the next episode
     for _ in range(40):
         rollout = yield from session.collect()
         if ends >= 8 and len(around) >= 3 and between:
@@ -286,7 +290,7 @@ def keeps_rows(learner: Learner) -> Script[None]:
 
 
 def declines_other_agents(learner: Learner) -> Script[None]:
-    """A run of agents that the environment does not have."""
+    """Begin a run with agents that the environment doesn't have."""
     run = yield from run_spec(learner)
     run = replace(run, seats=() if run.seats else ("one", "other"), facts=(), takes_turns=False)
     yield from learner.joining()
@@ -299,7 +303,7 @@ def declines_other_agents(learner: Learner) -> Script[None]:
 
 
 def truncates_at_the_limit(learner: Learner) -> Script[None]:
-    """Weights that act well, until the time limit."""
+    """Collect with weights that act well, so that episodes reach the time limit."""
     longest = yield from time_limit(learner)
     session = yield from collecting(learner, steps=longest + 10)
     reached = False
@@ -321,7 +325,7 @@ def truncates_at_the_limit(learner: Learner) -> Script[None]:
 
 
 def _truncated_in_order(rollout: Rollout) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
-    """For each episode of the rollout: whether only a time limit ended it. With seats, that is not known."""
+    """For each episode of the rollout, whether only a time limit ended it; False for all if there are several agents."""
     if rollout.resets is not None:
         return np.zeros(len(rollout.episodes), bool)
     ended = (rollout.terminated | rollout.truncated) & rollout.valid
@@ -329,7 +333,7 @@ def _truncated_in_order(rollout: Rollout) -> np.ndarray[tuple[int, ...], np.dtyp
 
 
 def _balancing(session: Collecting) -> Floats:
-    """Parameters that balance the pole of a cart, as its almost linear network; random ones for another environment."""
+    """Parameters of an almost linear network that balances CartPole's pole; for other environments, random parameters."""
     policy = session.run.policy
     if [leaf.shape for leaf in policy.observation] != [(4,)] or policy.action.sizes != (2,):
         return session.random_parameters(1)
@@ -343,7 +347,7 @@ def _balancing(session: Collecting) -> Floats:
 
 
 def waits_for_weights(learner: Learner) -> Script[None]:
-    """A permit under weights that have not come yet, while older ones are held."""
+    """Deal a permit whose weights haven't been sent yet, while the client has older ones."""
     session = yield from collecting(learner)
     yield from session.collect()
     permit = session.permit()
@@ -355,7 +359,7 @@ def waits_for_weights(learner: Learner) -> Script[None]:
 
 
 def acts_under_the_named_version(learner: Learner) -> Script[None]:
-    """The weights that a permit names were lost and come after newer ones. The watch compares the versions."""
+    """Send the weights that a permit names only after newer ones, as if they had been lost. The watch compares versions."""
     session = yield from collecting(learner)
     older = session.permit()
     newer = session.permit()
@@ -370,7 +374,7 @@ def acts_under_the_named_version(learner: Learner) -> Script[None]:
 
 
 def holds_two_versions(learner: Learner) -> Script[None]:
-    """Two permits of one lane under two versions; the weights of the second come first."""
+    """Deal two permits of one lane under two versions, and send the weights of the second one first."""
     session = yield from collecting(learner)
     first = session.permit()
     second = session.permit()
@@ -382,7 +386,7 @@ def holds_two_versions(learner: Learner) -> Script[None]:
 
 
 def collects_in_order(learner: Learner) -> Script[None]:
-    """The Collect of a rollout was lost; that of the next one has come, under weights that are held."""
+    """Send the Collect of a later rollout first, as if the Collect of the next rollout had been lost."""
     session = yield from collecting(learner)
     yield from session.collect()
     lost = session.permit()
@@ -396,7 +400,7 @@ def collects_in_order(learner: Learner) -> Script[None]:
 
 
 def lists_what_it_holds(learner: Learner) -> Script[None]:
-    """Permits wait, because the weights that the first of them names were lost. The watch knows their tickets."""
+    """Let permits wait, because the weights of the first one weren't sent. Heartbeats must list versions and tickets."""
     session = yield from collecting(learner)
     session.order(session.permit(), version=1)
     for version in (2, 3):
@@ -407,7 +411,7 @@ def lists_what_it_holds(learner: Learner) -> Script[None]:
 
 
 def keeps_listed_weights(learner: Learner) -> Script[None]:
-    """Rollouts under one version after the other. The second order lists the first version too, the third does not."""
+    """Collect under three versions. The second order also lists the first version as one to keep; the third doesn't."""
     session = yield from collecting(learner)
     yield from session.collect(version=1)
     for version, kept in ((2, (1, 2)), (3, (3,))):
@@ -419,11 +423,11 @@ def keeps_listed_weights(learner: Learner) -> Script[None]:
 
 
 def keeps_its_weights(learner: Learner) -> Script[None]:
-    """New weights arrive while a rollout is collected. The watch compares log_prob with the weights of its version."""
+    """Send new weights while the client collects a rollout. The watch checks log_prob with the weights of the rollout."""
     session = yield from collecting_at_length(learner)
     permit = session.permit()
     session.deal(permit)
-    for version in range(2, 20):  # their orders were lost
+    for version in range(2, 20):  # without their orders, as if these had been lost
         session.give(session.weights(version))
         yield Wait(session.rollout_s / 10)
     yield from session.rollout(permit)
@@ -431,7 +435,7 @@ def keeps_its_weights(learner: Learner) -> Script[None]:
 
 
 def takes_rounded_weights(learner: Learner) -> Script[None]:
-    """Parameters rounded to bfloat16, which are sent as uint16."""
+    """Send parameters that are rounded to bfloat16, as an array of uint16."""
     session = yield from collecting(learner)
     rounded = to_wire_dtype(session.random_parameters(1), "bfloat16")
     permit = session.permit()
@@ -441,7 +445,7 @@ def takes_rounded_weights(learner: Learner) -> Script[None]:
 
 
 def sends_again(learner: Learner) -> Script[None]:
-    """A rollout was lost: the learner asks for its ticket again."""
+    """Ask for the same ticket again, as if its rollout had been lost."""
     session = yield from collecting(learner)
     learner.watch.confirms = False
     permit = session.permit()
@@ -455,7 +459,7 @@ def sends_again(learner: Learner) -> Script[None]:
 
 
 def forgets_what_arrived(learner: Learner) -> Script[None]:
-    """A late copy of a Collect whose rollout has arrived."""
+    """Send a late copy of a Collect whose rollout has arrived."""
     session = yield from collecting(learner)
     permit = session.permit()
     yield from session.collect(permit)
@@ -466,7 +470,7 @@ def forgets_what_arrived(learner: Learner) -> Script[None]:
 
 
 def says_no_rollout_twice(learner: Learner) -> Script[None]:
-    """Nothing is asked for after a rollout, and its arrival is not yet confirmed."""
+    """Ask for nothing more after a rollout, without confirming that it has arrived."""
     session = yield from collecting(learner)
     learner.watch.confirms = False
     permit = session.permit()
@@ -475,7 +479,10 @@ def says_no_rollout_twice(learner: Learner) -> Script[None]:
 
 
 def collects_two_lanes(learner: Learner) -> Script[None]:
-    """Permits of two lanes in one Collect, several of each, under weights by which all actions are equally probable."""
+    """Deal several permits of each of two lanes in one Collect, under weights that make all actions equally probable.
+
+    The copies must differ in their actions and in their first observations.
+    """
     session = yield from collecting(learner)
     permits = [session.permit(lane) for _ in range(APART_ROLLOUTS) for lane in (0, 1)]
     session.order(*permits)
@@ -502,7 +509,10 @@ def collects_two_lanes(learner: Learner) -> Script[None]:
 
 
 def _did(rollouts: Sequence[Rollout], n: int, seats: int) -> tuple[list[bytes], list[bytes]]:
-    """The actions of a copy's first seat, empty in rows that are not valid, and the first observations of its episodes."""
+    """The actions of copy `n`'s first seat, and the first observations of its episodes, as bytes.
+
+    An action is empty in rows that aren't valid.
+    """
     actions = list[bytes]()
     first = n * seats
     firsts = [b"".join(leaf[0, first].tobytes() for leaf in rollouts[0].obs)]
@@ -515,11 +525,11 @@ def _did(rollouts: Sequence[Rollout], n: int, seats: int) -> tuple[list[bytes], 
 
 
 def starts_a_lane_again(learner: Learner) -> Script[None]:
-    """A higher incarnation, then a permit of the lower one."""
+    """Deal a permit of a higher incarnation, then one of a lower incarnation."""
     session = yield from collecting(learner)
     before = yield from session.collect()
     permit = session.permit(incarnation=2)
-    if learner.hello is not None and learner.hello.continues:  # it is to know that it is not the first one
+    if learner.hello is not None and learner.hello.continues:  # tell the client that this isn't the first incarnation
         unknown = (LastEpisode(0, None, 0, False),) * session.run.copies
         permit = replace(permit, past=LanePast(0, unknown, before.action[:0], (), (), ()))
     after = yield from session.collect(permit)
@@ -527,14 +537,14 @@ def starts_a_lane_again(learner: Learner) -> Script[None]:
         got = f"the same observations and actions as in incarnation 0, for {STEPS} steps"
         raise Broken(Rule.INDEPENDENT, "other episodes in incarnation 2", got)
     session.permit(incarnation=1)
-    old = session.permit(incarnation=1)  # of the sequence that is next
+    old = session.permit(incarnation=1)  # has the sequence number that is next
     session.deal(old)
     yield from learner.quiet(Rollout, Rule.INCARNATION, "no rollout of incarnation 1 after one of 2")
     yield from session.collect(session.permit(incarnation=2))
 
 
 def _past_of(rollouts: Sequence[Rollout]) -> LanePast:
-    """The past of lane 0 after these, which are all of it."""
+    """The past of lane 0 after these rollouts, which must be all rollouts of the lane."""
     last = rollouts[-1]
     resets = np.concatenate([*(resets_of(each)[:-1] for each in rollouts), resets_of(last)[-1:]])
     K = len(resets) - 1
@@ -556,7 +566,9 @@ def _past_of(rollouts: Sequence[Rollout]) -> LanePast:
 
 
 def continues_a_lane(learner: Learner) -> Script[None]:
-    """A lane that seems to come from another worker continues in the next incarnation as it would have there."""
+    """Send the client the past of a lane, as if another worker had collected it. The client must continue the lane in the
+    next incarnation with the same bits as that worker would have.
+    """
     rounds = 3
     undisturbed = yield from collecting(learner, steps=7)
     if learner.hello is None or not learner.hello.continues:
@@ -584,7 +596,7 @@ def continues_a_lane(learner: Learner) -> Script[None]:
 
 
 def releases_a_lane(learner: Learner) -> Script[None]:
-    """A lane goes to another worker while a ticket of it waits for weights."""
+    """Release a lane while one of its tickets waits for weights, as if the lane went to another worker."""
     session = yield from collecting(learner)
     yield from session.collect(session.permit(0))
     lost = session.permit(0)
@@ -601,12 +613,12 @@ def releases_a_lane(learner: Learner) -> Script[None]:
 
 
 def closes_unlisted_lanes(learner: Learner) -> Script[None]:
-    """A Release was lost; the next HeartbeatReply does not list the lane."""
+    """Send no Release, as if it had been lost, and don't list the lane in the next HeartbeatReply."""
     session = yield from collecting(learner)
     lost = session.permit(0)
     kept = session.permit(1)
     session.order(lost, kept, version=2)
-    learner.watch.sent(Release(learner.session, (LaneIncarnation(0, 0),)))  # and it is lost
+    learner.watch.sent(Release(learner.session, (LaneIncarnation(0, 0),)))  # tells only the watch, so the message is lost
     yield from heartbeats(learner, 3)
     session.give(session.weights(2))
     yield from session.rollout(kept)
@@ -614,7 +626,7 @@ def closes_unlisted_lanes(learner: Learner) -> Script[None]:
 
 
 def ignores_a_late_reply(learner: Learner) -> Script[None]:
-    """A copy of an old HeartbeatReply does not list the lane that came after it."""
+    """Send late copies of old HeartbeatReplies, which don't list a lane that was dealt after them."""
     session = yield from collecting(learner)
     learner.answers_heartbeats = False
     yield from heartbeats(learner, 1)
@@ -635,7 +647,7 @@ def ignores_a_late_reply(learner: Learner) -> Script[None]:
 
 
 def forgets_the_session_before(learner: Learner) -> Script[None]:
-    """Rejoin while it collects: nothing of the session before comes, and its weights are forgotten."""
+    """Send Rejoin while the client collects. It must send nothing more of the old session, and forget its weights."""
     session = yield from collecting_at_length(learner)
     yield from session.begin(session.permit(0), session.permit(1))
     again = yield from collecting(learner, net=LONG_NET)
@@ -648,7 +660,7 @@ def forgets_the_session_before(learner: Learner) -> Script[None]:
 
 
 def collects_over_a_new_connection(learner: Learner) -> Script[None]:
-    """The connection is cut while it collects; the learner asks for the ticket again."""
+    """Cut the connection while the client collects, and ask for the ticket again."""
     session = yield from collecting_at_length(learner)
     permit = session.permit()
     yield from session.begin(permit)
@@ -661,7 +673,7 @@ def collects_over_a_new_connection(learner: Learner) -> Script[None]:
 
 
 def ignores_what_it_cannot_read(learner: Learner) -> Script[None]:
-    """A Collect with an extra field, Weights with a missing frame, and a Collect for another session."""
+    """Send a Collect with an extra or missing field, Weights with a missing frame, and a Collect for another session."""
     session = yield from collecting(learner)
     yield from session.collect()
     permit = session.permit()
@@ -680,7 +692,7 @@ def ignores_what_it_cannot_read(learner: Learner) -> Script[None]:
 
 
 def beats_while_it_collects(learner: Learner) -> Script[None]:
-    """Rollouts follow each other without a pause; the watch counts heartbeats meanwhile."""
+    """Collect rollouts without a pause. Meanwhile, the watch checks that heartbeats arrive."""
     session = yield from collecting(learner, steps=1000)
     until_s = learner.now + 2 * 1.5 + 8 * learner.settings.heartbeat_s
     while learner.now < until_s:
@@ -688,7 +700,10 @@ def beats_while_it_collects(learner: Learner) -> Script[None]:
 
 
 def evaluates(learner: Learner) -> Script[None]:
-    """Two episodes, greedy, once more with a short limit. The answer to an order is lost. The watch compares it."""
+    """Evaluate two greedy episodes, then again with a short limit. Then repeat that order, as if its answer had been lost.
+
+    The watch compares the two answers.
+    """
     session = yield from collecting(learner)
     yield from _evaluate(session, _evaluation(learner))
     order = _evaluation(learner, most_steps=2)
@@ -700,7 +715,7 @@ def evaluates(learner: Learner) -> Script[None]:
 
 
 def evaluates_one_version(learner: Learner) -> Script[None]:
-    """An evaluation under weights that have not come yet, while older ones are held."""
+    """Order an evaluation whose weights haven't been sent yet, while the client has older ones."""
     session = yield from collecting(learner)
     yield from session.collect()
     order = _evaluation(learner, version=2)
@@ -712,9 +727,10 @@ def evaluates_one_version(learner: Learner) -> Script[None]:
 
 
 def evaluates_with_rows(learner: Learner) -> Script[None]:
-    """Episodes with their rows: drawn and greedy, from the same seeds in another order, cut and not. A client may decline.
+    """Evaluate episodes and ask for their rows. A client may decline.
 
-    The watch recomputes what it can of each.
+    Actions are sampled and greedy; the same seeds are given in another order; episodes are cut and not cut. The watch
+    recomputes what it can of each answer.
     """
     session = yield from collecting(learner)
     order = _evaluation(learner, greedy=False, send_rows=True, seeds=(1, 2, 3, 4))
@@ -740,7 +756,7 @@ def evaluates_with_rows(learner: Learner) -> Script[None]:
 
 
 def evaluates_under_no_other_version(learner: Learner) -> Script[None]:
-    """Newer weights than those of an evaluation are held too: it acts under its own, which the watch sees by its rows."""
+    """Send newer weights before those of an evaluation. The watch checks by the rows that the evaluation uses its own."""
     session = yield from collecting(learner)
     session.give(session.weights(2, -session.random_parameters(1)))
     order = _evaluation(learner, send_rows=True)
@@ -752,7 +768,10 @@ def evaluates_under_no_other_version(learner: Learner) -> Script[None]:
 
 
 def ends_evaluations(learner: Learner) -> Script[None]:
-    """The order of a later evaluation ends the one before, whose weights never came. An older evaluation is of use too."""
+    """Order an evaluation whose weights are never sent, then another one, which must end the first one.
+
+    The second one is of an older version, which must make no difference.
+    """
     session = yield from collecting(learner)
     over = _evaluation(learner, version=3)
     order = _evaluation(learner, version=2)
@@ -786,7 +805,7 @@ def _evaluation(
 
 
 def _evaluate(session: Collecting, order: Evaluate) -> Script[Evaluated]:
-    """Order an evaluation under weights that are given; the watch checks its answer."""
+    """Order an evaluation, send its weights, and wait for the answer, which the watch checks."""
     session.learner.send(order)
     session.give(session.weights(order.version))
     text = f"Evaluated for ticket {order.ticket}"
@@ -798,7 +817,7 @@ def _evaluate(session: Collecting, order: Evaluate) -> Script[Evaluated]:
 
 
 def drains_while_it_collects(learner: Learner) -> Script[None]:
-    """Drain while one ticket is collected and another waits. Heartbeats continue."""
+    """Send Drain while the client collects for one ticket and another ticket waits. Heartbeats must continue."""
     session = yield from collecting_at_length(learner, 3 * LONG_S)
     permits = [session.permit(), session.permit()]
     yield from session.begin(*permits)
@@ -827,7 +846,7 @@ def drains_while_it_collects(learner: Learner) -> Script[None]:
 
 
 def _draining(learner: Learner) -> Script[Collecting]:
-    """A session in which the client is told to drain while it collects."""
+    """Begin a session, and send Drain while the client collects."""
     session = yield from collecting_at_length(learner)
     yield from session.begin(session.permit())
     learner.send(Drain("the run is over"))
@@ -835,7 +854,7 @@ def _draining(learner: Learner) -> Script[Collecting]:
 
 
 def takes_no_work_while_it_drains(learner: Learner) -> Script[None]:
-    """A Collect, and a copy of the Welcome, after Drain."""
+    """Send a Collect after Drain."""
     session = yield from _draining(learner)
     late = session.permit(1)
     session.order(late)
@@ -848,23 +867,23 @@ def takes_no_work_while_it_drains(learner: Learner) -> Script[None]:
 
 
 def leaves_when_refused_while_it_drains(learner: Learner) -> Script[None]:
-    """Refuse after Drain: the client may have left already."""
+    """Send Refuse after Drain. The client may have left already."""
     yield from _draining(learner)
     learner.send(Refuse("the test refuses this worker"))
     yield from _ends(learner, (0, 2), "Drain and Refuse")
 
 
 def leaves_when_unknown_while_it_drains(learner: Learner) -> Script[None]:
-    """Rejoin after Drain: the learner does not know the session any more."""
+    """Send Rejoin after Drain, as if the learner no longer knew the session."""
     yield from _draining(learner)
     learner.send(Rejoin(learner.session))
     yield from _ends(learner, (0, 1), "Drain and Rejoin")
 
 
 def _ends(learner: Learner, codes: tuple[int, ...], after: str) -> Script[None]:
-    """The client ends; a Goodbye may come before."""
+    """Wait until the client ends with one of these exit codes. It may say Goodbye before. Raises `Broken` otherwise."""
     within_s = 2 * learner.settings.patience_s
-    learner.may_leave = True  # so that a Hello is this check's
+    learner.may_leave = True  # so that this check, and not the learner, judges a Hello
     before = learner.hello
     assert before is not None
     last_event = yield Wait(within_s, lambda event: isinstance(event, Ended) or isinstance(event.message, Goodbye | Hello))

@@ -57,7 +57,7 @@ def run(argv: list[str]) -> int:
 
 
 def check(argv: list[str], write: Callable[[str], None]) -> int:
-    """Check the client. `write` takes the lines of the report. Returns the exit code."""
+    """Check the client. `write` is called with the lines of the report. Returns the exit code."""
     words, command = cut_at_dashes(argv)
     values = parse_flags(ConformFlags, words, "conform")
     if not command:

@@ -1,7 +1,7 @@
-"""Checks a client, a worker in any language: opens the learner's port, starts the client, and lets the examiner decide.
+"""Checks a client: opens the learner's port, starts the client's process, and passes its messages to the examiner.
 
-Rule: this file decides nothing about the conversation (`examiner.py`). It only sends, receives, starts and
-ends processes, each with a deadline. No process that it started outlives it.
+Rule: this file decides nothing about the conversation; the examiner does (`examiner.py`). It only sends and receives
+messages, and starts and ends processes, always with a deadline. No process that it started outlives it.
 """
 
 from __future__ import annotations
@@ -46,20 +46,20 @@ ADDRESS_VARIABLE = "MILLRACE_ADDRESS"
 ADDRESS_WORD = "{address}"
 TOKEN_WORD = "{token}"
 POLL_S = 0.05
-STOP_CLIENT_WITHIN_S = 4.0  # after SIGTERM: then the client is killed
-LISTEN_WITHIN_S = 3.0  # the port of a socket that was closed may be taken for a moment
-KEPT_LINES = 40  # of the client's output
-MOST_PACKED_BYTES = 1 << 26  # of one message
+STOP_CLIENT_WITHIN_S = 4.0  # time from SIGTERM until the client is killed
+LISTEN_WITHIN_S = 3.0  # after a socket was closed, its port may still be in use for a moment
+KEPT_LINES = 40  # number of lines of the client's output to keep
+MOST_PACKED_BYTES = 1 << 26  # largest size of one message
 
 
 @dataclass(frozen=True)
 class ClientCommand:
-    """The client's command."""
+    """The command that starts the client."""
 
     command: tuple[str, ...]
-    """words; `{address}` and `{token}` in them are replaced"""
+    """the words of the command, in which `{address}` and `{token}` are replaced"""
     with_keys: bool = False
-    """whether the connection is encrypted, and the client needs its token"""
+    """whether the connection is encrypted, so that the client needs a token"""
 
 
 def conform(
@@ -95,7 +95,7 @@ def conform(
             for event in port.heard(min(POLL_S, examiner.next_due_s() - time.monotonic())):
                 perform(examiner.handle(event, time.monotonic()))
             if (ended := process.ended()) is not None:
-                for event in port.heard(POLL_S):  # its last words
+                for event in port.heard(POLL_S):  # the last messages of the process that ended
                     perform(examiner.handle(event, time.monotonic()))
                 perform(examiner.handle(ended, time.monotonic()))
             for result in examiner.results[told:]:
@@ -142,18 +142,18 @@ class _Port:
         self.address = self._link.address
 
     def cut(self) -> None:
-        """Close the socket, and all its connections."""
+        """Close the socket with all its connections."""
         self._socket.close()
         self._link = None
 
     def send(self, peer: bytes, frames: Sequence[bytes | memoryview]) -> None:
-        """Send, if the peer is there."""
+        """Send these frames, unless the peer isn't connected."""
         if self._link is not None:
             with suppress(zmq.ZMQError):
                 self._link.send(peer, frames)
 
     def heard(self, timeout_s: float) -> list[Heard]:
-        """What has arrived, after a wait of at most `timeout_s`."""
+        """The messages that have arrived. Waits at most `timeout_s` for the first one."""
         if self._link is None:
             time.sleep(max(0.0, timeout_s))
             return []
@@ -162,7 +162,7 @@ class _Port:
         return [Heard(peer, message) for peer, message in self._link.receive()]
 
     def discard(self) -> None:
-        """Drop what has arrived: its sender was ended."""
+        """Discard the messages that have arrived, because their sender was ended."""
         self.heard(0.0)
 
 
@@ -215,17 +215,17 @@ class _Process:
     def ask_to_stop(self) -> None:
         """Send SIGTERM."""
         if self._running is not None:
-            os.kill(self._running.pid, signal.SIGTERM)  # `send_signal` would take its exit code if it has just ended
+            os.kill(self._running.pid, signal.SIGTERM)  # `send_signal` would reap the process if it has just ended
 
     def ended(self) -> Ended | None:
-        """How it has ended; None while it runs, and before it is started."""
+        """How the client ended; None while it runs, and before it was started."""
         if self._running is None or not self._has_ended():
             return None
         code = self._close()
         return Ended(code, self._lines[-1] if self._lines else "")
 
     def end(self) -> None:
-        """End it and all that it started: SIGTERM, then SIGKILL."""
+        """End the client and all processes that it started: SIGTERM, then SIGKILL."""
         if self._running is None:
             return
         self.ask_to_stop()
@@ -235,12 +235,12 @@ class _Process:
         self._close()
 
     def _has_ended(self) -> bool:
-        """Whether it has ended. It stays a zombie, so nobody else gets its number before its group is killed."""
+        """Whether the client has ended. It stays a zombie, so that its id isn't reused before its group is killed."""
         assert self._running is not None
         return os.waitid(os.P_PID, self._running.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None
 
     def _close(self) -> int:
-        """Kill what is left of its process group, so its pipe ends. Returns the exit code."""
+        """Kill what is left of the client's process group, so that its output pipe is closed. Returns the exit code."""
         assert self._running is not None
         assert self._reader is not None
         with suppress(ProcessLookupError, PermissionError):

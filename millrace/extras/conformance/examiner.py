@@ -1,6 +1,7 @@
 """Runs the checks, one after the other, against one client. Pure: events and `now` in, effects and results out.
 
-Rule: it never waits without a deadline. A check that fails ends the client, so the next one begins with a new process.
+Rule: the examiner never waits without a deadline. If a check fails, the examiner ends the client, so that the next check
+begins with a new process.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ CHECK_S = 40.0  # longest time that one check may take
 
 @dataclass(frozen=True)
 class Check:
-    """A check: its name and what it does."""
+    """A check: its name, and the generator that performs it."""
 
     name: str
     script: Callable[[Learner], Script[None]]
@@ -32,11 +33,11 @@ class CheckResult:
     outcome: Literal["passed", "failed", "skipped"]
     seconds: float
     rule: Rule | None = None
-    """that is broken; None if it failed because it took too long"""
+    """the rule that the client broke; None if the check failed because it took too long"""
     expected: str = ""
     got: str = ""
     note: str = ""
-    """why it was skipped"""
+    """why the check was skipped"""
 
 
 class Examiner:
@@ -58,7 +59,7 @@ class Examiner:
         return len(self.results) == len(self._checks)
 
     def handle(self, event: ClientEvent, now: float) -> list[LearnerEffect]:
-        """Handle an event."""
+        """Handle an event. Returns the effects that it has on the client."""
         self.learner.now = now
         if self._script is not None:
             try:
@@ -69,7 +70,7 @@ class Examiner:
         return self._taken()
 
     def tick(self, now: float) -> list[LearnerEffect]:
-        """Do what is due: begin the next check, or end a wait."""
+        """Do what is due: begin the next check, or end a wait. Returns the effects."""
         learner = self.learner
         learner.now = now
         if self.done:
@@ -90,7 +91,7 @@ class Examiner:
         return self._taken()
 
     def next_due_s(self) -> float:
-        """Time at which `tick` must be called at the latest."""
+        """The time by which `tick` must be called."""
         return self._due_s
 
     def _begin(self) -> None:

@@ -1,6 +1,7 @@
-"""The checks of both profiles: joining, leaving, and what the learner must know of the environment.
+"""The checks that both profiles share: joining, leaving, and describing the environment.
 
-Each function is one check (`script.py`). The order of the states and messages is that of "The worker's half".
+Each check is a function that `profiles.py` lists (`script.py`). Its docstring says what the learner does to the client. The
+checks follow the order of states and messages in the section "The worker's half" of the wire document.
 """
 
 from __future__ import annotations
@@ -35,13 +36,13 @@ from millrace.protocol.rules import Rule
 from millrace.protocol.specs import RunSpec, StepSpec, WaitSpec
 from millrace.protocol.wire.socket_options import routing_id
 
-MOST_LIMIT_STEPS = 2000  # of a time limit that a check walks to
-POLE_GAINS = (0.1, 0.2, 1.0, 0.6)  # balance the pole of a cart, so that its episodes reach the time limit
-SILENCE_S = 1.5  # learner_timeout_s of the check of silence
+MOST_LIMIT_STEPS = 2000  # the longest time limit that a check tries to reach, in steps
+POLE_GAINS = (0.1, 0.2, 1.0, 0.6)  # of a linear controller that balances CartPole until the time limit
+SILENCE_S = 1.5  # learner_timeout_s in the check in which the learner falls silent
 
 
 def wait_spec(learner: Learner, heartbeat_s: float = 0.0, learner_timeout_s: float = 30.0) -> WaitSpec:
-    """A session in which the client waits for the run."""
+    """The specification of a session in which the client waits for the run."""
     return WaitSpec(heartbeat_s=heartbeat_s or learner.settings.heartbeat_s, learner_timeout_s=learner_timeout_s)
 
 
@@ -51,7 +52,7 @@ def describe(learner: Learner) -> Describe:
 
 
 def described(learner: Learner) -> Script[DescribedEnv]:
-    """The client's environment. If it is not known yet, the client joins and describes it."""
+    """The client's environment. If it isn't known yet, let the client join and describe it."""
     if learner.env is None:
         yield from in_any_session(learner)
         yield from describes_on_order(learner)
@@ -60,7 +61,7 @@ def described(learner: Learner) -> Script[DescribedEnv]:
 
 
 def describes_on_order(learner: Learner) -> Script[Describe]:
-    """The client describes its environment, in a session in which it waits for the run. Returns the order."""
+    """Let the client describe its environment, in a session in which it waits for the run. Returns the order."""
     order = describe(learner)
     learner.send(order)
     text = f"Described of the environment {order.env.id}, with ticket {order.ticket} of the order"
@@ -75,7 +76,7 @@ def describes_on_order(learner: Learner) -> Script[Describe]:
 
 
 def time_limit(learner: Learner) -> Script[int]:
-    """Steps of the longest episode, as described. Skips the check if there is no limit that it can walk to."""
+    """The time limit that the client described, in steps. Skips the check if there is none, or if it is too long."""
     env = yield from described(learner)
     longest = env.max_episode_steps
     if longest is None or longest > MOST_LIMIT_STEPS:
@@ -84,19 +85,19 @@ def time_limit(learner: Learner) -> Script[int]:
 
 
 def is_gymnasium_pole(env: DescribedEnv) -> bool:
-    """Whether it is gymnasium's CartPole, of which attributes and options of `reset` are known."""
+    """Whether the environment is gymnasium's CartPole, whose attributes and `reset` options the checks know."""
     return env.spec is not None and str(env.spec.entry_point).endswith(":CartPoleEnv")
 
 
 def heartbeats(learner: Learner, number: int, rule: Rule = Rule.HEARTBEAT) -> Script[Heartbeat]:
-    """The last one of this many Heartbeats that follow."""
+    """Wait for this many Heartbeats. Returns the last one."""
     for _ in range(number):
         beat = yield from learner.expect(Heartbeat, rule, "a Heartbeat")
     return beat
 
 
 def over_a_new_connection(learner: Learner, *others: type[Answer | Rollout]) -> Script[None]:
-    """Every connection is reset. A Heartbeat of the same session comes, or one of these messages."""
+    """Reset every connection, and wait for a Heartbeat of the same session, or for one of `others`."""
     learner.do(CutConnection(), Listen())
     text = "a message of the same session over a new connection"
     yield from learner.expect((Heartbeat, *others), Rule.CONNECTION, text, within_s=10)
@@ -106,7 +107,7 @@ def over_a_new_connection(learner: Learner, *others: type[Answer | Rollout]) -> 
 
 
 def says_hello(learner: Learner) -> Script[None]:
-    """The first message."""
+    """Start the client, and check its first message."""
     hello = yield from learner.newly_started()
     token = learner.settings.token
     peer = (
@@ -121,7 +122,7 @@ def says_hello(learner: Learner) -> Script[None]:
 
 
 def repeats_hello(learner: Learner) -> Script[None]:
-    """The learner does not answer: every Welcome is lost."""
+    """Don't answer Hello, as if every Welcome were lost."""
     first = yield from learner.newly_started()
     times = [learner.now]
     for _ in range(3):
@@ -135,7 +136,7 @@ def repeats_hello(learner: Learner) -> Script[None]:
 
 
 def ignores_early_messages(learner: Learner) -> Script[None]:
-    """Messages of a session that there is not."""
+    """Send messages of a session that doesn't exist."""
     hello = yield from learner.joining()
     for message in (
         Rejoin(1), HeartbeatReply(1, 1, ()), Release(1, ()), Weights(3, np.zeros(4, np.float32), np.zeros(0, np.float32))
@@ -147,7 +148,7 @@ def ignores_early_messages(learner: Learner) -> Script[None]:
 
 
 def accepts_only_its_welcome(learner: Learner) -> Script[None]:
-    """A Welcome that answers another attempt comes late."""
+    """Send Welcomes that answer other attempts."""
     hello = yield from learner.joining()
     learner.send(Welcome(77, hello.attempt - 1, wait_spec(learner)))
     learner.send(Welcome(78, hello.attempt + 1, wait_spec(learner)))
@@ -158,7 +159,7 @@ def accepts_only_its_welcome(learner: Learner) -> Script[None]:
 
 
 def describes(learner: Learner) -> Script[None]:
-    """The answer is lost, and the order comes again; then there is another order, and one of another session."""
+    """Repeat an order to describe, as if its answer had been lost; then send a new one, and one of another session."""
     yield from in_any_session(learner)
     order = yield from describes_on_order(learner)
     learner.send(order)
@@ -173,7 +174,7 @@ def describes(learner: Learner) -> Script[None]:
 
 
 def answers_heartbeats_in_order(learner: Learner) -> Script[None]:
-    """Replies are lost, late and repeated."""
+    """Answer Heartbeats with replies that are lost, late and repeated."""
     yield from learner.joining()
     learner.welcome(wait_spec(learner))
     first = yield from learner.expect(Heartbeat, Rule.HEARTBEAT, "a Heartbeat", within_s=learner.settings.start_s)
@@ -193,7 +194,7 @@ def answers_heartbeats_in_order(learner: Learner) -> Script[None]:
 
 
 def _replies(learner: Learner, number: int) -> Script[None]:
-    for _ in range(4):  # one may have been on its way
+    for _ in range(4):  # a Heartbeat may have been on its way before the reply arrived
         heartbeat = yield from heartbeats(learner, 1)
         if heartbeat.replies >= number:
             return
@@ -201,14 +202,14 @@ def _replies(learner: Learner, number: int) -> Script[None]:
 
 
 def in_any_session(learner: Learner, heartbeat_s: float = 0.0, learner_timeout_s: float = 30.0) -> Script[None]:
-    """The client joins, and waits for the run: a session that every client has."""
+    """Let the client join and wait for the run. Every client supports such a session."""
     yield from learner.joining()
     learner.welcome(wait_spec(learner, heartbeat_s, learner_timeout_s))
     yield from heartbeats(learner, 1)
 
 
 def keeps_the_rhythm(learner: Learner) -> Script[None]:
-    """Heartbeats come as often as the session asks for."""
+    """Count Heartbeats, which must come as often as the session asks for."""
     yield from in_any_session(learner, heartbeat_s=0.5)
     yield from heartbeats(learner, 1)
     began_s = learner.now
@@ -219,7 +220,7 @@ def keeps_the_rhythm(learner: Learner) -> Script[None]:
 
 
 def joins_again(learner: Learner) -> Script[None]:
-    """A Rejoin of this session, and one of another."""
+    """Send a Rejoin of another session, then one of this session."""
     yield from in_any_session(learner)
     learner.send(Rejoin(learner.session + 1000))
     yield from learner.quiet(Hello, Rule.OTHER_SESSION, "no Hello after a Rejoin of another session", for_s=1.0)
@@ -229,7 +230,7 @@ def joins_again(learner: Learner) -> Script[None]:
 
 
 def begins(learner: Learner, run: RunSpec | StepSpec) -> Script[None]:
-    """The client joins before there is a run, describes its environment, and begins the run in the same session."""
+    """Let the client join before there is a run, describe its environment, and begin the run in the same session."""
     yield from in_any_session(learner)
     yield from describes_on_order(learner)
     waited = learner.watch.welcome
@@ -245,8 +246,8 @@ def begins(learner: Learner, run: RunSpec | StepSpec) -> Script[None]:
 
 
 def _begun(learner: Learner) -> Script[None]:
-    """Heartbeats say that the client waits no more."""
-    for _ in range(4):  # one may have been on its way
+    """Wait until a Heartbeat says that the client no longer waits for the run."""
+    for _ in range(4):  # a Heartbeat may have been on its way before the Welcome arrived
         heartbeat = yield from heartbeats(learner, 1, Rule.BEGINS)
         if not heartbeat.waits:
             return
@@ -254,7 +255,7 @@ def _begun(learner: Learner) -> Script[None]:
 
 
 def takes_a_repeated_welcome(learner: Learner) -> Script[None]:
-    """The learner answers a repeated Hello by the same Welcome."""
+    """Send the same Welcome again, as a learner does if Hello was repeated."""
     yield from in_any_session(learner)
     yield from _replies(learner, 1)
     learner.send(learner.watch.welcome)
@@ -265,9 +266,9 @@ def takes_a_repeated_welcome(learner: Learner) -> Script[None]:
 
 
 def notices_silence(learner: Learner) -> Script[None]:
-    """The learner says nothing more."""
+    """Fall silent. The client must join again after `learner_timeout_s`."""
     yield from in_any_session(learner, learner_timeout_s=SILENCE_S)
-    yield from heartbeats(learner, 12)  # as long as it hears the learner, the client stays: any message counts
+    yield from heartbeats(learner, 12)  # the client stays as long as it receives any message from the learner
     learner.answers_heartbeats = False
     silent_from_s = learner.now
     text = f"Hello {SILENCE_S} s (learner_timeout_s) after the learner's last message"
@@ -280,14 +281,14 @@ def notices_silence(learner: Learner) -> Script[None]:
 
 
 def outlives_its_connection(learner: Learner) -> Script[None]:
-    """Every connection is reset; the learner keeps the session."""
+    """Reset every connection, but keep the session."""
     yield from in_any_session(learner)
     for _ in range(2):
         yield from over_a_new_connection(learner)
 
 
 def outlives_a_restart(learner: Learner) -> Script[None]:
-    """The learner is away for a second, and then knows no session."""
+    """Close the socket for a second; then continue as a learner that doesn't know the session."""
     yield from in_any_session(learner)
     learner.do(CutConnection())
     yield Wait(1.0)
@@ -301,14 +302,14 @@ def outlives_a_restart(learner: Learner) -> Script[None]:
 
 
 def leaves_when_refused(learner: Learner) -> Script[None]:
-    """Refuse while joining."""
+    """Send Refuse while the client is joining."""
     yield from learner.newly_started()
     learner.send(Refuse("the test refuses this worker: expected exit code 2"))
     yield from learner.left(Rule.REFUSE, "Refuse while joining", (2,))
 
 
 def leaves_when_refused_later(learner: Learner) -> Script[None]:
-    """Refuse while ready."""
+    """Send Refuse in a session."""
     yield from in_any_session(learner)
     learner.send(Refuse("the test refuses this worker: expected exit code 2"))
     learner.may_leave = True
@@ -316,14 +317,14 @@ def leaves_when_refused_later(learner: Learner) -> Script[None]:
 
 
 def drains_while_joining(learner: Learner) -> Script[None]:
-    """Drain is the answer to Hello. Its reason is as long as a reason may be."""
+    """Answer Hello with Drain, whose reason has the largest length that is allowed."""
     yield from learner.newly_started()
     learner.send(Drain("…" * MAX_LINE))
     yield from learner.left(Rule.DRAIN_JOINING, "Drain while joining")
 
 
 def drains_while_idle(learner: Learner) -> Script[None]:
-    """Drain while there is nothing to do. Its reason is as long as a reason may be."""
+    """Send Drain while the client has nothing to do. Its reason has the largest length that is allowed."""
     yield from in_any_session(learner)
     learner.send(Drain("…" * MAX_LINE))
     goodbye = yield from learner.expect(Goodbye, Rule.DRAIN, "Goodbye after Drain")
@@ -333,7 +334,7 @@ def drains_while_idle(learner: Learner) -> Script[None]:
 
 
 def stops_on_request(learner: Learner) -> Script[None]:
-    """SIGTERM while ready."""
+    """Send SIGTERM in a session."""
     yield from in_any_session(learner)
     learner.do(AskToStop())
     yield from learner.expect(Goodbye, Rule.STOP, "Goodbye after SIGTERM")
@@ -341,14 +342,14 @@ def stops_on_request(learner: Learner) -> Script[None]:
 
 
 def stops_while_joining(learner: Learner) -> Script[None]:
-    """SIGTERM while no learner answers."""
+    """Send SIGTERM while the client waits for an answer to its Hello."""
     yield from learner.newly_started()
     learner.do(AskToStop())
     yield from learner.left(Rule.STOP, "SIGTERM while joining")
 
 
 def draws_its_nonce(learner: Learner) -> Script[None]:
-    """Two processes of the same command have different lives."""
+    """Start two processes with the same command. Their `process_nonce` must differ."""
     one = yield from learner.newly_started()
     other = yield from learner.newly_started()
     if one.process_nonce == other.process_nonce:

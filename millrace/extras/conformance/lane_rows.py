@@ -1,7 +1,7 @@
-"""What must hold between the rollouts of one lane: they continue each other, and their sums are right. Pure.
+"""Checks the rollouts of one lane: each continues the one before, and returns and log-probabilities are right. Pure.
 
-It recomputes what a learner can: which rows are valid, the returns and lengths of episodes, and the log-probabilities of the
-actions under the weights that acted, by the numpy policy.
+It recomputes everything that a learner can recompute: which rows are valid, the returns and lengths of episodes, and, with
+the numpy policy, the log-probabilities of the actions under the weights that chose them.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from millrace.protocol.rules import Rule
 from millrace.protocol.specs import RunSpec
 from millrace.protocol.wire.weight_dtypes import to_float32
 
-RETURN_TOLERANCE = 1e-4  # relative: the rows carry rewards in float32, the sums are of float64
-LOG_PROB_TOLERANCE = 1e-3  # absolute: another order of additions gives other last bits
+RETURN_TOLERANCE = 1e-4  # relative, because rewards in rows are float32 but returns are summed in float64
+LOG_PROB_TOLERANCE = 1e-3  # absolute, because another order of additions gives other last bits
 
 
 class LaneRows:
-    """The rollouts of one lane, in order: of one incarnation, and of those that continue it."""
+    """The rollouts of one lane, in order, in one incarnation and in later ones that continue it."""
 
     def __init__(self, run: RunSpec) -> None:
         self._run = run
@@ -34,7 +34,7 @@ class LaneRows:
         self._length = np.zeros(run.copies, np.int64)
 
     def see(self, rollout: Rollout, weights: Weights) -> None:
-        """Check the next rollout, which keeps the row format. Raises `Broken`."""
+        """Check the next rollout, whose row format was already checked. Raises `Broken`."""
         self._check_begin(rollout)
         self._check_episodes(rollout)
         if can_be_recomputed(self._run):
@@ -96,7 +96,7 @@ class LaneRows:
                 raise Broken(Rule.EPISODES, expected_return, f"{episode.reward:g}")
 
     def _check_log_prob(self, rollout: Rollout, weights: Weights) -> None:
-        # What a seat did that waited when the rollout began may be of older weights.
+        # If a seat was waiting when the rollout began, older weights may have chosen the action in its first row.
         known = rollout.valid & (rollout.valid.cumsum(0) > 1) if self._run.takes_turns else rollout.valid
         params = params_of(self._run, weights, [leaf[:-1][known][None] for leaf in rollout.obs])
         action = rollout.action[known]
@@ -117,29 +117,29 @@ class LaneRows:
 
 
 def resets_of(rollout: Rollout) -> Bools:
-    """Which steps only reset a copy [T+1, N]; the last row is of the step after the rollout."""
+    """Which steps only reset a copy, [T+1, N] bool; the last row is about the step after the rollout."""
     if rollout.resets is not None:
         return rollout.resets
     return np.concatenate([~rollout.valid, rollout.valid[-1:] & (rollout.terminated | rollout.truncated)[-1:]])
 
 
 def can_be_recomputed(run: RunSpec) -> bool:
-    """Whether the numpy policy acts as this run's policy does."""
+    """Whether the numpy policy can recompute what this run's policy does."""
     return run.policy.own is None and not run.policy.needs_torch
 
 
 def params_of(run: RunSpec, weights: Weights, obs: Sequence[Array]) -> Floats:
-    """Distribution parameters [L, N, P] of these observations [L, N, *leaf], under these weights."""
+    """The distribution's parameters [L, N, P] for these observations [L, N, *leaf], under these weights."""
     policy = make_policy(run.policy)
     policy.load(to_float32(weights.parameters), weights.buffers)
     return policy(obs)
 
 
 def is_return(got: float, total: float) -> bool:
-    """Whether a return is this sum of rewards."""
+    """Whether the return `got` equals the sum of rewards `total`, within the tolerance."""
     return abs(got - total) <= RETURN_TOLERANCE * max(1.0, abs(total))
 
 
 def _same(one: list[tuple[float, int]], other: list[tuple[float, int]]) -> bool:
-    """Whether these episodes have the same returns and lengths, in this order."""
+    """Whether two lists of (return, length) are the same, in this order."""
     return all(a == b and is_return(y, x) for (x, a), (y, b) in zip(one, other, strict=True))

@@ -1,8 +1,8 @@
 """The learner that a check plays for the client. Pure: events and `now` in, effects out.
 
-Each check decides what the learner says and which messages are lost. The learner keeps the books that every check needs: the
-client's newest Hello, the session, the watch over its messages. Unless the check says otherwise, it answers each Heartbeat,
-and a repeated Hello by the same Welcome again.
+Each check decides which messages the learner sends and which of them are lost. The learner keeps the state that every check
+needs: the client's newest Hello, the session, and the watch over its messages. Unless a check turns this off, the learner
+answers each Heartbeat, and answers a repeated Hello with the same Welcome.
 """
 
 from __future__ import annotations
@@ -52,24 +52,24 @@ from millrace.protocol.specs import RunSpec, StepSpec, WaitSpec
 from millrace.protocol.wire.codec import Buffer, encode
 
 M = TypeVar("M")
-QUIET_S = 0.7
+QUIET_S = 0.7  # default time for which `Learner.quiet` waits
 
 
 @dataclass(frozen=True)
 class Settings:
-    """How the client is checked."""
+    """Settings of the whole test."""
 
     env: EnvSpec
     copies: int = 2
-    """N, env copies in a lane"""
+    """N, the number of env copies in a lane"""
     patience_s: float = 5.0
-    """how long an answer may take"""
+    """how long the client may take to answer"""
     start_s: float = 20.0
     """how long the client may take from its start to its first Hello"""
     heartbeat_s: float = 0.25
-    """what sessions ask for"""
+    """the interval of Heartbeats that sessions ask for"""
     token: Token | None = None
-    """the client's, if the connection is encrypted"""
+    """the client's token, if the connection is encrypted"""
 
 
 class Learner:
@@ -80,24 +80,24 @@ class Learner:
         self.now = 0.0
         self.effects: list[LearnerEffect] = []
         self.runs = False
-        """whether the client's process runs"""
+        """whether the client's process is running"""
         self.is_mute = False
         """whether the client was started and has never said Hello"""
         self.peer = b""
         self.hello: Hello | None = None
-        """the newest, of the process that runs; what comes before it was said by the process before"""
+        """the newest Hello of the running process; messages before the first one are from the process before"""
         self.answers_heartbeats = True
         self.may_leave = False
-        """whether the client may leave its session by itself, also by another process; no Heartbeat is due"""
+        """whether the client may leave its session, or a new process may take its name; then no Heartbeat is due"""
         self.tickets = count(101)
         self.env: DescribedEnv | None = None
-        """what the client has described, in this whole run of the test"""
+        """the environment that the client has described, at any time during the test"""
         self.step_s = 0.0
-        """how long a step takes that is long enough to act meanwhile; 0: it was not measured yet"""
+        """time of an env step in a long rollout; 0 if it hasn't been measured yet"""
         self._sessions = count(0x5EED_0001)
-        self._had_a_session = False  # the process
-        self._steps = 0  # env steps that the process has reported
-        self._watch: WatchedSession | None = None  # of the current session
+        self._had_a_session = False  # whether the running process has had a session
+        self._steps = 0  # number of env steps that the running process has reported
+        self._watch: WatchedSession | None = None  # the watch over the current session
 
     @property
     def watch(self) -> WatchedSession:
@@ -107,7 +107,7 @@ class Learner:
 
     @property
     def session(self) -> int:
-        """The current session."""
+        """The number of the current session."""
         return self.watch.session
 
     # --------------------------------------------------------------------------------------------------------- sending
@@ -119,12 +119,12 @@ class Learner:
         self.effects.append(SendFrames(self.peer, encode(message)))
 
     def send_unreadable(self, ticket: int, *messages: list[Buffer]) -> None:
-        """Send frames that cannot be read, some of them with this ticket, which the client must not answer."""
+        """Send messages that can't be read. Some of them contain this ticket, which the client must not answer."""
         self.watch.unreadable(ticket)
         self.effects += [SendFrames(self.peer, frames) for frames in messages]
 
     def welcome(self, run: WaitSpec | RunSpec | StepSpec) -> None:
-        """Answer the newest Hello: a new session begins."""
+        """Answer the newest Hello, which begins a new session."""
         assert self.hello is not None
         self.answers_heartbeats = True
         welcome = Welcome(next(self._sessions), self.hello.attempt, run)
@@ -133,11 +133,11 @@ class Learner:
         self.send(self._watch.welcome)
 
     def begin(self, run: RunSpec | StepSpec) -> None:
-        """The run begins in the session in which the client waits for it."""
+        """Begin the run in the session in which the client waits for it."""
         self.send(replace(self.watch.welcome, run=run))
 
     def do(self, *effects: LearnerEffect) -> None:
-        """Have these effects on the client's process and its connections."""
+        """Request these effects on the client's process and its connections."""
         self.effects += effects
         for effect in effects:
             match effect:
@@ -153,7 +153,7 @@ class Learner:
     # --------------------------------------------------------------------------------------------------------- hearing
 
     def take(self, event: ClientEvent, wanted: Callable[[ClientEvent], bool]) -> bool:
-        """Do the books for an event; whether the check waits for it. Raises `Broken`."""
+        """Update the state for an event. Returns whether it is the event that the check waits for. Raises `Broken`."""
         match event:
             case Ended():
                 self._forget_process()
@@ -169,7 +169,7 @@ class Learner:
                 self.is_mute = False
                 return wanted(event)
             case Heard(_, Hello() | Alive() | Inquire() | BadMessage()):
-                return False  # of a supervisor, of a process that was ended, or of a second worker of the same command
+                return False  # from a supervisor, from a process that was ended, or from a second worker of the command
             case Heard(peer, message) if peer == self.peer and self.hello is not None:
                 return self._take_message(message, event, wanted)
         return False
@@ -222,7 +222,7 @@ class Learner:
         return False
 
     def check_heartbeats(self) -> None:
-        """Raise `Broken` if a Heartbeat is overdue. None is due from a client that may leave the session by itself."""
+        """Raise `Broken` if a Heartbeat is overdue. While the client may leave its session, no Heartbeat is due."""
         if self._watch is not None and not (self.may_leave or self._watch.said_goodbye):
             self._watch.late(self.now)
 
@@ -231,7 +231,10 @@ class Learner:
     def expect(
         self, kinds: type[M] | tuple[type[M], ...], rule: Rule, expected: str, *, within_s: float = 0.0, **fields: Any
     ) -> Script[M]:
-        """The next message of these kinds whose fields have these values, within `within_s` or the patience. Or `Broken`."""
+        """Wait for a message of these kinds whose fields have these values, for `within_s` (by default, `patience_s`).
+
+        Raises `Broken` with this rule and this expectation if none arrives.
+        """
         may_end = Goodbye in (kinds if isinstance(kinds, tuple) else (kinds,))
 
         def is_it(event: ClientEvent) -> bool:
@@ -248,7 +251,7 @@ class Learner:
         return message
 
     def takes_part(self, kind: type[M], rule: Rule, expected: str, *, within_s: float = 0.0) -> Script[M]:
-        """The next message of this kind. A client may decline instead: that skips the check."""
+        """Wait for a message of this kind. If the client declines with Goodbye instead, skip the check."""
         message = yield from self.expect((kind, Goodbye), rule, expected, within_s=within_s)
         if isinstance(message, Goodbye):
             yield from self.left(Rule.DECLINED, "Goodbye", (2,))
@@ -263,7 +266,7 @@ class Learner:
             raise Broken(rule, expected, brief(heard.message))
 
     def left(self, rule: Rule, after: str, codes: tuple[int, ...] = (0,)) -> Script[None]:
-        """The client's process ends with one of these exit codes. Or `Broken`."""
+        """Wait until the client's process ends. Raises `Broken` unless it has one of these exit codes."""
         within_s = self.settings.patience_s
         ended = yield Wait(within_s, lambda event: isinstance(event, Ended))
         if not isinstance(ended, Ended):
@@ -272,7 +275,7 @@ class Learner:
             raise Broken(rule, f"exit code {' or '.join(map(str, codes))} after {after}", f"exit code {ended.code}")
 
     def joining(self) -> Script[Hello]:
-        """A client that has said Hello and is not welcomed. It is started, or told to join again."""
+        """Start the client or tell it to join again, so that it has said Hello and waits for a Welcome."""
         if self._watch is not None:
             return (yield from self.rejoin())
         if self.hello is not None:
@@ -280,7 +283,7 @@ class Learner:
         return (yield from self.newly_started())
 
     def newly_started(self) -> Script[Hello]:
-        """A client that has just been started, and has said its first Hello."""
+        """Start the client as a new process, and wait for its first Hello."""
         if self.runs:
             self.do(EndClient())
         self.do(StartClient())
@@ -293,12 +296,12 @@ class Learner:
         return hello
 
     def rejoin(self) -> Script[Hello]:
-        """The client is told to join again, and does so."""
+        """Tell the client to join again, and wait for its Hello."""
         self.send(Rejoin(self.session))
         return (yield from self.later_hello(Rule.REJOIN, "Hello with a later attempt after Rejoin"))
 
     def later_hello(self, rule: Rule, expected: str, *, within_s: float = 0.0) -> Script[Hello]:
-        """The process stays, and leaves its session to join again."""
+        """Wait until the client leaves its session and says Hello again, in the same process and with a later attempt."""
         before = self.hello
         assert before is not None
         self.may_leave = True

@@ -1,6 +1,6 @@
-"""What the author of a client that breaks a rule does next.
+"""Advice to the author of a client that breaks a rule.
 
-Rule: every failure names a rule of `millrace.protocol.rules`; each that a check can find broken has its advice here.
+Rule: every failure names a rule of `millrace.protocol.rules`, and every rule that a check can find broken has advice here.
 """
 
 from __future__ import annotations
@@ -176,4 +176,4 @@ MENDS: Mapping[Rule, str] = {
     Rule.DRAINING_LEAVES: "end the process when one of them arrives after Drain, and say Hello no more",
 }
 TOO_SLOW = "look for the step at which the client waits; run this check alone with --only"
-"""If a check has not ended within its deadline, which isn't a rule of the document."""
+"""The advice if a check didn't end within its deadline, which isn't a rule of the wire document"""

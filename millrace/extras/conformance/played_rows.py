@@ -1,6 +1,7 @@
-"""What must hold for an evaluation: its rows fit each other and the answer, its actions fit the weights. Pure.
+"""Checks an evaluation: its rows must match each other and the answer, and its actions must match the weights. Pure.
 
-It recomputes what a learner can: the most probable actions, by the numpy policy, and returns and lengths from the rows.
+It recomputes everything that a learner can recompute: the most probable actions, with the numpy policy, and the returns and
+lengths of episodes, from their rows.
 """
 
 from __future__ import annotations
@@ -16,18 +17,18 @@ from millrace.protocol.rows.played import reason_to_reject
 from millrace.protocol.rules import Rule
 from millrace.protocol.specs import RunSpec
 
-BY_CHANCE = -14.0  # log of the probability that all sampled actions are the most probable ones by chance
+BY_CHANCE = -14.0  # if log P(all sampled actions are the most probable ones) is larger, that may happen by chance
 
 
 class PlayedRows:
-    """One answer to an Evaluate, from its first rows to its end."""
+    """One answer to an Evaluate: the rows of its episodes, then its Evaluated."""
 
     def __init__(self, order: Evaluate, run: RunSpec, weights: Weights) -> None:
-        """`weights`: of the version that the order names."""
+        """`weights`: the weights of the version that the order names."""
         self.ended = False
-        """whether its Evaluated has come"""
+        """whether the Evaluated has arrived"""
         self.rows: list[list[EpisodeRows]] = [[] for _ in order.seeds]
-        """by episode"""
+        """the rows that have arrived, for each episode"""
         self._order = order
         self._run = run
         self._weights = weights
@@ -51,7 +52,7 @@ class PlayedRows:
         before.append(rows)
 
     def see_answer(self, answer: Evaluated) -> None:
-        """Check the end of the answer. Raises `Broken`."""
+        """Check the Evaluated, which ends the answer. Raises `Broken`."""
         order = self._order
         k = len(self.rows)
         if not len(answer.episodes) == len(answer.cut) == k:
@@ -62,7 +63,7 @@ class PlayedRows:
                 raise Broken(Rule.CUT, expected, f"{episode.length} steps")
             if order.send_rows:
                 self._check_episode(n, episode.length, episode.reward, cut)
-        if order.send_rows and can_be_recomputed(self._run) and not self._run.seats:  # rows do not say which seats act
+        if order.send_rows and can_be_recomputed(self._run) and not self._run.seats:  # rows don't contain which seats act
             self._check_actions()
         self.ended = True
 
@@ -97,7 +98,9 @@ class PlayedRows:
             )
 
     def _against_the_best(self, rows: EpisodeRows) -> tuple[Array, Array, Array]:
-        """For each row: the largest log-probability, how much lower that of the action is, and whether it is the mode."""
+        """For each row: the log-probability of the most probable action, by how much the chosen action's log-probability is
+        lower, and whether the chosen action is the most probable one.
+        """
         params = params_of(self._run, self._weights, [leaf[:-1, None] for leaf in rows.obs])
         policy = distribution(self._run.policy)
         action = rows.action[:, None]
@@ -107,5 +110,5 @@ class PlayedRows:
         return best, best - log_prob, np.isclose(action, mode).reshape(len(action), -1).min(-1)
 
     def first_observation(self, n: int) -> bytes:
-        """The bits of the first observation of an episode whose rows have come."""
+        """The bytes of the first observation of episode `n`, whose rows must have arrived."""
         return b"".join(leaf[0].tobytes() for leaf in self.rows[n][0].obs)

@@ -1,4 +1,4 @@
-"""Which checks a profile has, and in which order. Plain data."""
+"""The checks of each profile, in order. Plain data."""
 
 from __future__ import annotations
 

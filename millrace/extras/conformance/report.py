@@ -1,7 +1,7 @@
-"""The report of a client's test, as lines for people and as plain data for programs. Pure.
+"""The report about a client, as lines for people and as plain data for programs. Pure.
 
-Rule: a reader who has never seen the code understands a failure: the rule in the document's words, where it stands, what was
-expected, what was got, what to do next.
+Rule: a reader who has never seen the code understands a failure. The report quotes the broken rule in the words of the wire
+document, says where the rule is, what was expected, what the client did, and what to do next.
 """
 
 from __future__ import annotations
@@ -21,13 +21,16 @@ MARKS = {"passed": "ok     ", "failed": "FAILED ", "skipped": "skipped"}
 
 
 def line_of(result: CheckResult) -> str:
-    """One line about a check."""
+    """One line about the outcome of a check."""
     note = f"  ({result.note})" if result.note else ""
     return f"{MARKS[result.outcome]}  {result.name}{note}"
 
 
 def explanation(result: CheckResult, earlier: Sequence[CheckResult] = ()) -> list[str]:
-    """What a failure means, indented. If an earlier check failed by the same rule for the same reason, only its name."""
+    """Indented lines that explain a failure; none for other outcomes.
+
+    If an earlier check failed in the same way, the only line is a reference to that check.
+    """
     if result.outcome != "failed":
         return []
     same = next((each for each in earlier if _essence(each) == _essence(result)), None)
@@ -57,12 +60,12 @@ def _next(rule: Rule | None) -> str:
 
 
 def _essence(result: CheckResult) -> tuple[object, str, str]:
-    """A failure without the numbers in it, such as those of sessions and tickets, which differ from check to check."""
+    """A failure without its numbers, such as sessions and tickets, which differ from check to check."""
     return result.rule, NUMBER.sub("", result.expected), NUMBER.sub("", result.got)
 
 
 def summary(results: Sequence[CheckResult]) -> str:
-    """The last line."""
+    """The last line of the report."""
     counts = {outcome: sum(each.outcome == outcome for each in results) for outcome in MARKS}
     seconds = sum(each.seconds for each in results)
     skipped = f", {counts['skipped']} skipped" if counts["skipped"] else ""

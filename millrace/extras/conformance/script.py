@@ -1,7 +1,7 @@
 """How a check is written: a generator that sends messages and waits for events. Pure: no socket, process or clock.
 
-A check yields a `Wait` and gets the event that it waited for, or None when the time is over. It raises `Broken` if a rule is
-broken, and `Skipped` if this client gives it nothing to look at. `Learner` is the learner that it plays.
+A check yields a `Wait` and gets the event that it waited for, or None when the time is over. It raises `Broken` if the
+client breaks a rule, and `Skipped` if there is nothing to check with this client. It acts through a `Learner`.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class Broken(Exception):
 
 
 class Skipped(Exception):
-    """The check found nothing to look at. The text says why."""
+    """There was nothing to check. The text says why."""
 
 
 # ------------------------------------------------------------------------------------------------------------- effects
@@ -60,7 +60,7 @@ class EndClient:
 
 @dataclass(frozen=True)
 class CutConnection:
-    """LearnerEffect: close the socket; with it every connection, and what is queued."""
+    """LearnerEffect: close the socket, which drops every connection and all queued messages."""
 
 
 @dataclass(frozen=True)
@@ -98,24 +98,24 @@ ClientEvent = Heard | Ended
 
 
 def nothing(event: ClientEvent) -> bool:
-    """Wait for no event, only for the time."""
+    """A `Wait.wanted` that accepts no event, to wait only for the time."""
     return False
 
 
 @dataclass(frozen=True)
 class Wait:
-    """Wait until `wanted` says yes to an event, at most `for_s`."""
+    """Wait until `wanted` returns True for an event, for at most `for_s` seconds."""
 
     for_s: float
     wanted: Callable[[ClientEvent], bool] = nothing
 
 
 Script = Generator[Wait, ClientEvent | None, T]
-"""What a part of a check is: it yields waits and returns a value."""
+"""The type of a check, or of a part of one: a generator that yields waits and returns a value of type T."""
 
 
 def brief(message: Any) -> str:
-    """A message in a few words: its type and its numbers."""
+    """A message in a few words: its type, and its most important fields."""
     if isinstance(message, BadMessage):
         return f"an unreadable message ({message})"
     shown = [

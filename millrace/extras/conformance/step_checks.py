@@ -1,6 +1,6 @@
-"""The checks of the environment profile: the learner acts, and the client resets and steps on order.
+"""The checks of the environment profile: the learner chooses actions, and the client resets and steps on order.
 
-Each function is one check (`script.py`).
+Each check is a function that `profiles.py` lists (`script.py`). Its docstring says what the learner does to the client.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ from millrace.protocol.specs import StepSpec
 from millrace.protocol.wire.codec import encode
 from millrace.protocol.wire.plain_values import pack, unpack
 
-WALK_STEPS = 300  # steps of the walk that looks for ends of episodes
-APART_STEPS = 8  # in which actions that copies do not share make a difference
+WALK_STEPS = 300  # number of random steps within which an episode should end
+APART_STEPS = 8  # number of steps after which copies with different actions observe different things
 LANES = 2
 
 
@@ -55,7 +55,7 @@ Mode = Literal["NextStep", "SameStep", "Disabled"]
 
 
 def step_spec(learner: Learner, env: DescribedEnv, mode: Mode) -> StepSpec:
-    """A session in which the client steps its copies on order."""
+    """The specification of a session in which the client steps its copies on order."""
     N = learner.settings.copies
     return StepSpec(
         envs=(learner.settings.env,),
@@ -70,7 +70,7 @@ def step_spec(learner: Learner, env: DescribedEnv, mode: Mode) -> StepSpec:
 
 
 class Stepping:
-    """A session of the environment profile, with the orders that checks need."""
+    """A session of the environment profile. It makes and sends the orders that checks need."""
 
     def __init__(self, learner: Learner, env: DescribedEnv, mode: Mode = "NextStep") -> None:
         self.learner = learner
@@ -88,19 +88,19 @@ class Stepping:
         seed: int | None = 7,
         options: object = None,
     ) -> Reset:
-        """A Reset of these copies (or all), seeded by `seed` and the copy's number."""
+        """A Reset of these copies (by default, of all copies), each seeded with `seed` plus its number."""
         copies = range(self.spec.lanes[lane]) if copies is None else copies
         seeds = tuple(None if seed is None else seed + copy for copy in copies)
         packed = np.frombuffer(pack(options), np.uint8)
         return Reset(self.learner.session, next(self.learner.tickets), lane, incarnation, tuple(copies), seeds, packed)
 
     def step(self, lane: int = 0, incarnation: int = 0, actions: tuple[Array, ...] | None = None) -> Step:
-        """A Step with these actions, or random ones."""
+        """A Step with these actions, by default random ones."""
         chosen = self.random_actions(self.spec.lanes[lane]) if actions is None else actions
         return Step(self.learner.session, next(self.learner.tickets), lane, incarnation, chosen)
 
     def random_actions(self, N: int) -> tuple[Array, ...]:
-        """Random actions of N copies."""
+        """Random actions for N copies, as an array for each leaf of the action space."""
         each = [self.flatten(self.space.sample()) for _ in range(N)]
         return tuple(
             np.stack([np.asarray(values, leaf.dtype) for values in of_leaf])
@@ -113,7 +113,7 @@ class Stepping:
         return (yield from self.answer(order))
 
     def walk(self, actions: Sequence[tuple[Array, ...]]) -> Script[list[Stepped]]:
-        """The answers to steps of lane 0 with these actions."""
+        """Step lane 0 with these actions, one after the other. Returns the answers."""
         rows: list[Stepped] = []
         for each in actions:
             row = yield from self.do(self.step(actions=each))
@@ -121,13 +121,13 @@ class Stepping:
         return rows
 
     def answer(self, order: Reset | Step) -> Script[Stepped]:
-        """The answer to an order that was sent."""
+        """Wait for the answer to an order that was sent."""
         text = f"Stepped for the {type(order).__name__} with ticket {order.ticket} of lane {order.lane}"
         return (yield from self.learner.expect(Stepped, Rule.ORDER_ANSWERED, text, ticket=order.ticket))
 
 
 def stepping(learner: Learner, *lanes: int, mode: Mode = "NextStep") -> Script[Stepping]:
-    """A new session of the environment profile, in which these lanes were reset."""
+    """Begin a new session of the environment profile, and reset these lanes."""
     env = yield from described(learner)
     yield from learner.joining()
     steps = Stepping(learner, env, mode)
@@ -138,7 +138,7 @@ def stepping(learner: Learner, *lanes: int, mode: Mode = "NextStep") -> Script[S
 
 
 def begins_in_its_session(learner: Learner) -> Script[None]:
-    """The client waits for the vector environment, which begins in the same session."""
+    """Let the client wait for the vector environment, then begin it in the same session."""
     env = yield from described(learner)
     steps = Stepping(learner, env)
     yield from begins(learner, steps.spec)
@@ -147,7 +147,7 @@ def begins_in_its_session(learner: Learner) -> Script[None]:
 
 
 def answers_reset_and_step(learner: Learner) -> Script[None]:
-    """The first orders of a lane."""
+    """Send the first orders of a lane."""
     steps = yield from stepping(learner)
     first = yield from steps.do(steps.reset())
     if first.reward.any() or first.terminated.any() or first.truncated.any():
@@ -157,19 +157,19 @@ def answers_reset_and_step(learner: Learner) -> Script[None]:
 
 
 def says_nothing_without_an_order(learner: Learner) -> Script[None]:
-    """No Stepped before the first Reset."""
+    """Send no order, and expect no Stepped."""
     yield from stepping(learner)
     yield from learner.quiet(Stepped, Rule.ORDER_ONLY, "nothing before the first order of the session", for_s=1.0)
 
 
 def ends_episodes(learner: Learner) -> Script[None]:
-    """A walk with random actions: ends of episodes, and the resets that follow them."""
+    """Step with random actions, and check the ends of episodes and the resets that follow them."""
     steps = yield from stepping(learner)
     longest = steps.env.max_episode_steps
     before = yield from steps.do(steps.reset())
     length = np.zeros(steps.spec.lanes[0], int)
     ends = 0
-    around: list[tuple[bytes, bytes]] = []  # the last observation of an episode, the first one of the next
+    around: list[tuple[bytes, bytes]] = []  # the last observation of an episode, the first one of the next episode
     for _ in range(WALK_STEPS):
         row = yield from steps.do(steps.step())
         ended = before.terminated | before.truncated
@@ -199,9 +199,9 @@ def ends_episodes(learner: Learner) -> Script[None]:
 
 
 def resets_otherwise(learner: Learner, mode: Mode) -> Script[None]:
-    """The same seeds and actions with NextStep, and then with another autoreset mode, until an episode has ended.
+    """Use the same seeds and actions with autoreset mode NextStep and then with `mode`, until an episode has ended.
 
-    So the last observation of an episode and the first one of the next are known.
+    NextStep gives the last observation of the episode and the first one of the next, to compare with.
     """
     steps = yield from stepping(learner)
     row = yield from steps.do(steps.reset())
@@ -247,7 +247,7 @@ def _numbers_of_copy(row: Stepped, n: int) -> tuple[float, bool, bool]:
 
 
 def resets_with_options(learner: Learner) -> Script[None]:
-    """Bounds of the first state: the same for all copies, then those of each."""
+    """Reset with bounds of the first state as options: the same for all copies, then different ones for each copy."""
     env = yield from described(learner)
     if not is_gymnasium_pole(env):
         raise Skipped("the environment is not gymnasium's CartPole")
@@ -269,7 +269,7 @@ def _of_copy(row: Stepped, n: int) -> bytes:
 
 
 def _within(longest: int | None, length: Array, row: Stepped) -> None:
-    """An episode at the time limit has an end."""
+    """Raise `Broken` if an episode has reached the time limit and not ended."""
     if longest is None:
         return
     at_limit = (length >= longest) & ~(row.terminated | row.truncated)
@@ -283,7 +283,7 @@ def _within(longest: int | None, length: Array, row: Stepped) -> None:
 
 
 def truncates_at_the_limit(learner: Learner) -> Script[None]:
-    """A walk to the time limit."""
+    """Step until an episode reaches the time limit."""
     longest = yield from time_limit(learner)
     steps = yield from stepping(learner)
     act = controller(steps)
@@ -305,7 +305,10 @@ def truncates_at_the_limit(learner: Learner) -> Script[None]:
 
 
 def controller(steps: Stepping) -> Callable[[Stepped], tuple[Array, ...]]:
-    """What chooses actions for long episodes: for a cart with a pole (Box(4), Discrete(2)) it balances the pole."""
+    """A function that chooses actions for long episodes.
+
+    It balances the pole if the spaces are those of CartPole, Box(4) and Discrete(2). Otherwise, actions are random.
+    """
     observation, *more = steps.spec.observation
     action, *others = steps.spec.action
     is_pole = not more and not others and observation.shape == (4,) and action.kind == "discrete" and action.sizes == (2,)
@@ -317,7 +320,7 @@ def controller(steps: Stepping) -> Callable[[Stepped], tuple[Array, ...]]:
 
 
 def begins_the_same_episode_for_a_seed(learner: Learner) -> Script[None]:
-    """The same seeds twice."""
+    """Reset twice with the same seeds."""
     steps = yield from stepping(learner)
     one = yield from steps.do(steps.reset(seed=11))
     yield from steps.do(steps.step())
@@ -331,7 +334,9 @@ def _same(one: Stepped, other: Stepped) -> bool:
 
 
 def keeps_copies_apart(learner: Learner) -> Script[None]:
-    """All copies have one seed and the same actions, then others; then some copies have those and the rest have these."""
+    """Give all copies the same seed and actions; then all another seed and other actions; then half of them the first, and
+    half the second. Each copy must observe the same as before.
+    """
     steps = yield from stepping(learner)
     N = steps.spec.lanes[0]
     if N < 2:
@@ -340,7 +345,7 @@ def keeps_copies_apart(learner: Learner) -> Script[None]:
     plans = [[steps.random_actions(1) for _ in range(APART_STEPS)] for _ in seeds]
 
     def play(of_copy: Sequence[int]) -> Script[list[Stepped]]:
-        """What the copies answer if each has the seed and the actions of its plan."""
+        """The answers if copy n has the seed and the actions of plan `of_copy[n]`."""
         first = yield from steps.do(replace(steps.reset(), seeds=tuple(seeds[plan] for plan in of_copy)))
         rest = yield from steps.walk(
             [
@@ -363,7 +368,7 @@ def keeps_copies_apart(learner: Learner) -> Script[None]:
 
 
 def executes_an_order_once(learner: Learner) -> Script[None]:
-    """Orders are repeated, because their answers were lost."""
+    """Send orders again, as if their answers had been lost. The client must execute each order only once."""
     steps = yield from stepping(learner)
     actions = [steps.random_actions(steps.spec.lanes[0]) for _ in range(3)]
     yield from steps.do(steps.reset(seed=3))
@@ -391,7 +396,7 @@ def _again(learner: Learner, order: Reset | Step) -> Script[None]:
 
 
 def ignores_an_old_order(learner: Learner) -> Script[None]:
-    """A late copy of an order that others followed."""
+    """Send a late copy of an order after newer orders."""
     steps = yield from stepping(learner)
     first = steps.reset()
     yield from steps.do(first)
@@ -402,11 +407,11 @@ def ignores_an_old_order(learner: Learner) -> Script[None]:
 
 
 def ignores_another_session(learner: Learner) -> Script[None]:
-    """Orders of the session before. Its steps still count."""
+    """Send orders of the session before. Heartbeats must still count its steps."""
     old = yield from stepping(learner, 0)
     before = learner.session
     yield from old.do(old.step())
-    for _ in range(4):  # some may have been on their way
+    for _ in range(4):  # some Heartbeats may have been on their way before the Step
         heartbeat = yield from heartbeats(learner, 1)
         if heartbeat.steps:
             break
@@ -420,7 +425,7 @@ def ignores_another_session(learner: Learner) -> Script[None]:
 
 
 def serves_two_lanes(learner: Learner) -> Script[None]:
-    """Orders of two lanes on their way at the same time."""
+    """Send orders for two lanes before waiting for the answers."""
     steps = yield from stepping(learner)
     for orders in (
         [steps.reset(0), steps.reset(1)],
@@ -435,7 +440,7 @@ def serves_two_lanes(learner: Learner) -> Script[None]:
 
 
 def starts_a_lane_again(learner: Learner) -> Script[None]:
-    """A higher incarnation, then an order of the lower one."""
+    """Send orders of a higher incarnation, then an order of a lower one."""
     steps = yield from stepping(learner, 0)
     yield from steps.do(steps.step())
     yield from steps.do(steps.reset(incarnation=2))
@@ -446,7 +451,7 @@ def starts_a_lane_again(learner: Learner) -> Script[None]:
 
 
 def resets_some_copies(learner: Learner) -> Script[None]:
-    """A Reset that lists one copy."""
+    """Send a Reset that lists only one copy."""
     steps = yield from stepping(learner)
     if steps.spec.lanes[0] < 2:
         raise Skipped("the lanes have one copy each (--copies)")
@@ -461,7 +466,7 @@ def resets_some_copies(learner: Learner) -> Script[None]:
 
 
 def answers_calls(learner: Learner) -> Script[None]:
-    """A Call of an attribute that every gymnasium environment has, and of two that none has."""
+    """Send a Call for an attribute that every gymnasium environment has, and for two that none has."""
     steps = yield from stepping(learner, 0)
     for name in ("render_mode", "no_such_attribute_anywhere", "…" * MAX_LINE):
         given = np.frombuffer(pack(((), {})), np.uint8)
@@ -479,7 +484,7 @@ def answers_calls(learner: Learner) -> Script[None]:
 
 
 def beats_while_it_steps(learner: Learner) -> Script[None]:
-    """Orders follow each other without a pause; the watch counts heartbeats meanwhile."""
+    """Send orders without a pause. Meanwhile, the watch checks that heartbeats arrive."""
     steps = yield from stepping(learner, 0)
     until_s = learner.now + 2 * 1.5 + 8 * learner.settings.heartbeat_s
     while learner.now < until_s:
@@ -487,7 +492,7 @@ def beats_while_it_steps(learner: Learner) -> Script[None]:
 
 
 def lists_its_tickets(learner: Learner) -> Script[None]:
-    """Heartbeats after answers: nothing is held any more."""
+    """Wait for Heartbeats after all orders were answered. They must list no ticket."""
     yield from stepping(learner, 0)
     heartbeat = yield from heartbeats(learner, 3)
     if heartbeat.tickets:
@@ -495,7 +500,7 @@ def lists_its_tickets(learner: Learner) -> Script[None]:
 
 
 def releases_a_lane(learner: Learner) -> Script[None]:
-    """A lane goes to another worker, and comes back later."""
+    """Release a lane, as if it went to another worker, and give it back later."""
     steps = yield from stepping(learner, 0, 1)
     learner.send(steps.step(0))  # it may be answered or not
     learner.send(Release(learner.session, (LaneIncarnation(0, 0),)))
@@ -513,9 +518,9 @@ def releases_a_lane(learner: Learner) -> Script[None]:
 
 
 def forgets_unlisted_lanes(learner: Learner) -> Script[None]:
-    """A Release was lost; the next HeartbeatReply does not list the lane."""
+    """Send no Release, as if it had been lost, and don't list the lane in the next HeartbeatReply."""
     steps = yield from stepping(learner, 0, 1)
-    learner.watch.sent(Release(learner.session, (LaneIncarnation(0, 0),)))  # and it is lost
+    learner.watch.sent(Release(learner.session, (LaneIncarnation(0, 0),)))  # tells only the watch, so the message is lost
     yield from heartbeats(learner, 3)
     yield from _has_no_copies(steps, Rule.UNLISTED)
     yield from steps.do(steps.step(1))
@@ -523,7 +528,7 @@ def forgets_unlisted_lanes(learner: Learner) -> Script[None]:
 
 
 def _has_no_copies(steps: Stepping, rule: Rule) -> Script[None]:
-    """Lane 0, whose copies had episodes, was closed: a Reset of one copy opens it again, with new ones, or is ignored."""
+    """Check that lane 0, whose copies had episodes, was closed: a Reset of one copy must be ignored, or make new copies."""
     order = steps.reset(copies=(0,))
     steps.learner.send(order)
     yield Wait(0.5, lambda event: isinstance(event, Heard) and getattr(event.message, "ticket", 0) == order.ticket)
@@ -534,7 +539,7 @@ def _has_no_copies(steps: Stepping, rule: Rule) -> Script[None]:
 
 
 def answers_after_a_reset_connection(learner: Learner) -> Script[None]:
-    """The connection is cut while an order is open."""
+    """Cut the connection while an order is unanswered."""
     steps = yield from stepping(learner, 0)
     order = steps.step()
     learner.send(order)
@@ -546,7 +551,7 @@ def answers_after_a_reset_connection(learner: Learner) -> Script[None]:
 
 
 def ignores_what_it_cannot_read(learner: Learner) -> Script[None]:
-    """An unknown type, an extra field, a missing frame, bytes that aren't msgpack."""
+    """Send an unknown type, an extra field, a missing frame, bytes that aren't msgpack, and so on."""
     steps = yield from stepping(learner, 0)
     order = steps.step()
     head = msgpack.unpackb(bytes(encode(order)[0]))
@@ -568,7 +573,7 @@ def ignores_what_it_cannot_read(learner: Learner) -> Script[None]:
 
 
 def reads_long_messages(learner: Learner) -> Script[None]:
-    """A Release with as many lanes as a head holds, and a frame of 8 MiB."""
+    """Send a Release with so many lanes that its head is almost as long as allowed, and Weights with a frame of 8 MiB."""
     steps = yield from stepping(learner, 0)
     learner.send(Release(learner.session, tuple(LaneIncarnation(1000 + lane, 0) for lane in range(60_000))))
     learner.send(Weights(1, np.zeros(1 << 21, np.float32), np.zeros(0, np.float32)))
@@ -576,7 +581,7 @@ def reads_long_messages(learner: Learner) -> Script[None]:
 
 
 def takes_a_late_welcome(learner: Learner) -> Script[None]:
-    """A copy of the Welcome arrives while the lane has an episode."""
+    """Send a copy of the Welcome during an episode."""
     steps = yield from stepping(learner)
     yield from steps.do(steps.reset(seed=9))
     expected = [steps.random_actions(steps.spec.lanes[0]) for _ in range(2)]
@@ -590,7 +595,7 @@ def takes_a_late_welcome(learner: Learner) -> Script[None]:
 
 
 def drains_while_it_steps(learner: Learner) -> Script[None]:
-    """Drain follows an order at once."""
+    """Send Drain right after an order."""
     steps = yield from stepping(learner, 0)
     order = steps.step()
     learner.send(order)

@@ -1,6 +1,6 @@
-"""Rules that hold for every message of a session, whatever the check is about. Pure: messages and `now` in, `Broken` out.
+"""Rules that apply to every message of a session, whatever is being checked. Pure: messages and `now` in, `Broken` out.
 
-The watch knows what the learner has sent in this session. It sees each message of the client before the check does.
+The watch records what the learner has sent in this session, and sees each message of the client before the check does.
 """
 
 from __future__ import annotations
@@ -49,8 +49,8 @@ from millrace.protocol.rows.stepped import wrong_rows
 from millrace.protocol.rules import Rule
 from millrace.protocol.specs import RunSpec, StepSpec, WaitSpec
 
-HEARTBEATS_LATE = 2.0  # of these may be missing,
-LATE_S = 1.5  # a busy machine may add this many seconds
+HEARTBEATS_LATE = 2.0  # a Heartbeat may be late by this many intervals,
+LATE_S = 1.5  # and by this many seconds more, because the machine may be busy
 OTHER_SESSION = Rule.OTHER_SESSION, "its session was another"
 UNREADABLE = Rule.IGNORE_UNREADABLE, "no message that names it can be read"
 
@@ -66,49 +66,51 @@ class WatchedSession:
     """One session, as the learner sees it."""
 
     def __init__(self, welcome: Welcome, now: float, steps: int = 0, *, is_first: bool = True) -> None:
-        """`steps`: env steps that the process has reported in earlier sessions. `is_first`: it had none."""
+        """`steps`: number of env steps that the client's process reported in earlier sessions. `is_first`: whether this is
+        the first session of the process.
+        """
         self.welcome = welcome
-        """the newest"""
+        """the newest Welcome"""
         self.session = welcome.session
         self.run = welcome.run
         self._is_first_session = is_first
         self.heard_heartbeat_s = now
         self.heartbeat: Heartbeat | None = None
-        """the newest"""
+        """the newest Heartbeat"""
         self.replies = 0
-        """number of the last HeartbeatReply sent"""
+        """number of the last HeartbeatReply that was sent"""
         self.confirms = True
-        """False: the learner says of no rollout that it has arrived"""
+        """whether the learner confirms that rollouts have arrived"""
         self.versions: dict[int, Weights] = {}
         """the weights sent, by version"""
         self.descriptions: dict[int, Describe] = {}
-        """orders to describe, by ticket"""
+        """the orders to describe the environment, by ticket"""
         self.orders: dict[int, Order | Evaluate] = {}
-        """by ticket"""
+        """the other orders, by ticket"""
         self.permits: dict[int, Dealt] = {}
-        """by ticket"""
+        """the permits, by ticket"""
         self.answers: dict[int, Answer | Rollout] = {}
         """the first answer to each order, and the first rollout of each permit, by ticket"""
         self.played: dict[int, PlayedRows] = {}
         """the newest answer to each Evaluate, by ticket"""
         self.said_goodbye = False
         self._refused = self._drains = False  # whether the learner has sent Refuse, or Drain
-        self._welcomed = -1  # number of the last reply before the Welcome that brought the run; -1: it was the first one
+        self._welcomed = -1  # number of the last reply before the Welcome with the run; -1 if that was the first Welcome
         self._described: dict[int, Described] = {}  # the first answer to each Describe
         self._ignored: dict[int, tuple[Rule, str]] = {}  # tickets that must not be answered: the rule, and why
-        self._lanes: dict[int, int] = {}  # the client's lanes, each in its highest incarnation
-        self._asked = Counter[int]()
-        self._answered = Counter[int]()
+        self._lanes: dict[int, int] = {}  # the highest incarnation of each of the client's lanes
+        self._asked = Counter[int]()  # how often each ticket was sent
+        self._answered = Counter[int]()  # how often each ticket was answered
         self._results: dict[int, Evaluated] = {}  # the first answer to each Evaluate
-        self._due: dict[int, int] = {}  # tickets that arrive before a later HeartbeatReply than this one
-        self._missing = set[int]()  # of these, those that the last Heartbeat should have listed, and did not
+        self._due: dict[int, int] = {}  # for each ticket, the number of the last HeartbeatReply that was sent before it
+        self._missing = set[int]()  # tickets that the last Heartbeat should have listed, but didn't
         self._next_sequence: dict[tuple[int, int], int] = {}
         self._rows: dict[tuple[int, int], LaneRows] = {}
         self.steps = steps
-        """the most that a Heartbeat has reported"""
+        """the largest number of env steps that a Heartbeat has reported"""
 
     def to_keep(self, *named: int) -> tuple[int, ...]:
-        """What an order that names these versions lists: these, and those that tickets without an answer name."""
+        """The versions that an order lists as those to keep: `named`, and the versions of all unanswered tickets."""
         of_permits = {ticket: dealt.version for ticket, dealt in self.permits.items()}
         of_orders = {ticket: order.version for ticket, order in self.orders.items() if isinstance(order, Evaluate)}
         answered = self.answers.keys() | self._results.keys()
@@ -118,14 +120,14 @@ class WatchedSession:
     # ------------------------------------------------------------------------------------------ what the learner says
 
     def sent(self, message: ToWorker) -> None:
-        """The learner has sent this message, which may be lost."""
+        """Record that the learner has sent this message, which may be lost."""
         match message:
             case Welcome(session, _, RunSpec() | StepSpec() as run) if session == self.session:
                 if isinstance(self.run, WaitSpec):
                     self.welcome = message
                     self.run = run
                     self._welcomed = self.replies
-                    self._due.clear()  # what is still to be described is not wanted any more
+                    self._due.clear()  # descriptions that haven't arrived are no longer needed
             case Describe() if message.session != self.session:
                 self._ignored[message.ticket] = OTHER_SESSION
             case Describe():
@@ -163,7 +165,7 @@ class WatchedSession:
             self._due[ticket] = self.replies
 
     def loses(self) -> None:
-        """What was sent may be lost: the connection is cut."""
+        """Record that messages which were sent may be lost, because the connection is cut."""
         self._due.clear()
 
     def _asks(self, order: Order | Permit) -> None:
@@ -174,11 +176,11 @@ class WatchedSession:
             self._ignored[order.ticket] = Rule.INCARNATION, why
 
     def unreadable(self, ticket: int) -> None:
-        """The learner sends this ticket in messages that cannot be read."""
+        """Record that the learner sends this ticket in messages that can't be read."""
         self._ignored[ticket] = UNREADABLE
 
     def received(self) -> tuple[Received, ...]:
-        """What the learner says of each lane of the client: the rollouts that have arrived."""
+        """For each lane of the client, the number of rollouts whose arrival the learner confirms."""
         arrived = self._next_sequence if self.confirms else {}
         return tuple(Received(*place, arrived.get(place, 0)) for place in sorted(self._lanes.items()))
 
@@ -268,7 +270,10 @@ class WatchedSession:
             )
 
     def _see_if_all_are_listed(self, message: Heartbeat) -> None:
-        """A ticket that came before the last reply is listed until it is answered; by two threads perhaps one beat later."""
+        """Check that the Heartbeat lists every ticket that was sent before the last reply and isn't answered.
+
+        A client with two threads may list a ticket one Heartbeat later.
+        """
         missing = {
             ticket
             for ticket, replies in self._due.items()
@@ -280,7 +285,10 @@ class WatchedSession:
         self._missing = missing
 
     def rule_of_missing(self, ticket: int, otherwise: Rule) -> Rule:
-        """The rule that is likely broken if a ticket leads to nothing: in a later session, a lane's first may seem old."""
+        """The rule that is probably broken if the client does nothing about a ticket.
+
+        In a later session, a client that didn't forget the session before may take a lane's first permit for an old one.
+        """
         is_old = not self._is_first_session and ticket in self.permits and not self.permits[ticket].permit.sequence
         return Rule.FORGETS if is_old else otherwise
 
@@ -362,7 +370,10 @@ class WatchedSession:
             raise Broken(Rule.LANES if isinstance(order, Permit) else Rule.ORDER_ANSWERED, expected, f"lane {message.lane}")
 
     def _is_first(self, message: Answer | Rollout, too_often: Rule, differs: Rule) -> bool:
-        """Whether its ticket was not answered before. The rules: for too many answers, and for one that differs."""
+        """Whether this is the first answer to its ticket.
+
+        Raises `Broken` with the rule `too_often` if there are too many answers, or `differs` if it isn't like the first one.
+        """
         ticket = message.ticket
         self._answered[ticket] += 1
         asked = self._asked[ticket]
@@ -419,13 +430,13 @@ class WatchedSession:
         rows.see(message, self.versions[message.version])
 
     def _continued(self, permit: Permit) -> LaneRows:
-        """The rows of the lane in the newest incarnation before that of this permit, which continues them."""
+        """The rows that this permit continues: those of its lane in the newest incarnation so far."""
         newest = max(incarnation for lane, incarnation in self._rows if lane == permit.lane)
         return self._rows[permit.lane, newest]
 
 
 def fields_that_differ(one: Answer | Rollout, other: Answer | Rollout) -> list[str]:
-    """Names of the fields of two messages that have not the same bits."""
+    """Names of the fields that differ between two messages, bit for bit."""
     return [name for name in one.__struct_fields__ if _bits(getattr(one, name)) != _bits(getattr(other, name))]
 
 
@@ -439,7 +450,7 @@ def _bits(value: object) -> object:
 
 
 def check_stepped(message: Stepped, spec: StepSpec) -> None:
-    """Raise `Broken` if the arrays are not those of the lane."""
+    """Raise `Broken` if the arrays don't have the dtypes and shapes of the lane, or values outside their spaces."""
     if why := wrong_rows(message, spec, axes=None):
         raise Broken(Rule.STEPPED_ARRAYS, "arrays of the lane", why)
     if why := wrong_rows(message, spec, axes=("copy",)):
@@ -449,8 +460,10 @@ def check_stepped(message: Stepped, spec: StepSpec) -> None:
 
 
 def resets_too_early(around: Sequence[tuple[bytes, bytes]]) -> bool:
-    """Whether the last observation of every episode that terminated is the first one of the next: the copy was reset too
-    early. `around`: these pairs. If all episodes begin in the same way, that says nothing.
+    """Whether the copy was reset too early: the last observation of every episode equals the first one of the next episode.
+
+    `around`: pairs of these observations, for episodes that terminated. False if all episodes begin in the same way,
+    because then the pairs show nothing.
     """
     first = {after for _, after in around}
     return len(around) >= 3 and len(first) > 1 and all(last == after for last, after in around)
