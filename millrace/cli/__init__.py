@@ -1,1 +1,1 @@
-"""The command line `millrace COMMAND`: `main` runs the command, and the other modules hold flags and longer commands."""
+"""The command line `millrace COMMAND`: `main` runs the command, and the other modules contain flags and commands."""

@@ -1,4 +1,4 @@
-"""`millrace bench`: start the benchmarks in their own process. They use this package and are not installed with it."""
+"""`millrace bench`: starts the benchmarks in their own process. They use this package, but aren't installed with it."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from millrace.protocol.errors import UsageError
 
 
 def run(argv: list[str]) -> int:
-    """Run them. Returns the exit code."""
+    """Run the benchmarks. Returns the exit code."""
     places = (INSTALLED_IN, Path.cwd())
     repository = next((folder for folder in places if (folder / "benchmarks" / "program.py").is_file()), None)
     if repository is None:
         if asks_for_help(argv):
             show_help("bench", f"{COMMANDS['bench'].about.capitalize()}.", {})
         raise UsageError("bench: not part of the installed package; run it in a clone of the repository (make bench)")
-    # Only the repository is added to the path, and not the current folder, whose modules aren't millrace's (-P).
+    # -P keeps the current folder out of the path, because its modules aren't millrace's. Only the repository is added.
     path = os.pathsep.join(filter(None, [str(repository), os.environ.get("PYTHONPATH")]))
     flags = [flag for flag in argv if flag != "--debug"]  # a flag of `millrace` itself
     command = [sys.executable, "-P", "-m", "benchmarks.program", *flags]
@@ -29,6 +29,6 @@ def run(argv: list[str]) -> int:
         try:
             return process.wait()
         except KeyboardInterrupt:
-            process.terminate()  # it then ends the benchmark that it runs
+            process.terminate()  # the process then also ends the benchmark that it runs
             process.wait()
             raise

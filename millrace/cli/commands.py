@@ -1,9 +1,7 @@
-"""The commands of `millrace`: their groups, and the function that runs each.
+"""The commands of `millrace`, in groups, with the function that runs each. They include the commands of millrace's extras.
 
-The commands of millrace's extras are in the same table.
-
-Rule: a command's module is imported when the command runs, so that `--help` is fast, and a machine with only a worker's
-packages can run the commands that need no others. Other packages install commands as entry points of the group
+Rule: a command's module is imported only when the command runs, so that `--help` is fast, and so that a machine with only a
+worker's packages can run the commands that need no others. Other packages install commands as entry points of the group
 `millrace.commands`, which are read for `--help` and for a name that isn't built in.
 """
 # ruff: noqa: E501
@@ -29,7 +27,7 @@ class Command(NamedTuple):
 
 
 # fmt: off
-GROUPS = {  # one line a command
+GROUPS = {  # one line for each command
     "Train": {
         "train": Command("millrace.cli.train:train", "ENV [flags]", "train on this machine: a learner and its worker processes"),
         "plan": Command("millrace.cli.plan:run", "ENV [flags]", "step an environment here, and say what to choose and what to expect"),

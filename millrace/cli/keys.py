@@ -1,6 +1,6 @@
-"""`millrace keys`: who may join the learners of this machine. Returns lines; the command line prints them.
+"""`millrace keys`: manages the keys with which workers may join the learners of this machine.
 
-Rule: a secret is printed only if the user asked for it by name.
+Rule: a secret is printed only if the user asks for it with a flag.
 """
 
 from __future__ import annotations

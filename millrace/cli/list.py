@@ -1,4 +1,4 @@
-"""`millrace list`: a line for each run."""
+"""`millrace list`: prints a line for each run."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """The command line: finds the command, runs it, and turns an error into one line and an exit code.
 
-Rule: bad usage is one line on stderr and exit code 2. A run that failed is one line (and the worker's traceback below it,
-if there is one) and exit code 1. Ctrl-C is exit code 130. A traceback of millrace itself is shown only with --debug. A run
-continues if standard error or standard output cannot be written; that text is dropped.
+Rule: wrong usage gives one line on stderr and exit code 2. A failed run gives one line (with the worker's traceback below
+it, if there is one) and exit code 1. Ctrl-C gives exit code 130. A traceback of millrace itself is shown only with --debug.
+If standard error or standard output can't be written, the text is dropped and the run continues.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from millrace.protocol.errors import UsageError, UserFacingError, did_you_mean, 
 
 ABOUT = "Worker processes step copies of a gymnasium environment; one learner trains a policy in PyTorch."
 INSTALLED_IN = Path(__file__).parents[2]
-"""The folder that holds `millrace`"""
+"""The folder that contains the package `millrace`"""
 NOT_IN_WORKERS = {
     "rich",
     "safetensors",
@@ -32,19 +32,19 @@ NOT_IN_WORKERS = {
     "tomli_w",
     "torch",
 }
-"""Packages that the learner needs and a worker does not. An installation only for workers lacks them."""
+"""Packages that a learner needs but a worker doesn't. An installation only for workers lacks them."""
 
 
 def main(argv: list[str] | None = None) -> int:
     """Run the command line. Returns the exit code."""
     argv = sys.argv[1:] if argv is None else argv
-    if argv[:1] == ["--debug"]:  # every command accepts it among its own flags
+    if argv[:1] == ["--debug"]:  # move it behind the command, because every command accepts it
         end = argv.index("--") if "--" in argv else len(argv)
         argv = [*argv[1:end], "--debug", *argv[end:]]
     with suppress(OSError):  # the current folder may have been deleted
         here = Path.cwd()
         if any(map(is_run_folder, (here, *here.parents))):
-            sys.path[:] = [entry for entry in sys.path if entry not in ("", str(here))]  # never import from there
+            sys.path[:] = [entry for entry in sys.path if entry not in ("", str(here))]  # never import from a run folder
         elif str(here) not in sys.path:
             sys.path.insert(_end_of_installed(), str(here))  # so that a user's module is found but hides no installed module
     prepare_streams()
@@ -53,9 +53,9 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _end_of_installed() -> int:
-    """Where in `sys.path` the installed modules end: before a clone that millrace is installed from, else at the end.
+    """The index in `sys.path` at which the installed modules end: before the clone from which millrace is installed, if any.
 
-    A clone has more folders than `millrace`, which must not hide the user's `learner.py` or `tests`.
+    A clone contains other folders than `millrace`, which must not hide the user's `learner.py` or `tests`.
     """
     if (INSTALLED_IN / "millrace" / "learner").is_symlink() and str(INSTALLED_IN) in sys.path:
         return len(sys.path) - 1 - sys.path[::-1].index(str(INSTALLED_IN))
@@ -63,7 +63,7 @@ def _end_of_installed() -> int:
 
 
 def _exit_code(argv: list[str]) -> int:
-    """Run the command line and print its error, if any."""
+    """Run the command line and print its error, if any. Returns the exit code."""
     try:
         exit_code = _dispatch(argv)
         sys.stdout.flush()
@@ -76,7 +76,7 @@ def _exit_code(argv: list[str]) -> int:
     except KeyboardInterrupt as interrupt:
         _print_error(last_line("millrace", interrupt, elsewhere=_elsewhere(argv)))
         return _failed(argv, 130)
-    except BrokenPipeError:  # nobody reads the output any more (`| head`), so a message is useless
+    except BrokenPipeError:  # nothing reads the output any longer (`| head`), so print no message
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except OSError as error:
@@ -85,7 +85,7 @@ def _exit_code(argv: list[str]) -> int:
             return _failed(argv, ours.exit_code)
         if error.filename is not None or error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EIO):
             return _internal_error(argv, error)
-        _print_error(f"millrace: standard output: {error.strerror}")  # an error of a file has the file's name
+        _print_error(f"millrace: standard output: {error.strerror}")  # an error about a file would contain its name
         return _failed(argv, 1)
     except ModuleNotFoundError as error:
         if error.name not in NOT_IN_WORKERS:
@@ -117,7 +117,7 @@ def _dispatch(argv: list[str]) -> int:
 
 
 def _overview() -> str:
-    """The groups of commands, a line for each command."""
+    """The text of `millrace --help`: the groups of commands, with a line for each command."""
     groups = GROUPS | {"From other packages": installed} if (installed := installed_commands()) else GROUPS
     width = max(len(f"{name} {command.arguments}") for commands in groups.values() for name, command in commands.items())
     lines = ["usage: millrace COMMAND [arguments]", "", ABOUT]
@@ -131,11 +131,11 @@ def _overview() -> str:
 
 
 def _print_error(line: str) -> None:
-    print(escaped(line), file=sys.stderr)  # it may quote a worker
+    print(escaped(line), file=sys.stderr)  # escaped, because it may quote a worker
 
 
 def _elsewhere(argv: list[str]) -> bool:
-    """Whether this command line starts a learner whose workers are started elsewhere; a resumed run stays such a learner."""
+    """Whether this command line starts a learner without local workers; to resume its run, the same command is needed."""
     return argv[:1] == ["learner"]
 
 

@@ -1,4 +1,4 @@
-"""`millrace plan`: measure an environment here, and show what to choose for a run and what to expect of it."""
+"""`millrace plan`: measures an environment on this machine, and recommends settings, with the speed to expect."""
 
 from __future__ import annotations
 

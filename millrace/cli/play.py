@@ -1,4 +1,4 @@
-"""`millrace evaluate`: play greedy episodes of a run's policy."""
+"""`millrace evaluate`: plays greedy episodes of a run's policy."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from millrace.terminal import count_line
 
 
 def evaluate(argv: list[str]) -> int:
-    """Play, and print the policy's result. Returns the exit code."""
+    """Play the episodes, and print the evaluation. Returns the exit code."""
     flags = parse_flags(EvaluateFlags, argv, "evaluate")
-    from millrace.playing import play  # takes 0.2 s to import: not before the flags are known to be right
+    from millrace.playing import play  # takes 0.2 s, so only if the flags are right
 
     with count_line("evaluating") as watch:
         evaluation, videos = play(flags, watch)

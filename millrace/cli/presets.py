@@ -1,4 +1,4 @@
-"""`millrace presets`: settings that are known to work."""
+"""`millrace presets`: lists settings that are known to work."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ class PresetsFlags(msgspec.Struct, frozen=True):
 
 
 def run(argv: list[str]) -> int:
-    """List them. Returns the exit code."""
+    """List the presets. Returns the exit code."""
     parse_flags(PresetsFlags, argv, "presets")
     print("Used unless --preset says otherwise, by environment and algorithm:\n")
     for algo, env in algorithms_and_environments():

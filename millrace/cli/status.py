@@ -1,9 +1,9 @@
-"""`millrace status ADDRESS|RUN`: ask a learner for the state of its run and print it. Needs only a worker's packages.
+"""`millrace status ADDRESS|RUN`: asks a learner for the state of its run and prints it. Needs only a worker's packages.
 
-If no process trains the run, this prints the last state in its folder.
+If no process trains the run, this prints the last state in the run's folder.
 
 Rule: anyone who may connect may ask, and asking changes nothing. If a learner doesn't answer within the deadline, the error
-is one line. Names that a peer has chosen can't control the terminal.
+is one line. Names that a peer has chosen are escaped, so that they can't control the terminal.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ from millrace.protocol.wire.worker_link import OF_OBSERVER, WorkerLink
 from millrace.workers.conversation.connection_rules import checked_token
 
 ASK_AGAIN_S = WATCH_EVERY_S = 1.0
-LEFT_ALIGNED = ("worker", "host", "lanes", "doing")  # columns of words; columns of numbers are right-aligned
+LEFT_ALIGNED = ("worker", "host", "lanes", "doing")  # columns of words; columns of numbers are aligned to the right
 
 
 class StatusFlags(msgspec.Struct, frozen=True, kw_only=True):
@@ -73,7 +73,7 @@ def run(argv: list[str]) -> int:
 
 
 def status(argv: list[str], out: TextIO) -> None:
-    """Run the command. Raises `UsageError`, or `RunError` when the learner does not answer."""
+    """Run the command, and write to `out`. Raises `UsageError`, or `RunError` if the learner doesn't answer."""
     values = parse_flags(StatusFlags, argv, "status")
     if "://" not in values.address and (last := last_state(Path(values.address))) is not None:
         out.write(f"{last_in_json(last) if values.json else in_sentences(last)}\n")
@@ -98,15 +98,15 @@ def status(argv: list[str], out: TextIO) -> None:
 
 
 def last_state(run: Path) -> RunLine | None:
-    """The last state of a run that no process trains; None if one seems to train it, or it isn't a run."""
+    """The last state of a run that no process trains; None if a process seems to train it, or if it isn't a run."""
     line = read_line(run, time.time()) if is_run_folder(run) else None
     return None if line is None or line.state in ("training", "unreadable") else line
 
 
 def whom_to_ask(where: str, token: Token | None, *, insecure: bool) -> tuple[str, Token | None]:
-    """The address of a learner, and the token with which to connect. `where`: its address, or the folder of its run.
+    """The address of a learner, and the token to connect with. `where`: the learner's address, or the folder of its run.
 
-    A run folder names the learner's key folder, whose token is used if `token` is None. Raises `UsageError`.
+    A run folder names the learner's key folder. If `token` is None, a token from that folder is used. Raises `UsageError`.
     """
     if "://" in where:
         return where, checked_token(where, token, insecure=insecure)
@@ -119,7 +119,7 @@ def whom_to_ask(where: str, token: Token | None, *, insecure: bool) -> tuple[str
 
 
 def token_of_learner(run: str, folder: Path) -> Token:
-    """A token from the learner's key folder. Raises `UsageError` if there is none on this machine."""
+    """A token from the learner's key folder. Raises `UsageError` if this machine has none."""
     keys = KeyFolder(folder)
     try:
         path = keys.first_token(keys.allowed())
@@ -138,12 +138,12 @@ def token_of_learner(run: str, folder: Path) -> Token:
 
 
 def observer_name() -> str:
-    """A routing name that no worker has."""
+    """A name for the connection that differs from the names of all workers."""
     return f"status-{socket.gethostname()}-{os.getpid()}-{os.urandom(3).hex()}"
 
 
 def ask(link: WorkerLink, timeout_s: float, clock: Callable[[], float] = time.monotonic) -> Status:
-    """Ask the learner for its status. Raises `RunError` if no answer comes within `timeout_s`."""
+    """Ask the learner for its status. Raises `RunError` if it doesn't answer within `timeout_s`."""
     deadline_s = clock() + timeout_s
     while (left_s := deadline_s - clock()) > 0:
         link.send(encode(Inquire()))
@@ -158,18 +158,18 @@ def ask(link: WorkerLink, timeout_s: float, clock: Callable[[], float] = time.mo
 
 
 def in_json(status: Status) -> str:
-    """One line of JSON. Every field has its name, which the message itself leaves out."""
+    """The status as one line of JSON, with the names of all fields (the message itself has only values)."""
     return msgspec.json.encode({"type": Status.__name__, **msgspec.structs.asdict(status)}).decode()
 
 
 def last_in_json(line: RunLine) -> str:
-    """One line of JSON about a run that nobody trains."""
+    """One line of JSON about a run that no process trains."""
     known = {"type": "LastState"} | line._asdict() | {"path": str(line.path)}
     return msgspec.json.encode({name: value for name, value in known.items() if name not in ("owner", "problem")}).decode()
 
 
 def as_table(status: Status) -> str:
-    """A line about the run, who waits for whom, a table of its workers, how many there could be, and what went wrong."""
+    """The status as text: a line about the run, who waits for whom, a table of workers, and what went wrong."""
     late = any(worker.late_actions for worker in status.workers)
     wanted = f"workers: {workers_here(status)}\n" if status.workers_wanted else ""
     held_up = bottleneck(status.progress)
@@ -206,7 +206,7 @@ def _run_line(status: Status) -> str:
 
 
 def _cells(worker: WorkerStatus, version: int, late: bool) -> dict[str, str]:
-    """A row of the table, by column. `late`: with the column of late actions."""
+    """A row of the table, by column. `late`: include the column of late actions."""
     return {
         "worker": _printable(worker.worker) + (f" ({worker.strikes} strikes)" if worker.strikes else ""),
         "host": _printable(worker.host),
@@ -222,7 +222,7 @@ def _cells(worker: WorkerStatus, version: int, late: bool) -> dict[str, str]:
 
 
 def table(rows: Sequence[dict[str, str]], left_aligned: Sequence[str], empty: str) -> list[str]:
-    """Lines: the names of the columns, then each row; `empty` if there is none."""
+    """The lines of a table: the names of the columns, followed by the rows; `empty` if there are no rows."""
     if not rows:
         return [empty]
     widths = {name: max(len(name), *(len(row[name]) for row in rows)) for name in rows[0]}
@@ -235,5 +235,5 @@ def table(rows: Sequence[dict[str, str]], left_aligned: Sequence[str], empty: st
 
 
 def _printable(text: str) -> str:
-    """A peer's text with control characters escaped."""
+    """A text from a peer, with control characters escaped."""
     return "".join(each if each.isprintable() else each.encode("unicode_escape").decode() for each in text)

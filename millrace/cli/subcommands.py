@@ -1,4 +1,4 @@
-"""Commands with subcommands: which one is meant, and the help that lists them."""
+"""Commands with subcommands: finds the subcommand, and prints the help that lists them all."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`millrace train` and `millrace learner`: a learner, with its worker processes on this machine or without any."""
+"""`millrace train` and `millrace learner`: run a learner, with worker processes on this machine or elsewhere."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def learner(argv: list[str]) -> int:
 
 def _train(argv: list[str], command: Literal["train", "learner"]) -> int:
     config, resume = read_config(command, argv)
-    from millrace.launch import training  # takes 0.2 s to import: not before the flags are known to be right
+    from millrace.launch import training  # takes 0.2 s, so only if the flags are right
 
     shown = ShownRun(argv, new=None if resume else config, command=command)
     with shown.progress() as watch:

@@ -1,6 +1,6 @@
-"""Shows the progress of a run that a command trains, and prints how it ended, and commands to continue with.
+"""Shows the progress of a run that a command trains; at its end, prints how it ended and what to do next.
 
-Rule: output that cannot be written is dropped; the run continues.
+Rule: output that can't be written is dropped, and the run continues.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ class ShownRun:
     """Shows the progress of a run, and prints how it ended."""
 
     def __init__(self, argv: list[str], new: Config | None = None, command: str = "train") -> None:
-        """`new`: the settings of a new run, whose origin is shown before its first progress.
+        """`new`: the settings of a new run, whose origin is shown before its first progress; None if the run is resumed.
 
-        `command`: the millrace command that resumes the run.
+        `command`: the millrace command that trains the run, and can resume it.
         """
         self._log_json = any(typed.name == "log_json" for typed in typed_flags(argv))
         self._new = new
@@ -47,7 +47,7 @@ class ShownRun:
 
     @contextmanager
     def progress(self) -> Iterator[Watch]:
-        """While it is entered, shows each progress that it is called with."""
+        """A context manager that yields a function, which shows each progress that it is called with."""
         with unfailing("stdout"), progress_view(self._log_json) as watch:
             yield watch if self._new is None else _after_origin(self._new, self._command, watch)
 
@@ -62,7 +62,7 @@ class ShownRun:
 
 
 def _after_origin(config: Config, command: str, watch: Callable[[Progress], None]) -> Callable[[Progress], None]:
-    """Wraps a function so that it first logs where the settings come from, and how many workers `train` has chosen."""
+    """Wrap `watch`, so that its first call also logs where the settings come from, and how many workers `train` chose."""
     workers = chosen_workers(config, usable_cores()) if command == "train" else ""
     lines = iter([joined(origin(config), workers)])
 
@@ -75,7 +75,7 @@ def _after_origin(config: Config, command: str, watch: Callable[[Progress], None
 
 
 def result(summary: Summary) -> list[str]:
-    """How a run ended, and its policy's results."""
+    """Lines about how a run ended and the evaluations of its policies."""
     lines = [f"{summary.stop_reason}: {summary.env_steps:,} env steps in {summary.wall_s:.1f} s"]
     if summary.evaluation is not None:
         others = "" if summary.ended_by is None else ", on other episodes than those that ended the run"
@@ -86,7 +86,7 @@ def result(summary: Summary) -> list[str]:
 
 
 def next_commands(run: Path, summary: Summary | None, command: str) -> list[str]:
-    """Shell commands: look at the run, play its policy, and, if it made all its steps, train it about twice as long."""
+    """Shell commands that show the run, play its policy, and, if it made all its steps, train it about twice as long."""
     where = shlex.quote(str(run))
     evaluated = None if summary is None else summary.evaluation
     against = " --against ANOTHER_RUN" if evaluated is not None and evaluated.score_interval is not None else ""

@@ -1,4 +1,4 @@
-"""`millrace worker`: workers that join a learner."""
+"""`millrace worker`: starts workers that join a learner."""
 
 from __future__ import annotations
 
@@ -6,5 +6,5 @@ from millrace.workers.__main__ import main
 
 
 def run(argv: list[str]) -> int:
-    """Work until the learner or the user ends it. Returns the exit code."""
+    """Run the workers until the learner or the user ends them. Returns the exit code."""
     return main(argv)

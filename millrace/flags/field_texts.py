@@ -1,4 +1,4 @@
-"""Reads the text under each field of a record, which is the help of its flag."""
+"""Reads the string under each field of a record in the source code, which is the help of the field's flag."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import msgspec
 
 
 def field_texts(record: type) -> dict[str, str]:
-    """The text under each field of a record in the source code, empty if it has none. Inherited fields come first."""
+    """The string under each field of a record, by the field's name; empty if there is none. Inherited fields come first."""
     texts: dict[str, str] = {}
     for base in reversed(record.__mro__):
         if base is msgspec.Struct or not issubclass(base, msgspec.Struct):
@@ -28,7 +28,7 @@ def _class_body(record: type) -> list[ast.stmt]:
     """The statements of a class; none if its source code can't be read, as for a class typed into a Python prompt."""
     try:
         source = inspect.getsource(record)
-        # The source of a class in a class is indented.
+        # The source of a nested class is indented.
         tree = ast.parse(f"if True:\n{source}" if source[:1].isspace() else source)
     except (OSError, TypeError, SyntaxError):
         return []

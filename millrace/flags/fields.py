@@ -1,7 +1,7 @@
 """Turns the fields of a record into flags.
 
-Rule: a field is a flag of the same name, with dashes. Its type says which values are allowed. `Annotated[..., Flag(...)]`
-says what neither name nor type can. A field that is itself a record isn't a flag.
+Rule: a field becomes a flag of the same name, with dashes. The field's type determines which values are allowed.
+`Annotated[..., Flag(...)]` adds what neither name nor type can express. A field that is itself a record isn't a flag.
 """
 
 from __future__ import annotations
@@ -20,48 +20,48 @@ NotNegative = Annotated[float, msgspec.Meta(ge=0)]
 
 @dataclass(frozen=True)
 class Flag:
-    """What a field says about its flag."""
+    """Properties of a flag, in the annotation of its field."""
 
     metavar: str = ""
-    """how the help shows its values; if empty, the type decides"""
+    """placeholder for the values in the help; if empty, it follows from the type"""
     alias: str = ""
-    """another name"""
+    """a second name of the flag"""
     positional: bool = False
-    """an argument without a flag"""
+    """whether this is a positional argument"""
     hidden: bool = False
-    """one process of millrace passes it to another; the help doesn't show it"""
+    """whether the help leaves it out, because only processes of millrace pass it to one another"""
 
 
 class FlagField(NamedTuple):
-    """A field of a record."""
+    """A field of a record, as a flag."""
 
     name: str
     hint: Any
-    """its type, with bounds"""
+    """the field's type, with bounds"""
     kind: Any
-    """its type without bounds and without None"""
+    """the field's type, without bounds and without None"""
     optional: bool
-    """whether it may be None, which is written as `none`"""
+    """whether the value may be None, which is written as `none`"""
     flag: Flag
 
     @property
     def written(self) -> str:
-        """Its name on the command line."""
+        """The flag's name on the command line; for a positional argument, its placeholder."""
         return self.metavar if self.flag.positional else f"--{self.name.replace('_', '-')}"
 
     @property
     def many(self) -> bool:
-        """Whether several words follow the flag."""
+        """Whether several words may follow the flag."""
         return get_origin(self.kind) in (tuple, list, dict)
 
     @property
     def whole(self) -> bool:
-        """Whether its values are whole numbers."""
+        """Whether the values are whole numbers."""
         return (_plain(get_args(self.kind)[0])[0] if self.many else self.kind) is int
 
     @property
     def metavar(self) -> str:
-        """How the help shows the values; empty for a flag without values."""
+        """The placeholder for the values in the help; empty for a flag without values."""
         if self.flag.metavar:
             return self.flag.metavar
         if self.flag.positional:
@@ -70,9 +70,9 @@ class FlagField(NamedTuple):
         return f"{shown}|none" if self.optional else shown
 
 
-@cache  # each look-up evaluates the annotations of the whole record, which takes milliseconds
+@cache  # evaluating the annotations of a record takes milliseconds
 def fields_of(record: type[msgspec.Struct]) -> dict[str, FlagField]:
-    """The fields of a record by name, those of its bases first."""
+    """The fields of a record, by name. Fields of base classes come first."""
     found = {}
     for name, hint in get_type_hints(record, include_extras=True).items():
         kind, optional = _plain(hint)
@@ -89,7 +89,7 @@ def is_choice(hint: Any) -> bool:
 
 
 def choices(hint: Any) -> list[str]:
-    """The values that a type allows: a Literal, or a Literal or None."""
+    """The values that a type allows, as text. The type is a Literal, or a Literal or None."""
     kind, optional = _plain(hint)
     return [*map(str, get_args(kind)), *(["none"] if optional else [])]
 

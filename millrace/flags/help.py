@@ -1,4 +1,4 @@
-"""The help of a command: its usage, what it does, and its flags in groups. Pure except for the width of the terminal."""
+"""The help of a command: its usage, a description, and its flags in groups. Pure, except for the width of the terminal."""
 
 from __future__ import annotations
 
@@ -13,26 +13,26 @@ from millrace.flags.field_texts import field_texts
 from millrace.flags.fields import FlagField, fields_of
 
 WIDEST_COLUMNS = 120
-TEXT_COLUMN = 26  # where the texts begin
-NO_BREAK = "\0"  # a space at which no line breaks
+TEXT_COLUMN = 26  # column at which the help texts begin
+NO_BREAK = "\0"  # stands for a space at which a line must not break
 
 Group = tuple[type[msgspec.Struct] | msgspec.Struct, Sequence[str]]
-"""A record, or one with the values to show as defaults, and the names of the fields to show"""
+"""A record class, or a record whose values are shown as defaults; and the names of the fields to show"""
 
 
 class Entry(NamedTuple):
-    """A field in the help."""
+    """The entry of a field in the help."""
 
     field: FlagField
     text: str
     default: Any
-    """`msgspec.NODEFAULT` if there is none"""
+    """the default value; `msgspec.NODEFAULT` if there is none"""
     layered: bool
-    """whether the default may come from a preset or a file, so that there is also a flag to turn it off"""
+    """whether the default may come from a preset or a file; then a bool also has a flag that turns it off"""
 
 
 def help_text(command: str, about: str, groups: Mapping[str, Group]) -> str:
-    """The help. Positional arguments come first, whatever their group."""
+    """The text of the help. Positional arguments come first, whatever group they are in."""
     width = min(shutil.get_terminal_size().columns, WIDEST_COLUMNS)
     entries = {title: list(_entries(*group)) for title, group in groups.items()}
     arguments = [entry for each in entries.values() for entry in each if entry.field.flag.positional]
@@ -60,7 +60,7 @@ def _entries(record: type[msgspec.Struct] | msgspec.Struct, names: Sequence[str]
 
 
 def _heading(entry: Entry) -> str:
-    """The heading of a field: `--steps INT`."""
+    """The heading of an entry, such as `--steps INT`."""
     field = entry.field
     if field.flag.positional:
         return field.metavar if entry.default is msgspec.NODEFAULT else f"[{field.metavar}]"
@@ -71,7 +71,7 @@ def _heading(entry: Entry) -> str:
 
 
 def _lines(entry: Entry, width: int) -> list[str]:
-    """The heading and, beside or below it, the text and the default."""
+    """The lines of an entry: the heading, and next to it or below it the text with the default."""
     heading = f"  {_heading(entry)}"
     text = f"{entry.text}{_default(entry)}"
     lines = textwrap.wrap(text, width - TEXT_COLUMN, break_long_words=False, break_on_hyphens=False)
@@ -83,7 +83,7 @@ def _lines(entry: Entry, width: int) -> list[str]:
 
 
 def _folded(heading: str, width: int) -> list[str]:
-    """The lines of a heading. One that is too wide, for example because of many choices, is folded after a comma."""
+    """The lines of a heading. If it is too wide, for example because of many choices, it is folded after a comma."""
     if len(heading) <= width or "," not in heading[:width]:
         return [heading]
     end = heading.rindex(",", 0, width) + 1

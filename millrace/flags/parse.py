@@ -1,8 +1,8 @@
 """Parses a command line: its words become the values of its flags.
 
-Rules: a word that begins with a dash and isn't a number is a flag; other words are values of the flag before them, as many
-as it takes, or arguments. A value that begins with a dash is written after an equals sign: `--name=-x`. If a flag is given
-twice, the last one counts. Errors of the user are one line.
+Rules: a word that begins with a dash and isn't a number is a flag. Other words are values of the flag before them, up to the
+number of values that the flag takes; the rest are positional arguments. A value that begins with a dash is written after an
+equals sign: `--name=-x`. If a flag is given twice, the last one counts. Errors of the user are one line.
 """
 
 from __future__ import annotations
@@ -25,22 +25,22 @@ FlagsT = TypeVar("FlagsT", bound=msgspec.Struct)
 
 
 class Typed(NamedTuple):
-    """A flag as it was typed, and the words after it up to the next flag."""
+    """A flag as the user typed it, and the words between it and the next flag."""
 
     flag: str
-    """`--net`; empty for the words before the first flag"""
+    """the flag, such as `--net`; empty for the words before the first flag"""
     value: str | None
-    """the text after an equals sign, as in `--net=64`; None without one"""
+    """the text after an equals sign, as in `--net=64`; None if there is none"""
     words: list[str]
 
     @property
     def name(self) -> str:
-        """The name of its field."""
+        """The name of the flag's field."""
         return self.flag.lstrip("-").replace("-", "_")
 
 
 def parse_flags(record: type[FlagsT], argv: Sequence[str], command: str) -> FlagsT:
-    """The record that these words give. Raises `UsageError`, or SystemExit(0) after `--help`."""
+    """The record with the values that these words give. Raises `UsageError`, or SystemExit(0) after `--help`."""
     fields = fields_of(record)
     if asks_for_help(argv):
         show_help(command, " ".join((record.__doc__ or "").split()), {"flags": (record, list(fields))})
@@ -69,7 +69,7 @@ def cut_at_dashes(argv: Sequence[str]) -> tuple[list[str], list[str]]:
 
 
 def typed_flags(argv: Sequence[str]) -> list[Typed]:
-    """The flags that were typed, in order, whether they exist or not, preceded by the words before the first flag."""
+    """The flags that were typed, in order, even unknown ones. The first entry has the words before the first flag."""
     flags = [Typed("", None, [])]
     for word in argv:
         if word in EVERYWHERE:
@@ -83,7 +83,7 @@ def typed_flags(argv: Sequence[str]) -> list[Typed]:
 
 
 def first_words(flags: Sequence[Typed], *names: str) -> dict[str, str]:
-    """The value, or the first word, of each of these flags that has one."""
+    """The value, or the first word, of each of these flags that was typed with one, by name."""
     words = {}
     for typed in flags:
         if typed.name in names and (typed.value is not None or typed.words):
@@ -97,7 +97,10 @@ def given_values(
     command: str,
     hint: Callable[[str], str] = lambda name: "",
 ) -> dict[str, Any]:
-    """The values of the given fields. `hint` gets the name of an unknown flag, and returns the end of the error's line."""
+    """The values that were typed, by field. Raises `UsageError`.
+
+    `hint` takes the name of an unknown flag, and returns the end of the error's line.
+    """
     given: dict[str, Any] = {}
     arguments: list[str] = []
     for typed in flags:
@@ -129,7 +132,7 @@ def given_values(
 
 
 def is_flag(word: str) -> bool:
-    """Whether a word is a flag, not a value."""
+    """Whether a word is a flag rather than a value."""
     try:
         float(word)
     except ValueError:
@@ -138,7 +141,7 @@ def is_flag(word: str) -> bool:
 
 
 def _field(fields: Mapping[str, FlagField], name: str) -> FlagField | None:
-    """The field of this flag. A field that is true or false also has a flag that begins with `no`."""
+    """The field of this flag, if there is one. A bool field also has a flag that begins with `no`."""
     for field in fields.values():
         if name in (field.name, field.flag.alias) or (field.kind is bool and name == f"no_{field.name}"):
             return field

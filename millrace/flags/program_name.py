@@ -1,7 +1,7 @@
-"""How to type this program's name in the shell that started it, for lines that say what to type next.
+"""The name by which the user can start this program in a shell, for lines that say what to type next.
 
-Rule: printed commands work when typed. `millrace` works if the shell finds this very program under that name; in a clone
-whose virtual environment isn't active, it doesn't.
+Rule: printed commands work when the user types them. `millrace` works only if the shell finds this very program under that
+name; in a clone whose virtual environment isn't active, it doesn't.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ NAME = "millrace"
 
 
 def typed_name() -> str:
-    """The name that a user types. In a program of the user, or a notebook, the plain name."""
+    """The name to type. In the user's own program or a notebook, this is plain `millrace`."""
     started = Path(sys.argv[0] if sys.argv else "")
     if started.stem == NAME:
         return NAME if _is_found_as(NAME, started) else shlex.quote(str(started))
@@ -28,6 +28,9 @@ def typed_name() -> str:
 
 
 def _is_found_as(name: str, program: Path) -> bool:
-    """Whether the shell finds this program under this name. Links are not followed: two environments may share a Python."""
+    """Whether the shell finds this program under this name.
+
+    Links aren't followed, because the Pythons of two environments may be links to the same file.
+    """
     found = shutil.which(name)
     return found is not None and os.path.abspath(found) == os.path.abspath(program)

@@ -1,7 +1,8 @@
-"""Turns a word of `NAME VALUE ...` into a value, and a value into such a word.
+"""Turns a word in `NAME VALUE ...` into a value, and a value into such a word.
 
-Rule: a word that is a value in TOML is that value, as in a config file. Any other word is text. But a word that is a value
-in another language (`None`, `True`, `.5`) is refused, because nobody means it as text: the text "False" is true.
+Rule: a word that is a value in TOML is that value, as in a config file. Any other word is text, unless it is a value in
+another language (`None`, `True`, `.5`). Such a word is refused, because nobody means it as text: the text "False" would be
+true.
 """
 
 from __future__ import annotations
@@ -17,14 +18,14 @@ from millrace.protocol.errors import UsageError
 IN_TOML = {
     "true": "true", "yes": "true", "on": "true", "false": "false", "no": "false", "off": "false", "nan": "nan",
 }  # fmt: skip
-"""What to write for a word of another language, in lower case."""
+"""What to write in TOML for a word of another language. The keys are in lower case."""
 NOTHING = ("none", "null", "nil", "undefined")
 
 
 def read_word(word: str) -> object:
-    """The value of a word. Raises `UsageError`, which says what to write, for a word that is a value in another language."""
+    """The value of a word. If it is a value in another language, raises `UsageError`, which says what to write instead."""
     try:
-        # in a table of one line, so that the word can neither begin a comment nor another key
+        # The word is in a table of one line, so that it can begin neither a comment nor another key.
         table = tomllib.loads(f"one = {{value = {word}}}")
     except (ValueError, RecursionError):
         table = {}
@@ -37,7 +38,7 @@ def read_word(word: str) -> object:
 
 
 def as_text(word: str) -> str:
-    """What to type in a shell for this word as text, whatever it means in TOML."""
+    """What to type in a shell to give this word as text, even if it is a value in TOML."""
     return one_line(shlex.quote(_in_toml(word)), 60)
 
 
@@ -62,7 +63,7 @@ def _in_toml(value: object) -> str:
 
 
 def _what_to_write(word: str) -> str:
-    """The TOML for the value that this word has in another language; empty if it has none."""
+    """What to write in TOML for a word that is a value in another language; empty for any other word."""
     if word.lower() in IN_TOML:
         return f"write {IN_TOML[word.lower()]}"
     if word.lower() in NOTHING:

@@ -1,8 +1,8 @@
 """Turns words of a command line, or a keyword argument, into the value of a field, and values into a record.
 
-Rules: a whole number may be written as 1e6 or 1_000_000, and several as 64 64 or 64,64. The values of a table are written as
-in TOML (toml_words.py); those of any other field are parsed as its type. Values from Python and TOML are not parsed: the
-text "2.5" isn't a number.
+Rules: a whole number may be written as 1e6 or 1_000_000, and several as 64 64 or 64,64. The values in a table are written as
+in TOML (toml_words.py). The values of any other field are parsed by the field's type. Values from Python and TOML aren't
+parsed: there, the text "2.5" isn't a number.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ RecordT = TypeVar("RecordT", bound=msgspec.Struct)
 
 
 def read_words(field: FlagField, words: Sequence[str]) -> Any:
-    """The value that these words give. Raises `UsageError`."""
+    """The value of this field that the words give. Raises `UsageError`."""
     if field.optional and list(words) in (["none"], ["None"]):
         return None
     match get_origin(field.kind):
@@ -50,13 +50,13 @@ def read_words(field: FlagField, words: Sequence[str]) -> Any:
         return msgspec.convert(value, field.hint, strict=False, dec_hook=_path)
     except msgspec.ValidationError as error:
         expected = what_was_expected(str(error), field.hint)
-    except UnicodeEncodeError:  # a word, or a name of a file, may be any bytes
+    except UnicodeEncodeError:  # a word, such as a file's name, may contain any bytes
         expected = "expected text in UTF-8"
     raise UsageError(f"{field.written}: {expected}, got {shlex.join(words)}")
 
 
 def with_whole_numbers(field: FlagField, value: Any) -> Any:
-    """The value, with whole numbers that the user wrote as text or as a float converted, if the field has whole numbers."""
+    """The value. If the field takes whole numbers, numbers written as text or as a float such as 1e6 become int."""
     if not field.whole:
         return value
     if not field.many:
@@ -81,9 +81,9 @@ def _whole(value: Any) -> Any:
 
 
 def convert(values: Mapping[str, Any], record: type[RecordT], origins: Mapping[str, str]) -> RecordT:
-    """The record of these values from Python or TOML.
+    """Make the record of these values from Python or TOML. Raises `UsageError`.
 
-    Raises `UsageError`. `origins`: how an error refers to each value, by its name: `--max-lag`, or `my.toml: max_lag`.
+    `origins`: how an error refers to each value, such as `--max-lag` or `my.toml: max_lag`, by the value's name.
     """
     try:
         return msgspec.convert(values, record, dec_hook=_path)
@@ -95,14 +95,14 @@ def convert(values: Mapping[str, Any], record: type[RecordT], origins: Mapping[s
 
 
 def _path(kind: Any, value: object) -> Path:
-    """The path in a text. `kind` is `Path`, the only field type that msgspec doesn't know."""
+    """Convert text to a path, for msgspec. `kind` is always `Path`, the only field type that msgspec doesn't know."""
     if not isinstance(value, str | os.PathLike):
         raise TypeError("Expected `text or a path`")
     return Path(value)
 
 
 def what_was_expected(message: str, hint: Any) -> str:
-    """What was expected of a value, from msgspec's message and the type of the field."""
+    """The part `expected …` of an error line, made from msgspec's message and the type of the field."""
     if message.startswith("Invalid enum value") or (hint is not None and is_choice(hint)):
         return f"expected one of {', '.join(choices(hint))}"
     text = message.partition(" - at ")[0].replace(" | null", ' or "none"').replace("`object`", "table")
@@ -112,7 +112,7 @@ def what_was_expected(message: str, hint: Any) -> str:
 
 
 def _entry(field: FlagField, name: str, word: str) -> Any:
-    """The value of an entry of a table. Raises `UsageError`."""
+    """The value of an entry in a table. Raises `UsageError`."""
     try:
         value = read_word(word)
         return msgspec.convert(value, get_args(field.kind)[1])

@@ -92,7 +92,7 @@ class Collecting:
         return Weights(version, chosen, np.zeros(buffer_size(self.run.policy), np.float32), packed)
 
     def permit(self, lane: int = 0, incarnation: int = 0) -> Permit:
-        """The next permit for this lane. The first one of a higher incarnation tells the client to restart all its copies."""
+        """The next permit for this lane. The first one of a higher incarnation makes the client restart all its copies."""
         sequence = self._sequences[lane, incarnation]
         self._sequences[lane, incarnation] += 1
         permit = Permit(next(self.learner.tickets), lane, incarnation, sequence, round=sequence)

@@ -1,1 +1,1 @@
-"""Recorded episodes: Minari datasets, videos, and learning from a dataset."""
+"""Recorded episodes: writing Minari datasets and videos, and learning from a dataset."""

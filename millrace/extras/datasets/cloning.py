@@ -3,9 +3,9 @@
     L = −E[log π(a|o)] + vf_coef · E[(V(o) − G)²]     (SAC and TD3: without the critic)
     G = Σ γⁱ r over the rest of the episode, + γᵏ V(its last observation) if it was truncated
 
-Rule: a gradient step depends only on the demonstrations and the algorithm's saved state, which counts the steps made. So
-    interrupted cloning continues with the same bits. Therefore the order of each epoch is drawn from the seed and the
-    epoch's number.
+Rule: a gradient step depends only on the demonstrations and the algorithm's saved state, which counts the steps that were
+    made, so that interrupted cloning continues with the same bits. This is why the order of rows in an epoch is sampled from
+    the seed and the epoch's number.
 """
 
 from __future__ import annotations
@@ -29,19 +29,19 @@ from millrace.protocol.policy.torch_distributions import policy_log_prob
 from millrace.protocol.random_streams import Purpose, generator
 from millrace.protocol.rollout import Batch
 
-BATCH_SIZE = 64  # rows of a minibatch; the batch size of updates is often larger, and would need more epochs here
-LEARNING_RATE = 1e-3  # that of updates is often lower, so that they change little; it would need more epochs here
+BATCH_SIZE = 64  # rows in a minibatch; updates often use a larger batch size, which would need more epochs here
+LEARNING_RATE = 1e-3  # updates often use a lower rate, so that they change little; it would need more epochs here
 
 
 def clone(algorithm: Algorithm, episodes: Iterable[Batch], pulse: Callable[[], None]) -> dict[str, float]:
-    """Make the gradient steps of cloning these episodes (`clone_epochs`) that have not been made yet.
+    """Clone these episodes for `clone_epochs`, without the gradient steps that were made before.
 
-    `episodes`: each a batch of one column. Calls `pulse`, which may save the state, between gradient steps. Returns the loss
-    over all steps, and how close the most probable actions are: `clone/loss`, and `clone/accuracy` (choices and bits) or
-    `clone/mean_absolute_error` (numbers), or both.
+    `episodes`: each one is a batch of one column. `pulse`, which may save the state, is called after each gradient step.
+    Returns metrics over all steps of the episodes: `clone/loss`, and how close the most probable actions are, as
+    `clone/accuracy` (choices and bits), `clone/mean_absolute_error` (numbers), or both.
 
-    Raises `UsageError` if the algorithm derives from neither `ActorCritic` nor `Continuous`, and `RunError` if a loss or a
-    gradient is not finite, before the step.
+    Raises `UsageError` if the algorithm derives from neither `ActorCritic` nor `Continuous`, and `RunError`, before the
+    gradient step, if a loss or a gradient isn't finite.
     """
     if not isinstance(algorithm, ActorCritic | Continuous):
         raise UsageError(f"clone_epochs: expected an ActorCritic or a Continuous to clone, got {type(algorithm).__name__}")
@@ -72,10 +72,11 @@ def clone(algorithm: Algorithm, episodes: Iterable[Batch], pulse: Callable[[], N
 
 
 def center_critic(algorithm: ActorCritic, parts: Sequence[Demonstrations]) -> None:
-    """Add a number δ to all values, so that the mean error over these steps is 0: E[V(o) + δ] = E[G + γᵏ δ].
+    """Add a number δ to all values of the critic, so that its mean error over these steps is 0: E[V(o) + δ] = E[G + γᵏ δ].
 
-    Otherwise the critic would have to reach the level of the returns by gradient steps, which would saturate its units, so
-    that they learn little in the updates. If γ is 1 and no episode was terminated, there is no such δ, and nothing changes.
+    Otherwise the critic would reach the level of the returns only by many gradient steps, which would saturate its units, so
+    that they would learn little in later updates. If γ is 1 and no episode was terminated, there is no such δ, and nothing
+    changes.
     """
     error = weight = 0.0
     for rows in parts:
@@ -88,7 +89,7 @@ def center_critic(algorithm: ActorCritic, parts: Sequence[Demonstrations]) -> No
 
 
 def cloning_loss(algorithm: ActorCritic | Continuous, rows: Demonstrations) -> tuple[Tensor, Tensor]:
-    """The loss, a 0-dimensional tensor, and the params [B, P] of the action distribution."""
+    """The loss, a 0-dimensional tensor, and the parameters [B, P] of the action distribution."""
     inputs = _inputs(algorithm, rows)
     action = algorithm.tensor(rows.action)
     if isinstance(algorithm, Continuous):
@@ -112,12 +113,12 @@ def _returns(algorithm: ActorCritic, rows: Demonstrations) -> Tensor:
 
 
 def _parts(rows: Demonstrations, count: int) -> list[Demonstrations]:
-    """The steps, in `count` parts of nearly equal size. Parts share their observations."""
+    """The steps in `count` parts of nearly equal size, which share the arrays of observations."""
     return [rows.select(some) for some in np.array_split(np.arange(len(rows.at)), count)]
 
 
 def _measured(algorithm: ActorCritic | Continuous, parts: Sequence[Demonstrations]) -> dict[str, float]:
-    """The metrics, over all steps."""
+    """The metrics of cloning, over all steps of these parts."""
     size = sum(len(rows.at) for rows in parts)
     with torch.no_grad():
         sums = [_sums(algorithm, rows) for rows in parts]
@@ -132,8 +133,8 @@ def _measured(algorithm: ActorCritic | Continuous, parts: Sequence[Demonstration
 
 
 def _sums(algorithm: ActorCritic | Continuous, rows: Demonstrations) -> tuple[float, float, float]:
-    """Sums over these steps, of the loss, and of the most probable action: whether a choice or a bit is wrong; the mean
-    error of its numbers.
+    """Three sums over these steps: the loss; how often the most probable action has a wrong choice or bit; and the mean
+    absolute error of the numbers in the most probable action.
     """
     policy = algorithm.policy
     loss, params = cloning_loss(algorithm, rows)

@@ -1,8 +1,9 @@
 """Reads the files of a Minari dataset as data: its spaces from metadata.json, its episodes from main_data.hdf5.
 
-Rule: a dataset may come from a stranger. Nothing that it names is made, imported or called, and the content of metadata.json
-is checked against the arrays before it is trusted. (Minari itself makes the environment of a dataset that has no spaces, and
-so runs whatever its entry point names. It also follows links to other files, and lets Pillow open images of any format.)
+Rule: a dataset may come from an untrusted source. Nothing that it names is made, imported or called, and the content of
+metadata.json is checked against the arrays before it is used. (Minari itself is less strict. If a dataset has no spaces, it
+makes the dataset's environment, which runs any code that the entry point names. It also follows links to other files, and
+lets Pillow open images of any format.)
 """
 
 from __future__ import annotations
@@ -32,13 +33,13 @@ from millrace.protocol.specs import Leaf
 
 METADATA = "metadata.json"
 ARRAYS = "main_data.hdf5"
-MOST_METADATA_BYTES = 1 << 24  # it has two bounds of each element of a space
+MOST_METADATA_BYTES = 1 << 24  # metadata contains two bounds for each element of a space
 REWARD = Leaf("", "box", (), "float32")
 END = Leaf("", "box", (), "bool")
 
 
 class StoredEpisode(NamedTuple):
-    """L steps, with the shapes and the dtypes of the dataset's spaces."""
+    """An episode of L steps. Arrays have the shapes and dtypes of the dataset's spaces."""
 
     number: int
     obs: tuple[Array, ...]  # [L+1, *leaf] for each leaf of the observation
@@ -49,7 +50,7 @@ class StoredEpisode(NamedTuple):
 
 
 class _Metadata(msgspec.Struct):
-    """The used part of metadata.json."""
+    """The part of metadata.json that is used."""
 
     data_format: str
     total_episodes: Natural
@@ -60,10 +61,13 @@ class _Metadata(msgspec.Struct):
 
 
 class DatasetFiles:
-    """A dataset whose metadata fits its arrays. h5py must be installed, and Pillow for JPEG images."""
+    """A dataset whose metadata was checked against its arrays. Needs h5py, and for JPEG images Pillow."""
 
     def __init__(self, name: str, folder: Path) -> None:
-        """`name` begins each message; `folder` has the two files. Raises `UsageError` if the dataset cannot be used."""
+        """`name`: how error messages begin. `folder`: the folder of the two files.
+
+        Raises `UsageError` if the dataset can't be used.
+        """
         self._name = name
         self._folder = folder
         with self._as_usage_error(METADATA):
@@ -84,13 +88,15 @@ class DatasetFiles:
         self._check_counts()
 
     def read_episodes(self) -> Iterator[StoredEpisode]:
-        """The episodes, in their order. Raises `UsageError` at one that cannot be used."""
+        """Yield the episodes, in order. Raises `UsageError` when it reaches one that can't be used."""
         with self._as_usage_error(ARRAYS), SelfContainedHDF5.open(self._folder / ARRAYS) as file:
             for number in range(self.episodes):
                 yield self._episode(file, number)
 
     def _check_counts(self) -> None:
-        """Raise `UsageError` unless there are as many episodes and steps as the metadata says, and as the file can hold."""
+        """Raise `UsageError` unless the numbers of episodes and steps are those in the metadata, and a file of this size can
+        contain them.
+        """
         with self._as_usage_error(ARRAYS), SelfContainedHDF5.open(self._folder / ARRAYS) as file:
             if (episodes := len(file.root)) != self.episodes:
                 raise UnfitFile(f"expected {self.episodes} episodes, as {METADATA} says, got {episodes}")
@@ -169,7 +175,7 @@ def _leaves(file: SelfContainedHDF5, parent: Any, name: str, space: gymnasium.Sp
 
 
 def _read(stored: Any, rows: int, leaf: Leaf) -> Array:
-    """The array [rows, *leaf] in the dtype of the leaf, which must hold each of its values."""
+    """Read an array [rows, *leaf], converted to the dtype of the leaf. Raises `UnfitFile` if that would change a value."""
     shape = (rows, *leaf.shape)
     dtype = stored.dtype
     if stored.shape != shape or dtype.kind not in STORED_KINDS:
@@ -177,7 +183,7 @@ def _read(stored: Any, rows: int, leaf: Leaf) -> Array:
         got = f"{dtype}{list(stored.shape)}"
         raise UnfitFile(f"{stored.name}: expected {expected}, got {got}")
     raw: Array = stored[()]
-    with np.errstate(over="ignore", invalid="ignore"):  # values that become infinite are refused
+    with np.errstate(over="ignore", invalid="ignore"):  # floats that become infinite are refused later
         array = raw.astype(leaf.dtype, copy=False)
     if array.dtype.kind != "f" and (changed := array != raw).any():
         raise UnfitFile(f"{stored.name}: expected {leaf.dtype}, got {raw[changed][0]}")
@@ -185,7 +191,7 @@ def _read(stored: Any, rows: int, leaf: Leaf) -> Array:
 
 
 def _read_images(stored: Any, shape: tuple[int, ...]) -> Array:
-    """JPEG files, one a row, as an array [rows, height, width(, 3)]."""
+    """Decode JPEG images, one for each row, into an array [rows, height, width(, 3)]."""
     from PIL import Image, UnidentifiedImageError
 
     rows, height, width = shape[:3]
@@ -196,7 +202,7 @@ def _read_images(stored: Any, shape: tuple[int, ...]) -> Array:
     for row, content in enumerate(stored):
         file = io.BytesIO(np.asarray(content, np.uint8).tobytes())
         try:
-            image = Image.open(file, formats=["JPEG"])  # one of Pillow's other formats starts another program
+            image = Image.open(file, formats=["JPEG"])  # only JPEG, because for some formats Pillow starts another program
         except UnidentifiedImageError:
             raise UnfitFile(f"{stored.name}: expected JPEG images, got others") from None
         if (image.size, image.mode) != ((width, height), mode):

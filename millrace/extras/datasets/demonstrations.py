@@ -17,23 +17,27 @@ from millrace.protocol.rollout import Batch
 
 
 class Demonstrations(NamedTuple):
-    """B steps of episodes. Their observations are in `leaves`, [O, *leaf] each."""
+    """B steps of episodes, which have O observations in total."""
 
     leaves: tuple[Array, ...]
+    """[O, *leaf] for each leaf of the observation"""
     at: npt.NDArray[np.int64]
-    """[B] index of the observation"""
+    """[B] index of the step's observation in `leaves`"""
     last: npt.NDArray[np.int64]
-    """[B] index of the last observation of the episode"""
+    """[B] index of the last observation of the step's episode"""
     action: Array
-    """[B, *action] as rollouts store it"""
+    """[B, *action], as rollouts store it"""
     returns: Floats
     """[B] Σ γⁱ r over the rest of the episode"""
     discount: Floats
-    """[B] how much the value of the last observation adds to this: γᵏ, or 0 if the episode was terminated"""
+    """[B] weight of the last observation's value in the return: γᵏ, or 0 if the episode was terminated"""
 
     @classmethod
     def of(cls, batches: Iterable[Batch], scaled: Callable[[Floats], Floats], gamma: float) -> Demonstrations:
-        """All steps of these episodes, each a batch of one column. `scaled`: scales rewards as for the critic."""
+        """All steps of these episodes, each of which is a batch of one column.
+
+        `scaled` scales rewards as the critic needs them. `gamma` is the discount γ.
+        """
         leaves: list[list[Array]] = []
         rows: list[tuple[Array, ...]] = []
         start = 0
@@ -50,7 +54,7 @@ class Demonstrations(NamedTuple):
         return cls(tuple(map(np.concatenate, zip(*leaves, strict=True))), *columns)
 
     def select(self, some: Array) -> Demonstrations:
-        """Only these steps."""
+        """The steps with these indices. They share the arrays of observations."""
         columns: list[Any] = [column[some] for column in self[1:]]
         return Demonstrations(self.leaves, *columns)
 

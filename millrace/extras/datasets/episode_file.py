@@ -1,8 +1,8 @@
 """Appends episodes to the HDF5 file of a Minari dataset, in Minari's layout.
 
-Rule: HDF5 never learns that a write failed. Otherwise, for example on a full disk, it can't close the file, and the process
-    ends with a segmentation fault. So HDF5 writes through a file that remembers the first error, and keeps the unwritten
-    data in memory until HDF5 has closed it. Only then is the error raised.
+Rule: HDF5 never sees that a write failed. If it did, for example because the disk is full, it couldn't close the file, and
+    the process would end with a segmentation fault. So HDF5 writes through a file object that stores the first error, and
+    keeps unwritten data in memory until HDF5 has closed the file. Only then is the error raised.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from millrace.protocol.arrays import Array
 
 
 def append_episodes(path: Path, first: int, episodes: Sequence[Any]) -> None:
-    """Append episodes (Minari's `EpisodeBuffer`); the first one gets this number.
+    """Append episodes (Minari's `EpisodeBuffer`). `first`: the number of the first one; 0 makes a new file.
 
-    With 0, the file is made. Raises `OSError` if the file can't be written; it is then unusable.
+    Raises `OSError` if the file can't be written; the file is then unusable.
     """
-    # Ctrl-C raises in the main thread, whatever it is doing. HDF5 must not see that either.
+    # Write in another thread, because Ctrl-C raises in the main thread, and HDF5 must not see that error either.
     with ThreadPoolExecutor(1, "recording") as writer:
         writer.submit(_append, path, first, episodes).result()
 
@@ -57,7 +57,7 @@ def _append(path: Path, first: int, episodes: Sequence[Any]) -> None:
 
 
 def _add(group: Any, name: str, data: Any) -> None:
-    """Add an array, or the arrays of a Dict or a Tuple, one of whose entries is called `_index_0`."""
+    """Add an array, or a group with the arrays of a Dict or Tuple. Entries of a Tuple are called `_index_0` and so on."""
     match data:
         case Mapping():
             inside = group.create_group(name)
@@ -76,7 +76,7 @@ class _RememberingFile(io.RawIOBase):
     def __init__(self, descriptor: int) -> None:
         super().__init__()
         self.error: OSError | None = None
-        """the first one"""
+        """the first error, if any"""
         self._descriptor = descriptor
         self._at = 0
         self._unwritten: list[tuple[int, bytes]] = []  # offset and data, in the order of the writes
@@ -93,7 +93,7 @@ class _RememberingFile(io.RawIOBase):
         return offset
 
     def readinto(self, buffer: Any) -> int:
-        """Read written data, including data that only seems to be written; zeros beyond the end."""
+        """Read the file's content, including data that couldn't be written; beyond the end, read zeros."""
         wanted = memoryview(buffer).cast("B")
         found = os.pread(self._descriptor, len(wanted), self._at)
         wanted[:] = found.ljust(len(wanted), b"\0")
@@ -105,7 +105,7 @@ class _RememberingFile(io.RawIOBase):
         return len(wanted)
 
     def write(self, data: Any) -> int:
-        """Write all of it, or remember why not."""
+        """Write all data, or keep the data and the error in memory."""
         view = memoryview(data).cast("B")
         if not self._tried(lambda: self._write(view)):
             self._unwritten.append((self._at, bytes(view)))
@@ -121,7 +121,7 @@ class _RememberingFile(io.RawIOBase):
         """Do nothing: no write is buffered."""
 
     def close(self) -> None:
-        """Close it. Some file systems say only now that there is no space."""
+        """Close the file. Some file systems report only now that there is no space."""
         if not self.closed:
             super().close()
             try:

@@ -2,9 +2,9 @@
 
 Rule: every valid row is in exactly one whole episode, or waits for its episode to end (`waiting`), or is counted as left out
     (`left_out`). A reset row is not part of an episode. An episode that spans several rollouts is assembled only if all of
-    them arrived, in order, and each continues the previous one, so no episode has a gap. (The first rollout of an
-    incarnation does so if another worker continues the lane. A client that owns its loop makes steps between two rollouts:
-    then the first row of the second one is not valid.)
+    them arrived, in order, and each continues the previous one, so that no episode has a gap. (The first rollout of an
+    incarnation continues the previous rollout if another worker took over the lane. A client that owns its loop makes steps
+    between two rollouts, so the second doesn't continue the first; its first row is then not valid.)
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from millrace.protocol.rollout import Rollout
 
 @dataclass(frozen=True)
 class RecordedEpisode:
-    """L steps from a reset to the end of the episode. The last of the L+1 observations is the result of the last step."""
+    """An episode of L steps, from a reset to its end. The last of its L+1 observations is the result of the last step."""
 
     obs: tuple[Array, ...]  # [L+1, *leaf] for each leaf of the observation
     action: tuple[Array, ...]  # [L, *part] for each part of the action, as the environment took it
@@ -29,7 +29,7 @@ class RecordedEpisode:
     terminated: Bools  # [L]
     truncated: Bools  # [L]
     seed: int | None = None
-    """seed of the reset with which the episode began, if it is known"""
+    """seed of the reset that began the episode, if it is known"""
 
     @property
     def length(self) -> int:
@@ -43,9 +43,9 @@ class RecordedEpisode:
 
 
 class _Fragment(NamedTuple):
-    """The rows of an episode that are in one rollout. They are copies, so the rollout's arrays can be freed."""
+    """The k rows of an episode that are in one rollout. They are copies, so that the rollout's arrays can be freed."""
 
-    obs: tuple[Array, ...]  # [k, *leaf] each; [k+1, *leaf] of the fragment with which the episode ends
+    obs: tuple[Array, ...]  # [k, *leaf] each; [k+1, *leaf] in the last fragment of an episode
     action: tuple[Array, ...]  # [k, *part] each
     reward: Array
     terminated: Bools
@@ -59,16 +59,19 @@ class _LaneState:
     incarnation: int
     sequence: int  # sequence number of the next rollout
     running: list[list[_Fragment] | None] = field(default_factory=list)
-    """[N] the unfinished episode of each env copy. It is None until the next end if its beginning is missing."""
-    last_obs: tuple[Array, ...] = ()  # [N, *leaf] each
-    ended: Bools = field(default_factory=lambda: np.zeros(0, bool))  # [N] in the last row
+    """[N] the unfinished episode of each env copy; None, until its end, if its beginning is missing"""
+    last_obs: tuple[Array, ...] = ()  # the last observations of the newest rollout, [N, *leaf] each
+    ended: Bools = field(default_factory=lambda: np.zeros(0, bool))  # [N] whether its last row ended an episode
 
     @property
     def waiting(self) -> int:
         return sum(len(fragment.reward) for fragments in self.running for fragment in fragments or ())
 
     def continued_by(self, rollout: Rollout) -> Bools:
-        """[N] whether the rollout begins where the last one ended, with a reset row exactly if an episode ended there."""
+        """[N] whether the rollout continues the newest one in each env copy.
+
+        It does if it begins with the same observation, and with a reset row exactly if the newest rollout ended an episode.
+        """
         continued: Bools = rollout.valid[0] != self.ended
         for last, leaf in zip(self.last_obs, rollout.obs, strict=True):
             continued &= (last == leaf[0]).reshape(len(last), -1).all(1)
@@ -79,9 +82,9 @@ class EpisodeAssembler:
     """Assembles the episodes of many lanes."""
 
     def __init__(self, to_env_action: Callable[[Array], tuple[Array, ...]]) -> None:
-        """`to_env_action` converts the actions of a rollout [k, *action] to arrays [k, *part] that the environment took."""
+        """`to_env_action` converts actions of rollouts, [k, *action], to the arrays [k, *part] that environments take."""
         self.left_out = 0
-        """number of valid rows of episodes that stay incomplete, because a rollout was dropped or the lane moved"""
+        """number of valid rows in episodes that stay incomplete, because a rollout was dropped or the lane moved"""
         self._to_env_action = to_env_action
         self._lanes: dict[int, _LaneState] = {}
 

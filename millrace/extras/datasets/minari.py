@@ -1,7 +1,7 @@
 """Writes a Minari dataset. Minari is an optional dependency and is imported only when it is needed.
 
-Rule: the dataset is complete, or doesn't exist: if writing fails, everything that Minari made for it is removed. Episodes
-    take at most about `CHUNK_BYTES` of memory. Images are stored losslessly, not as JPEG.
+Rule: the dataset is complete, or doesn't exist: if writing fails, everything that was made for it is removed. Episodes in
+    memory take at most about `CHUNK_BYTES`. Images are stored losslessly, not as JPEG.
 """
 
 from __future__ import annotations
@@ -28,14 +28,17 @@ OF_NAMESPACE = "namespace_metadata.json"  # the file that marks a folder as a Mi
 class MinariDataset:
     """Writes a Minari dataset into the folder that MINARI_DATASETS_PATH names.
 
-    As a context manager: at the end the dataset is complete. If the body raises, the dataset is removed.
+    Use it as a context manager: when the context ends, the dataset is complete. If the body raises, the dataset is removed.
     """
 
     def __init__(self, dataset_id: str, env: gymnasium.Env[Any, Any], about: str) -> None:
-        """Raises `UsageError` if such a dataset cannot be made or Minari is not installed."""
+        """`env`: the environment that is stored with the dataset. `about`: the dataset's description.
+
+        Raises `UsageError` if such a dataset can't be made or Minari isn't installed.
+        """
         try:
             import h5py  # noqa: F401
-            import PIL  # noqa: F401  (for Minari, which does not ask for it)
+            import PIL  # noqa: F401  (Minari needs it, but doesn't require it)
             from minari.dataset.minari_dataset import parse_dataset_id
             from minari.storage import get_dataset_path
         except ImportError as error:
@@ -59,7 +62,7 @@ class MinariDataset:
         self._env = env
         self._about = about
         self._storage: Any = None  # the dataset's files, made with the first episode to write
-        self._episodes = self._steps = 0  # in these files
+        self._episodes = self._steps = 0  # numbers of episodes and steps in these files
         self._chunk: list[Any] = []
         self._chunk_bytes = 0
 
@@ -126,13 +129,13 @@ class MinariDataset:
         self._chunk_bytes = 0
 
     def _new_storage(self) -> Any:
-        """The dataset's files, without an episode."""
+        """Make the dataset's files, without episodes."""
         import minari
         from minari.dataset.minari_storage import MinariStorage
 
         data = self._folder / "data"
         data.mkdir(parents=True)
-        for namespace in self._namespaces:  # Minari's own function follows links in all datasets
+        for namespace in self._namespaces:  # made here, because Minari's own function follows links in all datasets
             if not (namespace / OF_NAMESPACE).exists():
                 (namespace / OF_NAMESPACE).write_text("{}")
         spec = self._env.spec if _spec_can_be_stored(self._env) else None
@@ -150,7 +153,7 @@ class MinariDataset:
 
 
 def _spec_can_be_stored(env: gymnasium.Env[Any, Any]) -> bool:
-    """Whether the dataset can store how to make its environment. It cannot if a class or function was registered."""
+    """Whether the dataset can store the environment's spec. It can't if the entry point is a class or function."""
     try:
         return env.spec is not None and bool(env.spec.to_json())
     except (TypeError, ValueError):

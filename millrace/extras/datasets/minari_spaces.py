@@ -1,6 +1,6 @@
-"""Makes gymnasium's spaces from the JSON in which Minari writes them. Pure.
+"""Makes gymnasium spaces from the JSON in which Minari stores them. Pure.
 
-Rule: as in `millrace.protocol.space_spec`, sizes are checked before anything of that size is allocated.
+Rule: as in `millrace.protocol.space_spec`, sizes are checked before memory of that size is allocated.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from millrace.protocol.space_spec import (
 
 
 def space_of_json(name: str, text: str) -> gymnasium.Space[Any]:
-    """The space of a text, which errors call `name`. Errors are of several types, but all of them are an `Exception`."""
+    """The space that this JSON text describes. `name`: its name in errors. Raises exceptions of several types."""
     spec = _spec(msgspec.convert(json.loads(text), _Space))
     check_space(name, spec)
     return make_space(spec)

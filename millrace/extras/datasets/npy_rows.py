@@ -1,4 +1,4 @@
-"""Writes a .npy file with a row [observation, action] for each step: float32, flattened.
+"""Writes a .npy file with a row for each step: the observation and the action, flattened, as float32.
 
 Rule: the file is complete, or doesn't exist.
 """
@@ -21,7 +21,7 @@ from millrace.protocol.errors import RunError
 
 
 class NpyRows:
-    """Context manager: collects rows in a temporary file and writes the .npy file at the end, unless the body raises."""
+    """A context manager. It collects rows in a temporary file, and at its end writes the .npy file if nothing was raised."""
 
     def __init__(self, target: Path | None) -> None:
         """`target`: the file to write. With None, nothing is written and every method does nothing."""

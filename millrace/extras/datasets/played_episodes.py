@@ -1,4 +1,4 @@
-"""Plays episodes with workers and keeps their rows. Each episode has its own ticket, and depends only on its seed."""
+"""Plays episodes with workers and keeps their rows. Each episode has a ticket of its own, and depends only on its seed."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from millrace.protocol.envs.env_actions import action_leaves_of
 from millrace.protocol.messages import EpisodeRows
 from millrace.protocol.random_streams import Purpose, env_seed
 
-FIRST_EPISODES = 2  # played before their size is known
-CHUNK_BYTES = 256 * 2**20  # about the memory that the episodes of one plan may take
-MOST_EPISODES = 256  # of one plan
+FIRST_EPISODES = 2  # number of episodes in the first plan, when their size isn't known yet
+CHUNK_BYTES = 256 * 2**20  # approximate limit of the memory for the episodes of one plan
+MOST_EPISODES = 256  # largest number of episodes in one plan
 
 
 def recording_seeds(seed: int) -> Iterator[int]:
@@ -31,29 +31,29 @@ class Played(NamedTuple):
 
     episode: RecordedEpisode
     result: PlayedEpisode
-    """its figures, and whether it was stopped because it was too long"""
+    """its return and length, and whether it was cut because it was too long"""
     frames: list[Array]
-    """[H, W, 3] uint8 for each of the first observations, if requested"""
+    """rendered frames [H, W, 3] uint8 of the first observations, if requested"""
 
 
 class PlayedEpisodes:
     """Episodes of a policy, in the order of their seeds."""
 
     def __init__(self, player: PolicyPlayer, seeds: Iterable[int], *, stochastic: bool = False) -> None:
-        """`seeds`: the reset seed of each episode. `stochastic`: draw actions from the policy; otherwise take the most
+        """`seeds`: the reset seed of each episode. `stochastic`: sample actions from the policy; otherwise take the most
         probable ones.
         """
         self._player = player
         self._seeds = iter(seeds)
         self._stochastic = stochastic
         self._to_env_action = action_leaves_of(player.policy.spec)
-        self._episodes = self._steps = self._bytes = 0  # played so far
+        self._episodes = self._steps = self._bytes = 0  # episodes, their steps, and bytes of observations, so far
 
     def until(self, steps: int) -> Iterator[tuple[RecordedEpisode, bool]]:
-        """Episodes until they have this number of steps, and whether each was cut.
+        """Yield episodes until they have this number of steps in total, each with whether it was cut.
 
-        The last one is finished, unless it would double the number of steps: then it is cut, and its last step marked
-        truncated.
+        The last episode is finished, unless it would double the number of steps. Then it is cut, and its last step is marked
+        as truncated.
         """
         taken = 0
         while taken < steps:
@@ -66,7 +66,7 @@ class PlayedEpisodes:
                     break
 
     def play(self, number: int, longest: int, *, frames: bool = False) -> list[Played]:
-        """The next episodes, of at most `longest` steps each, with `frames` if wanted. There must be enough seeds."""
+        """Play the next episodes, of at most `longest` steps each. `frames`: also render. There must be enough seeds."""
         seeds = [next(self._seeds) for _ in range(number)]
         rows: list[list[EpisodeRows]] = [[] for _ in seeds]
         plan = EvaluationPlan(
@@ -88,7 +88,7 @@ class PlayedEpisodes:
         return played
 
     def _wanted(self, steps: int) -> int:
-        """Number of episodes to play next, if this many steps are missing."""
+        """Number of episodes to play next if this many steps are still needed."""
         if not self._episodes:
             return FIRST_EPISODES
         by_steps = -(-steps * self._episodes // self._steps)

@@ -1,6 +1,6 @@
 """Reads a Minari dataset as batches from which an algorithm can learn. Minari is an optional dependency.
 
-Rule: a dataset is used only if its spaces are those of the run's policy, and if all of its numbers are finite and in their
+Rule: a dataset is used only if it has the spaces of the run's policy, and if all of its numbers are finite and in these
 spaces. Each episode becomes one batch with a single column, so its rows follow the row format and no row is left out.
 """
 
@@ -63,7 +63,7 @@ class PriorDataset(PriorData):
     def _batch(
         self, number: int, obs: tuple[Array, ...], action: Array, reward: Array, terminated: Array, truncated: Array
     ) -> Batch:
-        """An episode [T, 1] as a batch. Its last row ends the episode, whatever the dataset says: no row follows it."""
+        """An episode of arrays [T, 1, …] as a batch. Its last row always ends the episode, because no row follows it."""
         T = len(reward)
         where = f"prior {self._id}: episode {number}"
         leaves = [(leaf.name, array, leaf) for leaf, array in zip(self._policy.observation, obs, strict=True)]
@@ -116,7 +116,7 @@ def _open(dataset_id: str) -> DatasetFiles:
 
 
 def _ids(root: Path) -> Iterator[str]:
-    """The ids of the datasets here. Their files are not read."""
+    """The ids of the datasets in this folder. Their files aren't read."""
     for folder, inside, _ in os.walk(root):
         if "data" in inside:
             inside.clear()

@@ -1,4 +1,4 @@
-"""`millrace.record` and the command `record`: episodes of a run's policy, played by workers, as a dataset."""
+"""`millrace.record` and the command `record`: let workers play episodes of a run's policy, and write them as a dataset."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from millrace.protocol.errors import UsageError
 
 
 def write_dataset(flags: RecordFlags, watch: ShowPlayed, given: Given | None = None) -> RecordedDataset:
-    """Write a dataset.
+    """Write the dataset.
 
-    Raises `UserFacingError`, or `KeyboardInterrupt` if the user stops it; in both cases no files are left.
+    Raises `UserFacingError`, or `KeyboardInterrupt` if the user interrupts it; in both cases no files are left behind.
     """
     saved = policy_to_play(flags, given)
     for found, why in ((saved.seats, f"{saved.env.id} has several agents"), (saved.spec.critic, "the run has critic_keys")):

@@ -1,9 +1,9 @@
-"""Writes episodes of a run's policy as a Minari dataset and, if you ask, as a .npy file of rows.
+"""Writes episodes of a run's policy as a Minari dataset, and optionally also as a .npy file of rows.
 
-Rule: a dataset consists of whole episodes with raw rewards. It is complete, or doesn't exist. Episodes are played one after
-another on one env copy, so that short episodes are not favored. Each has its own reset seed, which is stored with it. The
-last episode is finished, so a dataset may have more steps than requested. If this would double the number of steps, the
-episode is cut, and its last step is marked as truncated.
+Rule: a dataset consists of whole episodes with raw rewards. It is complete, or doesn't exist. It contains episodes in the
+order of their seeds, so that short episodes aren't favored; each seed is stored with its episode. The last episode is
+finished, so a dataset may have more steps than requested. If this would double the number of steps, the episode is cut, and
+its last step is marked as truncated.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ def record_episodes(
     stochastic: bool = False,
     npy: Path | None = None,
 ) -> RecordedDataset:
-    """Have the workers of `player` play the policy of this run folder, and write a dataset of at least `steps` env steps.
+    """Let the workers of `player` play the policy of this run folder, and write a dataset of at least `steps` env steps.
 
     `stochastic`: sample actions from the policy; otherwise take the most probable ones. `npy`: also write this file. Raises
-    `UserFacingError`; in that case no files are left.
+    `UserFacingError`, and then leaves no files behind.
     """
     if npy is not None and not npy.parent.is_dir():
         raise UsageError(f"{npy} cannot be written: no such folder {npy.parent}")
@@ -50,7 +50,7 @@ def record_episodes(
             returns.append(episode.episode_return)
             taken += episode.length
             cut += was_cut
-        dataset.close()  # before the rows are written: if that fails, leaving the dataset removes it
+        dataset.close()  # before the rows: if they can't be written, leaving the context removes the dataset
     return RecordedDataset(
         dataset_id=dataset_id,
         episodes=len(returns),

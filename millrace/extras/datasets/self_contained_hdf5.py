@@ -1,7 +1,7 @@
-"""Reads groups and arrays of an HDF5 file that may come from a stranger, and never of another file.
+"""Reads groups and arrays of an HDF5 file from an untrusted source, and never reads another file.
 
-Rule: nothing leads out of the file. No link is followed, and all data of an array must be in the file, compressed only with
-h5py's own filters. So memory is bounded by the size of the file: an array has at most `MOST_EXPANSION` times as many bytes.
+Rule: no link is followed, and all data of an array must be in the file, compressed only with h5py's own filters. So memory
+is bounded by the size of the file: an array has at most `MOST_EXPANSION` times as many bytes.
 """
 
 from __future__ import annotations
@@ -15,26 +15,26 @@ from typing import Any, Self
 
 from millrace.learner.run_folder.regular_files import open_regular
 
-MOST_EXPANSION = 1_032  # the largest ratio of deflate; no other supported filter has a larger one
-FILTERS = {1, 2, 3, 32_000}  # deflate, shuffle, fletcher32, lzf. Any other may be a plug-in that the file would choose
+MOST_EXPANSION = 1_032  # deflate's largest compression ratio; no other supported filter has a larger one
+FILTERS = {1, 2, 3, 32_000}  # deflate, shuffle, fletcher32, lzf; for any other number, HDF5 might load a plug-in
 
 
 class UnfitFile(Exception):
-    """What is wrong with the file, in one line."""
+    """The file can't be used. The message says why, in one line."""
 
 
 class SelfContainedHDF5:
-    """An open file. Its methods raise `UnfitFile`; h5py raises other errors, of several types, if the file is damaged."""
+    """An open file. Its methods raise `UnfitFile`, or, if the file is damaged, one of several errors of h5py."""
 
     def __init__(self, file: Any, most_bytes: int) -> None:
-        """`most_bytes`: largest size of each array."""
+        """`most_bytes`: the largest allowed size of an array."""
         self.root = file
         self.most_bytes = most_bytes
 
     @classmethod
     @contextmanager
     def open(cls, path: Path) -> Iterator[Self]:
-        """Open a file to read it. Raises `OSError`, also for a link or anything but a regular file."""
+        """Open a file for reading. Raises `OSError`, even for a link or anything else that isn't a regular file."""
         import h5py
 
         with os.fdopen(open_regular(path), "rb") as opened, h5py.File(opened, "r") as file:
@@ -49,7 +49,7 @@ class SelfContainedHDF5:
         return member
 
     def array(self, parent: Any, name: str) -> Any:
-        """The array of this name inside a group, not read yet: h5py's `Dataset`."""
+        """The array of this name inside a group, as h5py's `Dataset`, whose data isn't read yet."""
         import h5py
 
         dataset = self._member(parent, name)
@@ -82,7 +82,7 @@ class SelfContainedHDF5:
 
 
 def _is_whole(array: Any) -> bool:
-    """Whether the file has all data of an array. HDF5 returns a fill value for data that was never written."""
+    """Whether the file contains all data of an array. For data that was never written, HDF5 returns a fill value."""
     if not array.chunks:
         return bool(array.id.get_storage_size() >= array.nbytes)
     sides = zip(array.shape, array.chunks, strict=True)

@@ -1,6 +1,6 @@
 """`--record`: a callback that writes the whole episodes of training as a Minari dataset.
 
-Rule: a dataset that can't be written doesn't stop training. It is removed, the run continues, and fails at its end.
+Rule: if the dataset can't be written, training doesn't stop. The dataset is removed, and the run fails when it has ended.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ log = logging.getLogger("millrace.learner")
 class TrainingRecorder(Callback):
     """Writes every whole episode of training into a dataset, with the actions that the environment took.
 
-    Steps of incomplete episodes are counted instead. Without a whole episode, no dataset is written.
+    Steps of incomplete episodes are only counted. If no episode is whole, no dataset is written.
     """
 
     def __init__(self, dataset_id: str, env: DescribedEnv, run: RunSpec, about: str) -> None:
@@ -56,8 +56,8 @@ class TrainingRecorder(Callback):
     def on_end(self, progress: Progress) -> None:
         """Finish the dataset, and log one line that describes it.
 
-        Raises `RunError` if it could not be written, now or earlier, and nothing else ended the run; the dataset is then
-        removed.
+        Raises `RunError` if the dataset couldn't be written, now or earlier, and nothing else ended the run. The dataset is
+        then removed.
         """
         if self._refused is None:
             self._finish()
@@ -72,7 +72,7 @@ class TrainingRecorder(Callback):
     def _finish(self) -> None:
         if self._episodes:
             with self._dataset:
-                pass  # leaving it writes the episodes that are still in memory
+                pass  # leaving the context writes the episodes that are still in memory
         parts = self._assembler.waiting + self._assembler.left_out
         log.warning(f"dataset {self._id}: {self._episodes:,} training episodes; {parts:,} steps of others left out")
 
@@ -81,7 +81,7 @@ class EnvironmentOfDataset(gymnasium.Env[Any, Any]):
     """The part of an environment that Minari reads: its spaces and its spec. It is never stepped."""
 
     def __init__(self, env: DescribedEnv, *, masked: bool = False) -> None:
-        """`env`: the environment as a worker described it. `masked`: a mask in its observations is not recorded."""
+        """`env`: the environment as a worker described it. `masked`: leave out the action mask in its observations."""
         self.observation_space = env.observation_space
         self.action_space = env.action_space
         if masked:

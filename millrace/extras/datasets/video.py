@@ -21,10 +21,10 @@ from millrace.playing import RecordVideos
 from millrace.protocol.arrays import Array
 from millrace.protocol.errors import EnvironmentFailed, RunError, UsageError, first_line
 
-AT_ONCE = 2  # episodes whose frames are in memory
+AT_ONCE = 2  # number of episodes whose frames are in memory at the same time
 LONGEST_EPISODE = 20_000  # env steps; the worker sends frames of the first 1,500
-FRAMES_PER_S = 30  # if the environment doesn't name a rate
-# Bounds of the rate that a worker sends for its environment. moviepy writes two decimals.
+FRAMES_PER_S = 30  # used if the environment's metadata has no render_fps
+# Bounds of the frame rate that a worker reports for its environment. moviepy writes two decimals.
 LEAST_FRAMES_PER_S = 0.01
 MOST_FRAMES_PER_S = 1_000
 FOLDER = "videos"
@@ -47,11 +47,11 @@ def prepare_videos() -> RecordVideos:
 def record_videos(
     player: PolicyPlayer, run: Path, episodes: int, seed: int, max_steps: int, prefix: str = ""
 ) -> tuple[Evaluation, list[Path]]:
-    """Have the workers of `player` play episodes, and write a video of each, whose name begins with `prefix`.
+    """Let the workers of `player` play episodes, and write a video of each, whose name begins with `prefix`.
 
     `seed`: seed of the episodes; see `EvaluationPlan.of`. `max_steps`: largest number of env steps of all episodes together;
-    each gets an equal share, and at most `LONGEST_EPISODE`. Returns the evaluation and the paths of the videos. Raises
-    `UserFacingError`, with a one-line message, if videos cannot be made.
+    each episode gets an equal share, but at most `LONGEST_EPISODE`. Returns the evaluation and the paths of the videos.
+    Raises `UserFacingError`, with a one-line message, if videos can't be made.
     """
     env_id = player.policy.env.id
     env = player.describe("rgb_array")
@@ -90,7 +90,10 @@ def record_videos(
 
 
 def _write(path: Path, frames: list[Array], frames_per_s: float) -> None:
-    """Encode frames [H, W, 3], each once. moviepy's clips have a length in seconds, and lose the last one by rounding."""
+    """Encode each of these frames [H, W, 3] once.
+
+    moviepy's own clips have a length in seconds, and by rounding lose the last frame.
+    """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # from packages that moviepy uses
         from moviepy.video.io.ffmpeg_writer import FFMPEG_VideoWriter

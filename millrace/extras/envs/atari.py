@@ -1,12 +1,12 @@
-"""Atari games with the preprocessing of Mnih et al. (2015): every fourth screen, grayscale, 84 × 84, the last four.
+"""Atari games with the preprocessing of Mnih et al. (2015): frame skip 4, grayscale, 84 × 84, the last four screens stacked.
 
 Rule: an observation is a stack of screens [4, 84, 84], whichever program steps the game. The single game, the emulator's
-vectorized form and envpool differ only in their random numbers, and in the frames before an episode's first screen: zeros,
-except that envpool repeats the first screen.
+vectorized form and envpool differ only in their random numbers, and in the frames before an episode's first screen: these
+are zeros, except that envpool repeats the first screen.
 
 Keyword arguments of the environment are the fields of `GameSettings`, and further arguments of the emulator. Scores with
-different settings cannot be compared. Life loss and clipped rewards are settings of training: `eval_env_kwargs` undoes them
-for evaluations.
+different settings can't be compared. Ending episodes at lost lives and clipping rewards are meant for training: undo them
+for evaluations with `eval_env_kwargs`.
 """
 
 from __future__ import annotations
@@ -25,20 +25,20 @@ from millrace.protocol.errors import UsageError
 FRAMES = 4
 SKIP = 4
 SIDE = 84
-MAX_FRAMES = 108_000  # in a game: half an hour of play
-NOOP = 0  # an action
-FIRE = 1  # an action
-JOYSTICK_FIRE = np.array([0, 0, 1], np.float32)  # of a game with continuous actions: radius, angle, fire
+MAX_FRAMES = 108_000  # time limit of a game in emulator frames: half an hour of play
+NOOP = 0  # number of this action
+FIRE = 1  # number of this action
+JOYSTICK_FIRE = np.array([0, 0, 1], np.float32)  # FIRE in a game with continuous actions: radius, angle, fire
 
 
 @dataclass(frozen=True)
 class GameSettings:
-    """A game, and how it is played."""
+    """The settings of an Atari game."""
 
     game: str = "Pong"
-    """Its name, as in `ALE/Pong-v5`."""
+    """Name of the game, as in `ALE/Pong-v5`."""
     repeat_action_probability: float = 0.0
-    """Sticky actions. 0.25 is that of Machado et al. (2018), 0 that of Mnih et al. (2015) and of most published tables.
+    """Probability of sticky actions: 0.25 in Machado et al. (2018), 0 in Mnih et al. (2015) and most published tables.
     Sticky actions make games harder.
     """
     noop_max: int = 30
@@ -46,15 +46,15 @@ class GameSettings:
     fire_on_reset: bool = False
     """Start a game with the action FIRE, if the game has it."""
     fire_after_life_loss: bool = False
-    """After each lost life, take FIRE, if the game has it, whatever the policy chose. Otherwise the policy must press it in
-    games that wait for it, such as Breakout.
+    """In the step after each lost life, take the action FIRE, if the game has it, in place of the policy's action. Without
+    this, the policy itself must press FIRE in games that wait for it, such as Breakout.
     """
     terminal_on_life_loss: bool = False
-    """An episode ends with each life, and the next one continues the same game. Returns are then per life: evaluate without
-    it. envpool makes no-op actions after each life.
+    """End an episode at each lost life; the next episode continues the same game. Returns are then those of single lives, so
+    evaluate without this setting. envpool makes no-op actions after each lost life.
     """
     clip_rewards: bool = False
-    """Clip rewards to ±1. Returns are then not scores: evaluate without it."""
+    """Clip rewards to ±1. Returns are then not scores, so evaluate without this setting."""
 
     @staticmethod
     def split(kwargs: dict[str, Any]) -> tuple[GameSettings, dict[str, Any]]:
@@ -65,7 +65,10 @@ class GameSettings:
 
 
 def make_game(**kwargs: Any) -> gymnasium.Env[Any, Any]:
-    """One env copy. `kwargs`: `GameSettings`, and further arguments of `gymnasium.make`. Needs ale-py and OpenCV."""
+    """Make one env copy. `kwargs`: the fields of `GameSettings`, and further arguments of `gymnasium.make`.
+
+    Needs ale-py and OpenCV.
+    """
     _silence_emulator()
     settings, options = GameSettings.split(kwargs)
     options |= {
@@ -87,7 +90,7 @@ def make_game(**kwargs: Any) -> gymnasium.Env[Any, Any]:
 
 
 def make_games(num_envs: int, **kwargs: Any) -> VectorEnv[Any, Any, Any]:
-    """`num_envs` copies that the emulator steps together; in one thread, because there is a worker for each core."""
+    """Make `num_envs` copies that the emulator steps together. It uses one thread, as each core already has a worker."""
     _silence_emulator()
     settings, options = GameSettings.split(kwargs)
     made = gymnasium.make_vec(
@@ -117,7 +120,7 @@ class _Joystick(gymnasium.Wrapper[Any, Any, Any, Any]):
 
 
 class _StartsGames(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """Presses FIRE for one screen after a reset, in games with this action."""
+    """Presses FIRE for one frame after a reset, in games with this action."""
 
     def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
         super().__init__(env)
@@ -154,7 +157,7 @@ class _FiresAfterLives(gymnasium.Wrapper[Any, Any, Any, Any]):
 
 
 class _VectorFiresAfterLives(VectorWrapper):
-    """Like `_FiresAfterLives`, for the emulator's vectorized form. A step that resets a game ignores its action."""
+    """Like `_FiresAfterLives`, for the emulator's vectorized form, which ignores the action in a step that resets a game."""
 
     def __init__(self, env: VectorEnv[Any, Any, Any]) -> None:
         super().__init__(env)
@@ -179,12 +182,14 @@ class _VectorFiresAfterLives(VectorWrapper):
 
 
 class _EndsWithLives(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """Ends an episode with each life. The reset after it makes one no-op step, unless the game is over or has a seed."""
+    """Ends an episode at each lost life. The next reset then makes one no-op step in the same game, unless the game is over
+    or `reset` gets a seed.
+    """
 
     def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
         super().__init__(env)
         self._lives = 0
-        self._goes_on = False  # whether a life was lost in the newest step, and the game did not end
+        self._goes_on = False  # whether the newest step lost a life without ending the game
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         goes_on = self._goes_on and seed is None
@@ -207,15 +212,15 @@ class _EndsWithLives(gymnasium.Wrapper[Any, Any, Any, Any]):
 
 
 class _StepAfterLives(VectorWrapper):
-    """Makes the step after a lost life only a reset, as in a loop over copies: it has no reward and no end.
+    """Makes the step after a lost life look like a reset, with no reward and no end, as it is in a loop over env copies.
 
-    The emulator continues the game in this step, with the policy's action. If the game, or a life, ends in that very step,
-    the next step ends the episode, which has one step.
+    In this step, the emulator continues the game with the policy's action. If this very step ends the game or loses a life,
+    the end is reported one step later, so that the episode has one step.
     """
 
     def __init__(self, env: VectorEnv[Any, Any, Any]) -> None:
         super().__init__(env)
-        self._ended = np.zeros(env.num_envs, bool)  # in the newest step
+        self._ended = np.zeros(env.num_envs, bool)  # whether the newest step ended an episode
         self._hidden = np.zeros(env.num_envs, bool)  # whether the newest step hid an end
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
@@ -250,7 +255,7 @@ def _silence_emulator() -> None:
 
 
 def _envpool(**kwargs: Any) -> tuple[str, dict[str, Any]]:
-    """Name and options of the game in envpool. Raises `UsageError` for settings that mean something else there."""
+    """The game's name and options in envpool. Raises `UsageError` for settings that have another meaning there."""
     settings = GameSettings(**kwargs)
     if settings.noop_max < 1:
         raise UsageError(f"envpool: noop_max: expected at least 1, got {settings.noop_max}; use --vector native or loop")

@@ -1,12 +1,13 @@
 """A cart that balances two links, one on top of the other: the equations of motion and the environment.
 
-Rule: q = (x, θ, φ). Both angles are absolute, 0 is upright and positive is towards +x. At the end of each massless link
+Rule: q = (x, θ, φ). Both angles are absolute; 0 is upright, and positive is towards +x. At the end of each massless link
 is a mass M with inertia I. The Lagrangian
 
     L = ½ m ẋ² + ½ M (v₁² + v₂²) + ½ I (θ̇² + φ̇²) − M g l (2 cos θ + cos φ),   v₁, v₂ the speeds of the two masses,
 
-gives M(q) q̈ + c(q, q̇) = (F − friction · ẋ, 0, 0). A step applies one force for `dt_s` seconds, in `substeps` equal steps of
-the classical Runge–Kutta method of fourth order. Uses Python floats: for three unknowns they are faster than arrays.
+gives M(q) q̈ + c(q, q̇) = (F − friction · ẋ, 0, 0). A step applies one force for `dt_s` seconds, in `substeps` equal steps
+of the classical Runge–Kutta method of fourth order. The code uses Python floats, because for three unknowns they are faster
+than arrays.
 """
 
 from __future__ import annotations
@@ -31,12 +32,12 @@ Accelerations = Callable[[float, float, float, float, float, float], tuple[float
 
 DT_S = 0.02
 SUBSTEPS = 2
-SPEED_LIMIT = 50.0  # m/s and rad/s: far beyond what the force can do on the track
+SPEED_LIMIT = 50.0  # m/s and rad/s; far above the speeds that the force can reach on the track
 
 
 @dataclass(frozen=True)
 class Physics:
-    """The constants of the Lagrangian. `friction_Ns_m` times the cart's speed is the friction force."""
+    """The constants of the Lagrangian. The friction force is `friction_Ns_m` times the cart's speed."""
 
     cart_kg: float = 1.0
     link_kg: float = 0.1
@@ -53,7 +54,7 @@ class Physics:
 
 
 def accelerations(physics: Physics) -> Accelerations:
-    """The function (θ, φ, ẋ, θ̇, φ̇, F) -> (ẍ, θ̈, φ̈): solves M(q) q̈ = (F − friction · ẋ, 0, 0) − c(q, q̇)."""
+    """The function (θ, φ, ẋ, θ̇, φ̇, F) -> (ẍ, θ̈, φ̈), which solves M(q) q̈ = (F − friction · ẋ, 0, 0) − c(q, q̇)."""
     sin = math.sin
     cos = math.cos
     friction = physics.friction_Ns_m
@@ -99,7 +100,7 @@ def accelerations(physics: Physics) -> Accelerations:
 
 
 def mass_matrix(physics: Physics, theta_rad: float = 0.0, phi_rad: float = 0.0) -> Doubles:
-    """M(q) [3, 3] of (ẍ, θ̈, φ̈)."""
+    """The mass matrix M(q) [3, 3], which multiplies (ẍ, θ̈, φ̈)."""
     ml = physics.link_kg * physics.link_m
     ml2 = ml * physics.link_m
     inertia = physics.inertia_kgm2
@@ -120,15 +121,18 @@ def energy(physics: Physics, state: Sequence[float]) -> float:
 
 
 def linear_model(physics: Physics) -> tuple[Doubles, Doubles]:
-    """A [6, 6] and B [6] of d state/dt = A state + B F, linear at the top: sin α = α, cos α = 1, squared speeds = 0."""
+    """A [6, 6] and B [6] of d state/dt = A state + B F, linearised at the upright position.
+
+    There, sin α = α, cos α = 1, and squared speeds are 0.
+    """
     mgl = physics.link_kg * physics.gravity_m_s2 * physics.link_m
     forces = [[0, 0, 0, -physics.friction_Ns_m, 0, 0, 1], [0, 2 * mgl, 0, 0, 0, 0, 0], [0, 0, mgl, 0, 0, 0, 0]]
-    solved = np.linalg.solve(mass_matrix(physics), np.array(forces))  # [3, 7]: by state, then by F
+    solved = np.linalg.solve(mass_matrix(physics), np.array(forces))  # [3, 7]: columns for the state, then for F
     return np.vstack([np.eye(3, 6, 3), solved[:, :6]]), np.append(np.zeros(3), solved[:, 6])
 
 
 def linear_accelerations(physics: Physics) -> Accelerations:
-    """The same function as `accelerations`, for the linear model."""
+    """A function like that of `accelerations`, but for the linear model."""
     a, b = linear_model(physics)
     (x1, x2, x3, x4), (t1, t2, t3, t4), (p1, p2, p3, p4) = np.column_stack([a[3:, 1:4], b[3:]]).tolist()
 
@@ -173,16 +177,22 @@ def advance(solve: Accelerations, state: PendulumState, force: float, h: float) 
 
 
 class CartDoublePendulum(gymnasium.Env[Floats, Floats]):
-    """Keep both links up by pushing the cart.
+    """Keep both links upright by pushing the cart.
 
-    Action, Box [1] float32: the force divided by `force_limit_N`; clipped to -1 to 1.
-    Observation, Box [6] float32: x_m, theta_rad, phi_rad, x_dot_m_s, theta_dot_rad_s, phi_dot_rad_s; θ is the lower link.
-    Start: each of these six is drawn uniformly from ±`start_spread`.
-    Reward: 1 − 0.3 (x / track)² − 0.3 (θ² + φ²) / 2 angle_limit² − 0.05 action² of a step after which both links are up,
-    so from 0.35 to 1; otherwise 0.
-    Terminated: |x| above `track_m`, or |θ| or |φ| above `angle_limit_rad`, or a speed above `SPEED_LIMIT`. Truncated: never,
-    but `gymnasium.make` adds a time limit of 500 steps (10 s). With `linearised`, it moves like the linear model.
-    Other keyword arguments are those of `Physics`.
+    Action: Box [1] float32, the force divided by `force_limit_N`. It is clipped to -1 to 1.
+
+    Observation: Box [6] float32, (x_m, theta_rad, phi_rad, x_dot_m_s, theta_dot_rad_s, phi_dot_rad_s). θ is the angle of the
+    lower link, φ that of the upper one.
+
+    Start: each of these six numbers is sampled uniformly from ±`start_spread`.
+
+    Reward: 1 − 0.3 (x / track)² − 0.3 (θ² + φ²) / 2 angle_limit² − 0.05 action², which is between 0.35 and 1. The step that
+    terminates the episode has reward 0.
+
+    Terminated: if |x| is above `track_m`, |θ| or |φ| above `angle_limit_rad`, or a speed above `SPEED_LIMIT`. Truncated:
+    never, but `gymnasium.make` adds a time limit of 500 steps (10 s).
+
+    `linearised`: move by the linear model. Other keyword arguments are the fields of `Physics`.
     """
 
     metadata = {"render_modes": ["human", "rgb_array"], "render_fps": round(1 / DT_S)}
@@ -217,7 +227,7 @@ class CartDoublePendulum(gymnasium.Env[Floats, Floats]):
         self.track_m = track_m
         self.angle_limit_rad = angle_limit_rad
         self.start_spread = start_spread
-        # Twice the limits of x and the angles, so that the last observation of an episode is inside, too.
+        # Twice the limits of x and the angles, so that even the last observation of an episode is inside the space.
         self._high = np.array([2 * track_m, *[2 * angle_limit_rad] * 2, *[SPEED_LIMIT] * 3], np.float32)
         self.observation_space = spaces.Box(-self._high, self._high, dtype=np.float32)
         self.action_space = spaces.Box(-1, 1, (1,), np.float32)
@@ -229,7 +239,7 @@ class CartDoublePendulum(gymnasium.Env[Floats, Floats]):
         self._screen: Screen | None = None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, dict[str, Any]]:
-        """Start nearly upright."""
+        """Start an episode nearly upright."""
         super().reset(seed=seed)
         x, theta, phi, *speeds = self.np_random.uniform(-self.start_spread, self.start_spread, 6).tolist()
         self.state = (x, theta, phi, *speeds)
@@ -239,7 +249,7 @@ class CartDoublePendulum(gymnasium.Env[Floats, Floats]):
         return np.array(self.state, np.float32), {}
 
     def step(self, action: Floats) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
-        """Push for `dt_s` seconds."""
+        """Push the cart for `dt_s` seconds."""
         state = self.state
         if state is None:
             raise ResetNeeded("CartDoublePendulum: step() before reset(); call reset() first")
@@ -274,7 +284,7 @@ class CartDoublePendulum(gymnasium.Env[Floats, Floats]):
         return observation, reward, not up, False, {}
 
     def render(self) -> Any:
-        """A picture [400, 600, 3] uint8 with "rgb_array"; with "human", show it in a window and return None."""
+        """With "rgb_array", return a picture [400, 600, 3] uint8. With "human", show it in a window and return None."""
         if self.render_mode is None:
             gymnasium.logger.warn(
                 'CartDoublePendulum: render() needs a render_mode, "rgb_array" or "human", given to make()'

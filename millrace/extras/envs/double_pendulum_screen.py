@@ -1,4 +1,4 @@
-"""Renders the cart with two links with pygame, which is imported when the first picture is drawn."""
+"""Draws the cart and its two links with pygame, which is imported when the first picture is drawn."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SCREEN = (600, 400)  # pixels: width, height
 
 
 class Screen:
-    """Draws a state with pygame, at twice the size and then scaled down, so that edges are smooth."""
+    """Draws states with pygame. Pictures are drawn at twice the size and then scaled down, so that edges are smooth."""
 
     def __init__(self, window: bool, track_m: float, link_m: float) -> None:
         os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
@@ -41,7 +41,7 @@ class Screen:
             self._clock = self._pygame.time.Clock()
 
     def show(self, state: Sequence[float], push: float, fps: int) -> npt.NDArray[np.uint8] | None:
-        """Draw the state. Without a window, returns the pixels [400, 600, 3] uint8."""
+        """Draw the state in the window; without a window, return the pixels [400, 600, 3] uint8."""
         self._draw(state[0], state[1], state[2], push)
         picture = self._pygame.transform.smoothscale(self._canvas, SCREEN)
         if self._window is None or self._clock is None:
@@ -62,7 +62,7 @@ class Screen:
         top = 0.72 * height - 66
         left, right = (width / 2 + scale * side for side in (-self._track_m, self._track_m))
         canvas.fill("#f6f4ef")
-        draw.line(canvas, "#d9d4c7", (width / 2, ground + 8), (width / 2, ground + 34), 3)  # mark of the middle
+        draw.line(canvas, "#d9d4c7", (width / 2, ground + 8), (width / 2, ground + 34), 3)  # marks the middle of the track
         draw.rect(canvas, "#8a8577", (left, ground, right - left, 8))
         for end in (left, right):
             draw.rect(canvas, "#8a8577", (end - 6, ground - 44, 12, 52), border_radius=6)
@@ -86,7 +86,7 @@ class Screen:
         draw.circle(canvas, "#f6f4ef", joint, 7)
 
     def _rod(self, start: tuple[float, float], end: tuple[float, float], color: str) -> None:
-        """A thick line with perpendicular ends, unlike pygame's line."""
+        """Draw a thick line with perpendicular ends, unlike pygame's lines."""
         (x1, y1) = start
         (x2, y2) = end
         across = 8 / (math.hypot(x2 - x1, y2 - y1) or 1)

@@ -1,7 +1,8 @@
 """envpool's compiled environments under gymnasium's ids.
 
 Rule: an id means the same environment as in gymnasium. Spaces that differ from gymnasium's are an error, and gymnasium's
-time limit applies. This file maps ids to envpool tasks and makes the env copies; `envpool_copies.py` keeps the row format.
+time limit applies. This file maps ids to envpool tasks and makes the env copies; `envpool_copies.py` makes their rows follow
+the row format.
 """
 
 from __future__ import annotations
@@ -28,20 +29,23 @@ _WARNINGS_LOCK = threading.Lock()
 
 
 class EnvpoolSpec(NamedTuple):
-    """How envpool makes copies of an environment."""
+    """The way in which envpool makes copies of an environment."""
 
     task: str
-    """envpool's name"""
+    """envpool's name of the environment"""
     options: dict[str, Any]
     """keyword arguments of `envpool.make`"""
     limit: int
-    """steps after which `EnvpoolCopies` truncates an episode; envpool itself does not"""
+    """number of steps after which `EnvpoolCopies` truncates an episode; envpool itself doesn't"""
     observation_space: gymnasium.Space[Any]
     action_space: gymnasium.Space[Any]
     """Observation and action space of one copy."""
 
     def make(self, seeds: Sequence[int]) -> VectorEnv[Any, Any, Any]:
-        """Make one env copy per seed: envpool accepts seeds only at creation. It uses one thread; each core has a worker."""
+        """Make one env copy for each seed, because envpool accepts seeds only when copies are made.
+
+        envpool uses one thread, because each core already has a worker.
+        """
         import envpool
 
         options = {**self.options, "num_threads": 1, "env_seed": list(seeds)}
@@ -53,14 +57,14 @@ class EnvpoolSpec(NamedTuple):
 
 @contextmanager
 def _ignore_warnings() -> Iterator[None]:
-    """Ignore warnings, such as those about rounded bounds. Warning filters are global, so a lock admits one thread."""
+    """Ignore warnings, such as those about rounded bounds. Warning filters are global, so only one thread may do this."""
     with _WARNINGS_LOCK, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         yield
 
 
 def envpool_spec(env: EnvSpec) -> EnvpoolSpec:
-    """How envpool makes the environment of this id. Raises `UsageError` if it cannot."""
+    """How envpool makes this environment. Raises `UsageError` if it can't."""
     check_unwrapped_id(env, "envpool")
     try:
         import envpool
@@ -86,9 +90,10 @@ def envpool_spec(env: EnvSpec) -> EnvpoolSpec:
 
 
 def _task_and_options(env: EnvSpec, known: gymnasium.envs.registration.EnvSpec) -> tuple[str, dict[str, Any]]:
-    """Task and options in envpool: from the entry point's attribute `envpool`, or the same as in gymnasium.
+    """The environment's task and options in envpool: what the entry point's attribute `envpool` returns, or the same id and
+    keyword arguments as in gymnasium.
 
-    The task is empty if another package registered the id of an envpool task, because it is another environment.
+    The task is empty if the id was registered by a package other than gymnasium, because it is then another environment.
     """
     creator = load_env_creator(known.entry_point) if isinstance(known.entry_point, str) else known.entry_point
     if (translate := getattr(creator, "envpool", None)) is not None:

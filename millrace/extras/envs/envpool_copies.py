@@ -1,8 +1,8 @@
 """The env copies of one lane in envpool, with time limits that are applied here.
 
-The rule is NextStep autoreset, which envpool keeps, and exact flags, which it does not: it reports an episode that
-terminates in the last step of its time limit as truncated only. So envpool gets a limit of one step more, and never
-reaches it: a copy that has made all its steps is truncated here, and reset explicitly in the next step.
+Rule: autoreset is NextStep, as in envpool, and flags are exact, which they aren't in envpool: it reports an episode that
+terminates in the last step before its time limit only as truncated. So envpool gets a limit that is one step longer, and
+never reaches it: this file truncates an episode at its time limit, and resets the copy explicitly in the next step.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from millrace.workers.copy_slots import close_copy, give_back
 
 
 class EnvpoolCopies:
-    """N copies in one pool. The pool is made at the first reset, because envpool takes its seeds when it is made."""
+    """N copies in one pool. The pool is made by `reset`, because envpool takes seeds only when the pool is made."""
 
     def __init__(self, pool: EnvpoolSpec, copies: int, facts: Sequence[str] = ()) -> None:
-        """`facts`: names of the numbers in `info` that belong to an episode."""
+        """`facts`: names of the numbers in `info` that are reported for each episode."""
         self.note = ""
         self._facts = facts
         self.observation_space = pool.observation_space
@@ -37,7 +37,7 @@ class EnvpoolCopies:
         self._activity = activity()
         self._env: VectorEnv[Any, Any, Any] | None = None
         self._read = make_flatten(self.observation_space)
-        self._truncated = np.zeros(copies, bool)  # [N] truncated here without envpool's knowledge
+        self._truncated = np.zeros(copies, bool)  # [N] whether the newest step was truncated here, unknown to envpool
 
     def reset(self, seeds: Sequence[int], pulse: Pulse) -> Leaves:
         """Start episodes in all copies, with a seed for each."""
@@ -68,13 +68,15 @@ class EnvpoolCopies:
         )
 
     def _step(self, actions: Array, copies: Array | None = None) -> tuple[StepResult, Array, Array]:
-        """Step these n copies, or all: the result, the number of steps [n] of their episodes, and their facts [n, names]."""
+        """Step these n copies, or all copies. Returns the result, the length so far [n] of each episode, and the facts
+        [n, names].
+        """
         observation, reward, terminated, truncated, infos = self._env.step(actions, copies)  # type: ignore[union-attr,call-arg]
         facts = facts_of_copies(self._facts, infos, len(actions)) if self._facts else np.empty((len(actions), 0))
         return StepResult(self._read(observation), reward, terminated, truncated), infos["elapsed_step"], facts
 
     def _step_and_reset(self, actions: Array) -> tuple[StepResult, Array, Array]:
-        """Reset the copies that were truncated here and step the others: the result of all, as in `_step`."""
+        """Reset the copies that were truncated here, and step the others. Returns the same as `_step`, for all copies."""
         reset = np.flatnonzero(self._truncated)
         rest = np.flatnonzero(~self._truncated)
         first = self._read(self._env.reset(reset)[0])  # type: ignore[union-attr,arg-type,call-arg]
@@ -91,7 +93,7 @@ class EnvpoolCopies:
         return StepResult(leaves, merged(result.reward), *flags), merged(elapsed), merged(facts)
 
     def assign(self, name: str, packed: bytes, pulse: Pulse) -> None:
-        """Raises `CopyFailed`: the copies are not Python objects."""
+        """Raises `CopyFailed`, because the copies aren't Python objects."""
         raise CopyFailed(None, line="envpool's env copies have no attributes")
 
     def close(self) -> None:

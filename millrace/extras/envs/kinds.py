@@ -1,4 +1,4 @@
-"""The kinds of env copies that are stepped at once: `--vector native` and `--vector envpool`."""
+"""The kinds of env copies that are stepped all at once: `--vector native` and `--vector envpool`."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ def open_native(run: RunSpec, first: EnvCopy, pulse: Pulse) -> VectorCopies:
 
 def open_envpool(run: RunSpec, first: EnvCopy, pulse: Pulse) -> EnvpoolCopies:
     """Make the copies of a lane with envpool."""
-    with activity().during(MAKING):  # the module that registers the environment is imported
+    with activity().during(MAKING):  # importing the module that registers the environment may take long
         return make_copy(first, lambda: EnvpoolCopies(envpool_spec(run.env), run.copies, run.facts))
 
 
 def native_spaces(env: EnvSpec) -> tuple[gymnasium.Space[Any], gymnasium.Space[Any]]:
-    """Observation and action space of one copy, from a vector environment that is made for this and closed."""
+    """Observation and action space of one copy. To find them, this makes a vector environment and closes it."""
     made = make_copy(FIRST_COPY, lambda: make_native(env, 1))
     spaces = made.single_observation_space, made.single_action_space
     close_copy(made)
@@ -41,7 +41,7 @@ def native_spaces(env: EnvSpec) -> tuple[gymnasium.Space[Any], gymnasium.Space[A
 
 
 def envpool_spaces(env: EnvSpec) -> tuple[gymnasium.Space[Any], gymnasium.Space[Any]]:
-    """Observation and action space of one copy. None is made."""
+    """Observation and action space of one copy. No copy is made."""
     pool = envpool_spec(env)
     return pool.observation_space, pool.action_space
 

@@ -1,4 +1,4 @@
-"""The env copies of one lane as one vector environment: any `gymnasium.vector.VectorEnv` whose autoreset is NextStep."""
+"""The env copies of one lane in one vector environment: any `gymnasium.vector.VectorEnv` with autoreset mode NextStep."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from millrace.workers.copy_slots import close_copy
 
 
 class VectorCopies:
-    """Any `gymnasium.vector.VectorEnv` with NextStep autoreset."""
+    """The env copies in a `gymnasium.vector.VectorEnv` with autoreset mode NextStep."""
 
     def __init__(
         self,
@@ -38,10 +38,7 @@ class VectorCopies:
         masked: bool = False,
         critic_keys: Sequence[str] = (),
     ) -> None:
-        """See `LoopedCopies`.
-
-        Raises `UsageError` for another autoreset mode.
-        """
+        """The arguments are those of `LoopedCopies`. Raises `UsageError` for another autoreset mode."""
         check_resets_next_step(env)
         self._env = env
         self._activity = activity()
@@ -58,7 +55,7 @@ class VectorCopies:
         self._batched = make_batched(self.action_space)
 
     def reset(self, seeds: Sequence[int], pulse: Pulse) -> Leaves:
-        """Start episodes in all copies, with a seed for each, or the first seed if the environment takes only one."""
+        """Start episodes in all copies, with a seed for each, or with the first seed if the environment accepts only one."""
         pulse()
         if len(seeds) != self._env.num_envs:
             raise UsageError(f"vector environment {self._env}: expected {len(seeds)} copies, got {self._env.num_envs}")
@@ -77,7 +74,7 @@ class VectorCopies:
             raise CopyFailed(None, "reset") from error
 
     def _first(self, seeds: Sequence[int]) -> Any:
-        """First observations, and infos. Most environments take a list of seeds, Atari an array, some one number."""
+        """Reset the environment. Most environments accept a list of seeds, Atari an array, and some only one number."""
         for seed in (list(seeds), np.array(seeds)):
             with suppress(gymnasium.error.Error, TypeError):
                 return self._env.reset(seed=seed)  # type: ignore[arg-type]
@@ -127,5 +124,5 @@ class VectorCopies:
         return of_ended(facts_of_copies(self._facts, infos, self._env.num_envs), ended)
 
     def close(self) -> None:
-        """Close it, ignoring exceptions."""
+        """Close the vector environment, ignoring exceptions."""
         close_copy(self._env)

@@ -1,7 +1,7 @@
 """An environment's own vectorized form: gymnasium's `vector_entry_point`.
 
-Rule: its autoreset mode must be NEXT_STEP: it resets in the step after the end of an episode, as a loop over env copies
-does. With another mode, last and first observations of episodes could not be distinguished.
+Rule: its autoreset mode must be NEXT_STEP: it resets a copy in the step after the end of an episode, as a loop over env
+copies does. In another mode, the last observation of an episode couldn't be distinguished from the first one of the next.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def make_native(env: EnvSpec, copies: int) -> VectorEnv[Any, Any, Any]:
 
 
 def check_unwrapped_id(env: EnvSpec, vector: str) -> None:
-    """Raises `UsageError` for environments without a vectorized form: a callable, and anything in a wrapper."""
+    """Raise `UsageError` if the environment can't have a vectorized form: a callable, or an environment in wrappers."""
     if env.wrappers:
         raise UsageError(
             f"environment {env.id}: vector {vector}: wrappers are applied to single env copies; use --vector loop"
@@ -37,7 +37,7 @@ def check_unwrapped_id(env: EnvSpec, vector: str) -> None:
 
 
 def check_resets_next_step(env: VectorEnv[Any, Any, Any]) -> None:
-    """Raises `UsageError` unless the autoreset mode is NEXT_STEP."""
+    """Raise `UsageError` unless the autoreset mode is NEXT_STEP."""
     mode = env.metadata.get("autoreset_mode")
     if mode not in {AutoresetMode.NEXT_STEP, AutoresetMode.NEXT_STEP.value}:
         raise UsageError(

@@ -1,6 +1,6 @@
-"""The command line of a launcher: its own flags, and after `--` the flags of the learner that it starts.
+"""Reads the command line of a launcher: its own flags, and after `--` the flags of the learner that it starts.
 
-Rule: settings that a cluster would refuse later are refused here, before anything is written or started.
+Rule: settings that the learner would refuse later, on the cluster, are refused here, before anything is written or started.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ Flags = TypeVar("Flags", bound=LaunchFlags)
 
 METRICS_PORT = 9464
 SET_BY_LAUNCHER = ("bind", "advertise", "run-dir", "resume", "keys", "insecure", "launched-workers")
-"""Flags of the learner that a launcher sets. The user must not set them."""
+"""Flags of the learner that a launcher sets, so the user must not set them"""
 DNS_LABEL = re.compile(r"[a-z]([-a-z0-9]{0,38}[a-z0-9])?")
 
 
@@ -38,9 +38,10 @@ def read_flags(
 
 
 def learner_flags(env: str, rest: Sequence[str], workers: int, *, bind: str, runs: str) -> list[str]:
-    """The flags of a learner on a cluster, for which this number of `workers` is started.
+    """The flags of a learner on a cluster, for which `workers` worker processes are started.
 
-    It resumes the newest run, and waits ten minutes for workers to be started.
+    With these flags, the learner resumes the newest run, and waits ten minutes for workers. `bind`: the address where they
+    join. `runs`: the folder of runs.
     """
     waits = ["--no-workers-timeout-s", "600", "--launched-workers", str(workers)]
     return [env, "--bind", bind, "--run-dir", runs, "--resume", "auto", *waits, *rest]

@@ -1,4 +1,4 @@
-"""The flags that all launchers share, and those of each."""
+"""The flags that all launchers share, and the flags of each launcher."""
 
 from __future__ import annotations
 

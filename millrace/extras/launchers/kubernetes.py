@@ -1,8 +1,8 @@
-"""`millrace launch kubernetes`: a manifest with a learner and workers. Pure, except that it reads a key folder.
+"""`millrace launch kubernetes`: makes a manifest with a learner and workers. Pure, except that it reads a key folder.
 
-The learner is a Job, which ends with the run. If its pod is lost, another resumes from the newest checkpoint. The workers
-are a Deployment, whose size may change at any time, and which stays for the next learner. The manifest contains secrets only
-if a key folder was named.
+The learner is a Job, which ends with the run. If its pod is lost, another pod resumes the run from the newest checkpoint.
+The workers are a Deployment, whose size may change at any time, and which stays for the next learner. The manifest contains
+secrets only if the user named a key folder.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ TOKEN = f"{FIRST_CLIENT}.token"
 
 
 def manifest(flags: KubernetesFlags, rest: Sequence[str], now: datetime) -> str:
-    """The manifest: YAML documents. `rest` are the user's flags for the learner. Raises `UsageError`."""
+    """The manifest, as YAML documents. `rest`: the user's flags for the learner. Raises `UsageError`."""
     keys = [_secret(flags.name, KeyFolder(expanded(flags.keys, "key folder")), now)] if flags.keys else []
     parts = [*keys, _service(flags), _storage(flags), _learner(flags, rest), _workers(flags), _budget(flags)]
     return _comments(flags) + "---\n" + "---\n".join(parts)
@@ -202,7 +202,7 @@ spec:
 
 
 def _pod() -> str:
-    """The restrictions of every pod."""
+    """The security restrictions of every pod."""
     return """\
       automountServiceAccountToken: false
       enableServiceLinks: false
@@ -211,7 +211,7 @@ def _pod() -> str:
 
 
 def _container(cpu: str, memory: str) -> str:
-    """The resources and restrictions of a container."""
+    """The resources and security restrictions of a container."""
     return f"""\
           resources:
             requests: {{cpu: {json.dumps(cpu)}, memory: {json.dumps(memory)}}}
@@ -221,5 +221,5 @@ def _container(cpu: str, memory: str) -> str:
 
 
 def _args(args: Sequence[str]) -> str:
-    """A list in YAML, with $( escaped: Kubernetes would replace $(NAME) by a variable."""
+    """A list of arguments in YAML. `$(` is escaped, because Kubernetes would replace `$(NAME)` with a variable."""
     return json.dumps([arg.replace("$(", "$$(") for arg in args])

@@ -1,6 +1,7 @@
-"""`millrace launch ray`: the learner runs in this process, on a node of a Ray cluster; the workers run in Ray actors.
+"""`millrace launch ray`: the learner runs in this process, on a node of a Ray cluster, and workers run in Ray actors.
 
-Rule: an actor runs only the worker program. Only Ray restarts actors and chooses their nodes. Actors end with the learner.
+Rule: an actor runs nothing but the worker program. Ray alone restarts actors and chooses their nodes. Actors end with the
+learner.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from millrace.protocol.keys.worker_token import read_token
 
 
 def launch(flags: RayFlags, rest: Sequence[str], watch: Watch) -> Path:
-    """Train. Returns the run folder. `rest` are the user's flags for the learner. Raises `UserFacingError`."""
+    """Train a policy. Returns the run folder. `rest`: the user's flags for the learner. Raises `UserFacingError`."""
     for name in ("processes", "port"):
         if getattr(flags, name) < 1:
             raise UsageError(f"{name}: expected int >= 1, got {getattr(flags, name)}")
@@ -60,7 +61,7 @@ def _token_text(keyring: Keyring | None) -> str:
 
 @contextmanager
 def _ray_cluster(address: str) -> Iterator[str]:
-    """Connect to the cluster. Returns the IP address by which other nodes reach this node."""
+    """A context manager that connects to the cluster, and yields the IP address by which other nodes reach this node."""
     try:
         ray.init(address=address, log_to_driver=False, logging_level=logging.WARNING)
     except (ConnectionError, RuntimeError, ValueError) as error:

@@ -1,1 +1,1 @@
-"""Monitoring: shows runs to people and to other programs. It only reads what the core reports."""
+"""Monitoring: shows runs to people, and sends their metrics to other programs. It only reads what the core reports."""

@@ -1,8 +1,8 @@
-"""Every number in metrics.jsonl and TensorBoard: its label, unit and meaning.
+"""Every number in metrics.jsonl and TensorBoard, with its label, unit and meaning. Pure.
 
-Pure. The dashboard and reference/metrics.md are made from it.
+The dashboard uses this table, and reference/metrics.md is generated from it.
 
-Rule: a number that millrace itself logs has an entry here. In a name, `NAME` stands for a name that the user chose.
+Rule: every number that millrace itself logs has an entry here. In a name, `NAME` stands for a name that the user chose.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ class Meaning(NamedTuple):
     unit: str
     text: str
     label: str = ""
-    """its label, if its name doesn't say it"""
+    """label to show; if empty, it is made from the name"""
 
 
 STEPS = "env steps"
@@ -140,15 +140,15 @@ METRICS: dict[str, dict[str, Meaning]] = {
         "custom/NAME": Meaning("its own", "A number that a callback logs with `progress.log(\"NAME\", value)`."),
     },
 }  # fmt: skip
-"""The numbers in groups, by the names under which they are logged"""
+"""The numbers in titled groups, by the names under which they are logged"""
 
 ENTRIES = {name: (title, meaning) for title, group in METRICS.items() for name, meaning in group.items()}
 
 
 def described(metric: str) -> tuple[str, Meaning]:
-    """Group and meaning of a number, from the name under which it is logged, which may be any text.
+    """The group and the meaning of the number that is logged under this name. The name may be any text.
 
-    Its label is not empty.
+    The label in the meaning is never empty.
     """
     group, _, name = metric.partition("/")
     of_user = f"{group}/NAME_missing" if name.endswith("_missing") else f"{group}/NAME"

@@ -1,7 +1,7 @@
-"""Logs a run to MLflow: settings as parameters, metrics by env steps.
+"""Logs a run to MLflow: settings as parameters, and metrics over env steps.
 
-A resumed run continues in the same MLflow run. It uses its own client, so it neither starts nor ends the active run of
-`mlflow`.
+A resumed run continues the same MLflow run. The callback uses a client of its own, so it neither starts nor ends the active
+run of the `mlflow` module.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from typing import Any
 from millrace import Progress
 from millrace.extras.monitoring.run_rows import RowCallback, flat_settings, run_name, tool
 
-MOST_PARAMETERS = 100  # of one request
-MOST_CHARACTERS = 500  # of the value of a parameter
+MOST_PARAMETERS = 100  # largest number in one request
+MOST_CHARACTERS = 500  # largest length of a parameter's value
 RUN_TAG = "millrace.run"
 
 
@@ -30,7 +30,7 @@ class MlflowCallback(RowCallback):
     """
 
     def __init__(self, experiment: str = "millrace", tracking_uri: str | None = None, every_s: float = 1.0) -> None:
-        """`tracking_uri`: by default, the one of `mlflow`. `every_s`: least number of seconds between two rows.
+        """`tracking_uri`: by default, the tracking URI of `mlflow`. `every_s`: least number of seconds between two rows.
 
         Raises `UsageError` if MLflow is not installed.
         """

@@ -1,8 +1,8 @@
-"""The learner's `/metrics` for Prometheus, by Prometheus's naming conventions.
+"""Serves the learner's metrics to Prometheus at `/metrics`. Their names follow Prometheus's conventions.
 
-Rule: the training loop publishes a whole snapshot in one assignment now and then, and never waits. The server's threads read
-    only the newest snapshot. Labels have few values: millrace's own, and at most `MAX_FACTS` names of `info_keys`; no names
-    of workers, paths or keys.
+Rule: the training loop now and then publishes a whole snapshot in one assignment, and never waits. The server's threads read
+    only the newest snapshot. Labels have few values: millrace's own, and at most `MAX_FACTS` names of `info_keys`, but never
+    names of workers, paths or keys.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ from millrace.protocol.errors import UsageError
 
 log = logging.getLogger("millrace.learner")
 
-EVERY_S = 0.5  # between snapshots
-SCRAPE_TIMEOUT_S = 5.0  # a scraper that is silent for longer loses its connection, and its thread ends
+EVERY_S = 0.5  # least time between two snapshots
+SCRAPE_TIMEOUT_S = 5.0  # if a scraper sends nothing for longer, its connection is closed, and its thread ends
 LAGS = (0, 1, 2, 4, 8, 16, 32)
 """upper bounds of the histogram's buckets, in versions"""
 STAGES = {"learner": ("wait", "update", "evaluate", "other"), "worker": ("wait", "open", "act", "step", "evaluate")}
@@ -51,7 +51,7 @@ STATES = ("active", "spare", "evaluating", "draining")
 
 
 class Observed(NamedTuple):
-    """The hub at one moment."""
+    """A snapshot of the hub, and its time."""
 
     at_s: float
     """seconds since 1970"""
@@ -70,7 +70,7 @@ class MetricsCollector(Collector):
         self._wanted = config.lanes
 
     def observe(self, hub: Hub) -> None:
-        """Take a new snapshot if the last one is old enough. Called whenever the hub has listened."""
+        """Take a new snapshot if the last one is old enough. The hub calls this whenever it has listened for messages."""
         now = self._clock()
         if self._observed is not None and 0.0 <= now - self._observed.at_s < EVERY_S:
             return
@@ -80,14 +80,14 @@ class MetricsCollector(Collector):
         self._observed = Observed(now, snapshot)
 
     def describe(self) -> Iterator[Metric]:
-        """Describe nothing in advance, so that the registry does not collect at registration."""
+        """Describe nothing in advance, because otherwise the registry would collect metrics at registration."""
         return iter(())
 
     def collect(self) -> Iterator[Metric]:
-        """All metrics. Called in a thread of the server, once for each scrape."""
+        """All metrics. A thread of the server calls this once for each scrape."""
         yield InfoMetricFamily("millrace_build", "Versions of millrace and of what decides its results.", versions())
         yield InfoMetricFamily("millrace_run", "What is trained.", self._about)
-        # Also before the first worker has joined: an autoscaler may start none without it.
+        # Reported even before the first worker has joined, because an autoscaler may need it to start one.
         wanted = "Workers with which each lane has its own: the number to scale to."
         yield GaugeMetricFamily("millrace_workers_wanted", wanted, self._wanted)
         if (observed := self._observed) is not None:
@@ -129,7 +129,7 @@ def _of_progress(hub: HubSnapshot, updates: int) -> Iterator[Metric]:
 
 
 def _of_facts(facts: Mapping[str, FactMean]) -> Iterator[Metric]:
-    """The numbers of `info_keys`. A name is the value of a label, which may be any text: the exposition escapes it."""
+    """The numbers of `info_keys`. Each name is the value of a label, which may be any text, because it is escaped."""
     means = GaugeMetricFamily(
         "millrace_episode_info_mean",
         "Numbers in info, by name: of those of the last 100 training episodes that have it.",
@@ -200,9 +200,9 @@ def _by_reason(name: str, text: str, counts: Mapping[str, int]) -> CounterMetric
 
 @contextmanager
 def metrics_server(config: Config) -> Iterator[Callable[[Hub], None]]:
-    """Serve `/metrics` at `metrics_bind` until the context ends. Yields the observer that the hub must call.
+    """A context manager that serves `/metrics` at `metrics_bind`, and yields the observer that the hub must call.
 
-    Raises `UsageError`, with a one-line message, if the port is in use.
+    Raises `UsageError`, with a one-line message, if it can't listen there.
     """
     collector = MetricsCollector(config)
     registry = CollectorRegistry()
@@ -249,7 +249,7 @@ class _IPv6(_Server):
 
 
 class _Quiet(WSGIRequestHandler):
-    """Logs no line for each scrape."""
+    """A request handler that logs no line for a scrape."""
 
     timeout = SCRAPE_TIMEOUT_S
 

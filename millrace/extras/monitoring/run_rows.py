@@ -1,7 +1,7 @@
-"""What callbacks send of a run to other programs: flattened settings, and a row of numbers every `every_s` seconds at most.
+"""The data of a run that callbacks send to other programs: flattened settings, and at most one row of numbers in `every_s`.
 
-Rule: a row with an evaluation and the last row are always sent, with what callbacks before this one logged for them. Numbers
-that are missing are left out.
+Rule: rows with an evaluation and the last row are always sent, including the numbers that callbacks before this one logged.
+Missing numbers are left out.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from millrace.protocol.errors import UsageError, refusals_of
 
 
 class RowFilter:
-    """Chooses which rows are sent."""
+    """Chooses the rows to send."""
 
     def __init__(self, every_s: float, clock: Callable[[], float] = time.monotonic) -> None:
         self._every_s = every_s
@@ -26,10 +26,10 @@ class RowFilter:
         self._sent_s: float | None = None
         self._sent_update = -1
         self._logged_update = -1
-        self._logged: dict[str, float | None] = {}  # for the row of this update
+        self._logged: dict[str, float | None] = {}  # numbers that callbacks logged for the row of this update
 
     def due(self, progress: Progress) -> dict[str, float] | None:
-        """The row of the last update, if it is to be sent now."""
+        """The row of the last update, if it is time to send one; otherwise None."""
         self._remember_logged(progress)
         now = self._clock()
         if self._sent_s is not None and now - self._sent_s < self._every_s:
@@ -38,7 +38,7 @@ class RowFilter:
         return self.last(progress)
 
     def last(self, progress: Progress) -> dict[str, float] | None:
-        """The row of the last update, unless it was sent."""
+        """The row of the last update; None if it was already sent."""
         self._remember_logged(progress)
         if progress.updates == self._sent_update or not (progress.metrics or progress.lags):
             return None
@@ -46,7 +46,9 @@ class RowFilter:
         return numbers(progress.row({**progress.metrics, **self._logged}))
 
     def _remember_logged(self, progress: Progress) -> None:
-        """The run forgets these numbers when it has written the row; here it may not have been sent."""
+        """Remember the numbers that callbacks logged. The run forgets them when it has written the row to metrics.jsonl, but
+        the row may not have been sent by then.
+        """
         if progress.updates != self._logged_update:
             self._logged_update = progress.updates
             self._logged = {}
@@ -54,18 +56,18 @@ class RowFilter:
 
 
 class RowCallback(Callback):
-    """Sends rows to a tool. A subclass for each tool says how: `_begin`, `_send`, `_end`.
+    """The base of callbacks that send rows to a tool. A subclass for each tool implements `_begin`, `_send` and `_end`.
 
-    What the tool refuses ends the run, in one line that names the tool.
+    An error of the tool ends the run, with a message of one line that names the tool.
     """
 
     def __init__(self, tool: str, every_s: float) -> None:
-        """`tool`: the module of this tool. `every_s`: least number of seconds between two rows."""
+        """`tool`: the name of the tool's module. `every_s`: least number of seconds between two rows."""
         self._tool = tool
         self._rows = RowFilter(every_s)
 
     def on_start(self, progress: Progress) -> None:
-        """Begin a run with this folder's name, or continue the existing one. Log the numbers of cloning, if any."""
+        """Begin a run with the name of the run folder, or continue the existing one. Log the numbers of cloning, if any."""
         with refusals_of(self._tool):
             self._begin(progress)
         self._log(self._rows.last(progress), progress)
@@ -104,7 +106,7 @@ class RowCallback(Callback):
 
 
 def logged(progress: Progress) -> dict[str, float | None]:
-    """What callbacks have logged at this moment of the run."""
+    """The numbers that callbacks have logged for the current row."""
     return {} if progress.requests is None else progress.requests.logged()
 
 
@@ -114,7 +116,7 @@ def numbers(row: dict[str, float | None]) -> dict[str, float]:
 
 
 def flat_settings(progress: Progress) -> dict[str, Any]:
-    """All settings of the run by name; those of a table as env_kwargs.gravity or algorithm.learning_rate."""
+    """All settings of the run by name. Settings in a table are called env_kwargs.gravity or algorithm.learning_rate."""
     flat: dict[str, Any] = {}
     for name, value in progress.settings.items():
         flat |= {f"{name}.{key}": inner for key, inner in value.items()} if isinstance(value, dict) else {name: value}

@@ -1,7 +1,7 @@
 """Writes the metrics of a run as TensorBoard events, into the folder tensorboard of the run folder.
 
-Rule: events that the disk refuses are written later, as with all files of a run. A resumed run writes its own file,
-which tells TensorBoard to forget what came after the checkpoint.
+Rule: events that can't be written, for example because the disk is full, are written later, like all files of a run. A
+resumed run writes a file of its own, which tells TensorBoard to discard the events after the checkpoint.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from millrace.learner.run_folder.record_file import RecordFile
 from millrace.learner.run_folder.run_folder import RunFolder
 from millrace.protocol.errors import RunError
 
-EVERY_S = 0.2  # a fast run makes a hundred updates in that time, and an event takes as long as a small minibatch
+EVERY_S = 0.2  # a fast run makes a hundred updates in this time, and writing an event takes as long as a small minibatch
 
 
 class TensorBoardCallback(RowCallback):
-    """Writes a row in `EVERY_S` seconds, every row with an evaluation, and the last."""
+    """Writes one row every `EVERY_S` seconds, and in addition every row with an evaluation and the last row."""
 
     def __init__(self, folder: RunFolder, every_s: float = EVERY_S) -> None:
         """`every_s`: least number of seconds between two rows."""
@@ -61,9 +61,9 @@ class TensorBoardCallback(RowCallback):
 
 
 def _framed(event: Event) -> bytes:
-    """An event as TensorBoard frames it: length, checksum of the length, event, checksum of the event.
+    """An event in TensorBoard's framing: length, checksum of the length, event, checksum of the event.
 
-    TensorBoard's own writer would start a thread.
+    TensorBoard's own event writer isn't used, because it would start a thread.
     """
     framed = io.BytesIO()
     RecordWriter(framed).write(event.SerializeToString())

@@ -1,4 +1,4 @@
-"""Logs a run to Weights & Biases: settings, metrics, evaluations. A resumed run continues under the same id."""
+"""Logs a run to Weights & Biases: its settings, metrics and evaluations. A resumed run continues under the same id."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class WandbCallback(RowCallback):
     """
 
     def __init__(self, every_s: float = 1.0, **init: Any) -> None:
-        """`every_s`: least number of seconds between two rows. `init`: arguments of `wandb.init`.
+        """`every_s`: least number of seconds between two rows. `init`: keyword arguments of `wandb.init`.
 
         Raises `UsageError` if wandb is not installed.
         """

@@ -1,4 +1,4 @@
-"""A web page over run folders and running learners."""
+"""A web page that shows run folders and running learners."""
 
 from millrace.extras.monitoring.dashboard.page_beside import Dashboard
 

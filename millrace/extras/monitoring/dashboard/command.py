@@ -28,7 +28,7 @@ class DashboardFlags(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def dashboard(argv: list[str]) -> int:
-    """Serve the dashboard until Ctrl-C. Its address is printed first."""
+    """Print the address of the dashboard, and serve it until Ctrl-C. Returns the exit code."""
     flags = parse_flags(DashboardFlags, argv, "dashboard")
     folders = flags.folders or (Path("runs"),)
     host, port = where_to_listen(flags.bind, insecure=flags.insecure)
@@ -43,7 +43,7 @@ def dashboard(argv: list[str]) -> int:
 
 
 def where_to_listen(bind: str, *, insecure: bool) -> tuple[str, int]:
-    """Host and port. Raises `UsageError` for an address that others can reach, unless `insecure`."""
+    """The host and port in `bind`. Raises `UsageError` for an address that others can reach, unless `insecure`."""
     host, _, port = bind.rpartition(":")
     if not (host and port.isascii() and port.isdecimal() and int(port) < 65_536):
         raise UsageError(f"dashboard: bind {bind}: expected HOST:PORT, as in 127.0.0.1:8080")

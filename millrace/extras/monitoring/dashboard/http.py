@@ -1,8 +1,8 @@
 """The part of HTTP that the dashboard needs: a request in, an answer out. Pure.
 
 Rule: a request is refused unless its method, its Host and the token at the beginning of its path are right. A wrong token is
-    answered like a wrong path, so that nothing shows how close a guess was. Every answer forbids the browser everything that
-    its page doesn't need.
+    answered like a wrong path, so that an answer doesn't help to guess the token. Every answer forbids the browser
+    everything that its page doesn't need.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ REASONS = {
     421: "Misdirected Request",
     500: "Internal Server Error",
 }
-MOST_FIELDS = 100  # of a query
+MOST_FIELDS = 100  # largest number of fields in a query
 PART_BYTES = 1 << 18
-RANGE = re.compile(r"bytes=([0-9]{0,15})-([0-9]{0,15})")  # one part; for several, the whole body is sent
+RANGE = re.compile(r"bytes=([0-9]{0,15})-([0-9]{0,15})")  # a single part; if several are requested, the whole body is sent
 
 
 class PageRequest(NamedTuple):
@@ -47,20 +47,21 @@ class PageRequest(NamedTuple):
 
     method: str
     path: tuple[str, ...]
-    """the parts of the path, the token among them"""
+    """the parts of the path; the first one is the token"""
     query: Mapping[str, list[str]]
     headers: Mapping[str, str]
-    """by lowercase name"""
+    """the headers, by lowercase name"""
 
 
 class StoredBody(NamedTuple):
-    """A body of which only the requested part is read."""
+    """The body of an answer in a file, of which only the requested part is read."""
 
     tag: str
-    """differs if the content differs"""
+    """entity tag: it differs if the content differs"""
     size: int
+    """number of bytes"""
     read: Callable[[int, int], bytes]
-    """reads from one offset up to another"""
+    """reads the bytes from one offset up to another"""
 
 
 class PageAnswer(NamedTuple):
@@ -72,12 +73,12 @@ class PageAnswer(NamedTuple):
 
 
 def refusal(status: int) -> PageAnswer:
-    """An answer with only its status."""
+    """An answer whose text is only the status."""
     return PageAnswer(f"{status} {REASONS[status]}\n".encode(), "text/plain; charset=utf-8", status)
 
 
 def parsed(head: bytes) -> PageRequest | None:
-    """The request in these lines; None if they aren't one."""
+    """The request in the head of an HTTP message; None if the head isn't valid."""
     first, *lines = head.decode("latin-1").split("\r\n")
     method, _, rest = first.partition(" ")
     target, _, version = rest.partition(" ")
@@ -98,7 +99,7 @@ def parsed(head: bytes) -> PageRequest | None:
 
 
 def why_refused(request: PageRequest | None, token: str, hosts: Collection[str]) -> int:
-    """The status with which a request is refused; 0 if it is not. `hosts`: allowed values of Host; empty: any."""
+    """The status with which a request is refused; 0 if it is accepted. `hosts`: allowed values of Host; empty: any."""
     if request is None:
         return 400
     if hosts and request.headers.get("host", "").lower() not in hosts:
@@ -109,10 +110,10 @@ def why_refused(request: PageRequest | None, token: str, hosts: Collection[str])
 
 
 def answer_parts(request: PageRequest | None, answer: PageAnswer) -> Iterator[bytes]:
-    """The answer in the parts in which it is sent.
+    """The bytes of an answer, in the parts in which they are sent.
 
-    The first has the head, and a body is read as it is sent. If the browser already has the same content, or requested only
-    the head, it gets no body.
+    The first part contains the head. A body is read part by part while it is sent. If the browser already has the same
+    content, or requested only the head, the answer has no body.
     """
     headers = dict(HEADERS)
     whole = _stored(answer.body)
@@ -146,7 +147,7 @@ def _stored(body: bytes | StoredBody) -> StoredBody:
 
 
 def _wanted_part(headers: Mapping[str, str], tag: str, size: int) -> range | None:
-    """The bytes that a Range requests, empty if they don't exist; None if all are requested (RFC 9110, section 14)."""
+    """The range of bytes that the browser requests, empty if they don't exist; None for all (RFC 9110, section 14)."""
     match = RANGE.fullmatch(headers.get("range", ""))
     if match is None or not any(match.groups()) or headers.get("if-range", tag) != tag:
         return None

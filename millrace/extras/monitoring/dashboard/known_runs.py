@@ -1,7 +1,7 @@
-"""The runs that the dashboard shows, read from their folders repeatedly.
+"""The runs that the dashboard shows, which it reads repeatedly from their folders.
 
-Rule: unchanged files are not read again, and only a bounded number of rows of a long metrics.jsonl is kept. A run has a key,
-which addresses contain instead of its path.
+Rule: unchanged files are not read again, and only a bounded number of rows of a long metrics.jsonl is kept. Addresses of
+pages contain a run's key instead of its path.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from millrace.protocol.bounds import escaped
 from millrace.protocol.errors import UsageError
 
 CHANGES = ("", CONFIG_FILE, RUN_FILE, PROGRESS_FILE, SUMMARY_FILE, METRICS_FILE, RUN_LOG_FILE, "videos")
-MOST_KEPT = 64  # runs whose rows are in memory
+MOST_KEPT = 64  # largest number of runs whose rows are in memory
 MOST_LOGS = 4
 LOG_BYTES = 4_096
 
 
 class RunContent(NamedTuple):
-    """A run with its rows."""
+    """The content of a run folder, with its rows of metrics."""
 
     report: ReportedRun
     rows: list[dict[str, Any]]
@@ -42,7 +42,7 @@ class KnownRuns:
     """Finds and reads runs. Used by one thread."""
 
     def __init__(self, folders: Sequence[Path], clock: Callable[[], float]) -> None:
-        """`clock`: wall-clock time."""
+        """`clock`: returns the time in seconds since 1970."""
         self._folders = folders
         self._clock = clock
         self._tails: dict[Path, MetricsTail] = {}
@@ -55,7 +55,7 @@ class KnownRuns:
         return self._folders[0] if len(self._folders) == 1 and is_run_folder(self._folders[0]) else None
 
     def find(self) -> dict[str, Path]:
-        """The runs by their keys, the newest first. Folders that don't exist any more have none."""
+        """The runs by their keys, the newest first. Folders that no longer exist are skipped."""
         runs: list[Path] = []
         for folder in self._folders:
             try:
@@ -65,7 +65,7 @@ class KnownRuns:
         return {key_of(run): run for run in runs}
 
     def line(self, run: Path) -> RunLine:
-        """Its line in a list of runs."""
+        """The line of this run in a list of runs."""
         now = self._clock()
         changed = _changes(run)
         before, line = self._lines.get(run, (None, None))
@@ -75,9 +75,9 @@ class KnownRuns:
         return line
 
     def content(self, run: Path) -> RunContent:
-        """The content of its folder that its page shows.
+        """The content of this run's folder that its page shows.
 
-        Raises `UsageError`, with a one-line message, if it cannot be read.
+        Raises `UsageError`, with a one-line message, if the folder can't be read.
         """
         changed = _changes(run)
         before, content = self._read.pop(run, (None, None))
@@ -91,7 +91,7 @@ class KnownRuns:
                 raise UsageError(f"run {run}: {METRICS_FILE} cannot be read: {reason(error)}") from error
             rows = tail.rows
             content = RunContent(read_run(run, rows), rows)
-        self._read[run] = changed, content  # last in the table: the first is the run that was not requested for longest
+        self._read[run] = changed, content  # at the end: the first run in the table is the least recently requested one
         while len(self._read) > MOST_KEPT:
             oldest = next(iter(self._read))
             del self._read[oldest]
@@ -100,12 +100,12 @@ class KnownRuns:
 
 
 def key_of(run: Path) -> str:
-    """The key of a run in addresses."""
+    """The key that stands for a run in addresses: 12 hexadecimal digits."""
     return blake2b(os.fsencode(run.absolute()), digest_size=6).hexdigest()
 
 
 def newest_logs(run: Path) -> list[tuple[str, str]]:
-    """Name and last lines of the most recently written logs of local workers."""
+    """The names and last lines of local workers' logs, the most recently written first."""
     logs = regular_files(run, "workers/*.log")
     ends_of_logs = []
     for path in sorted(logs, key=_written, reverse=True)[:MOST_LOGS]:
@@ -129,7 +129,7 @@ def _written(path: Path) -> int:
 
 
 def _changes(run: Path) -> tuple[object, ...]:
-    """A value that changes whenever one of its files was written."""
+    """A value that changes whenever one of the run's files is written."""
     stamps: list[object] = []
     for name in CHANGES:
         try:

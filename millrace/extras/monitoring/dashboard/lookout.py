@@ -1,7 +1,7 @@
-"""Asks the learners of the runs on open pages twice a second, and remembers the answers of the last minutes.
+"""Asks the learners of the runs on open pages for their status twice a second, and keeps the answers of the last minutes.
 
-Rule: a learner is asked like by `millrace status`, with the same rights, and only while a page of its run is open. The
-memory for a run is bounded, and freed when no page is open. An open page requests it once a second (`page.js`).
+Rule: a learner is asked in the same way as by `millrace status`, with the same rights, and only while a page of its run is
+open. The memory for a run is bounded, and freed when no page is open. An open page calls `look` once a second (`page.js`).
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from millrace.protocol.wire.codec import encode
 from millrace.protocol.wire.worker_link import OF_OBSERVER, WorkerLink
 
 ASK_EVERY_S = 0.5
-LOOKED_AT_S = 10.0  # an open page asks each second
-FORGOTTEN_S = 300.0
-SILENT_S = 5.0
-PAUSE_S = 10.0  # a message without an end fills the memory until the connection is closed
-SAMPLES = 400
+LOOKED_AT_S = 10.0  # a page counts as open for this long after its last request; an open page requests once a second
+FORGOTTEN_S = 300.0  # after this time without an open page, the answers are freed
+SILENT_S = 5.0  # after this time without an answer, the connection is closed
+PAUSE_S = 10.0  # time until the next connection; a message without an end would fill the memory while a connection is open
+SAMPLES = 400  # number of answers to keep
 MOST_LANES = 64  # largest number of lanes shown
 ANSWER_WITHIN_S = 0.5
-MOST_ANSWERS = 4  # most answers read each second: a learner may send more than requested
+MOST_ANSWERS = 4  # largest number of answers to read at a time, because a learner may send more than requested
 
 LEARNER: dict[str, str] = {
     "gathering": "waiting",
@@ -40,7 +40,7 @@ LEARNER: dict[str, str] = {
     "evaluating": "evaluating",
     "starting": "starting",
 }
-"""What a learner is doing in each phase, in the words of the picture"""
+"""What the picture says that a learner is doing, for each phase of its progress"""
 WORKER = {
     "stepping": "collecting",
     "repeating": "resetting",
@@ -54,7 +54,7 @@ WORKER = {
     "closing": "resetting",
     "waiting": "waiting",
 }
-"""What a lane is doing for each activity of its worker"""
+"""What the picture says that a lane is doing, for each activity of its worker"""
 
 
 class LaneSample(NamedTuple):
@@ -69,7 +69,7 @@ class Seen(NamedTuple):
     """What is known about a running learner."""
 
     status: Status | None = None
-    """its newest answer"""
+    """the newest answer"""
     samples: tuple[LaneSample, ...] = ()
     problem: str = ""
     """why there is no answer"""
@@ -77,7 +77,7 @@ class Seen(NamedTuple):
 
 @dataclass
 class _Watched:
-    """A run whose page is open, or was a short while ago."""
+    """A run whose page is open, or was open a short while ago."""
 
     looked_s: float
     link: WorkerLink | None = None
@@ -85,7 +85,7 @@ class _Watched:
     status: Status | None = None
     answered_s: float = 0.0
     silent_since_s: float = 0.0
-    """since its newest answer, or since the connection"""
+    """the time of the newest answer, or of the connection if there was no answer since"""
     ask_again_s: float = 0.0
     problem: str = ""
     samples: deque[LaneSample] = field(default_factory=lambda: deque(maxlen=SAMPLES))
@@ -99,13 +99,13 @@ def sample(status: Status, now: float) -> LaneSample:
 
 
 def _doing(worker: WorkerStatus) -> str:
-    if not worker.doing:  # it has no supervisor
+    if not worker.doing:  # a worker without a supervisor doesn't report its activity
         return "collecting" if worker.tickets else "waiting"
     return WORKER.get(worker.doing, "")
 
 
 class Lookout:
-    """Watches runs in a thread, while it is entered."""
+    """A context manager that watches runs in a thread."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
@@ -123,7 +123,7 @@ class Lookout:
         self._thread.join()
 
     def look(self, run: Path) -> Seen:
-        """What is known about the learner of this run. It is asked from now on, as long as a page of it is open."""
+        """What is known about the learner of this run. From now on, the learner is asked while a page of the run is open."""
         with self._lock:
             watched = self._watched.setdefault(run, _Watched(self._clock()))
             watched.looked_s = self._clock()

@@ -1,4 +1,4 @@
-"""Starts a dashboard beside a program or a run, in its own process, so that neither has to wait for it."""
+"""Starts a dashboard alongside a program or a run, in a process of its own, so that neither has to wait for it."""
 
 from __future__ import annotations
 
@@ -26,9 +26,10 @@ log = logging.getLogger("millrace.learner")
 
 
 class Dashboard:
-    """Runs in a browser, until it is closed or this program ends. A notebook shows it in the cell.
+    """Shows runs in a browser, until it is closed or this program ends. A notebook shows the page in the cell.
 
-    Its `address` is on this machine; anyone who has it sees everything in these runs. Raises `RunError` if it doesn't start.
+    `address` is the page's address on this machine. Anyone who knows it can see everything in these runs. Raises `RunError`
+    if the dashboard doesn't start.
 
     >>> from millrace.extras.monitoring.dashboard import Dashboard
     >>> with Dashboard("runs") as dashboard:
@@ -36,13 +37,13 @@ class Dashboard:
     """
 
     def __init__(self, *runs: str | os.PathLike[str]) -> None:
-        """`runs`: run folders, or folders of them; if none is given, the folder runs."""
+        """`runs`: run folders, or folders that contain run folders; by default, the folder `runs`."""
         folders = [os.fspath(run) for run in runs or ("runs",)]
         command = [sys.executable, "-P", "-m", "millrace.extras.monitoring.dashboard.serve", *folders]
         pipe = subprocess.PIPE
-        # It must find millrace where this program found it, perhaps in a clone that isn't installed.
+        # The process must import millrace from the same place as this program, which may be a clone that isn't installed.
         path = os.pathsep.join(entry or os.getcwd() for entry in sys.path)
-        # Only this program gets the Ctrl-C of the terminal, so that open pages show how the run ended.
+        # In its own session, the process doesn't get the terminal's Ctrl-C, so that open pages can show how the run ended.
         self._process = subprocess.Popen(
             command,
             env={**os.environ, "PYTHONPATH": path},
@@ -59,12 +60,12 @@ class Dashboard:
             raise RunError(f"dashboard: it did not start: {self.address or 'it printed nothing'}")
 
     def close(self) -> None:
-        """End it at once."""
+        """End the dashboard at once."""
         self._process.kill()
         self._process.communicate()
 
     def let_end(self) -> None:
-        """Let it end a short while after this call, so that open pages show how a run has ended."""
+        """Let the dashboard end a short while after this call, so that open pages can show how the run ended."""
         threading.Thread(target=self._process.communicate, name="dashboard-ends", daemon=True).start()
 
     def __enter__(self) -> Self:
@@ -84,7 +85,7 @@ class Dashboard:
 
 @contextmanager
 def page_of_run(run: Path) -> Iterator[None]:
-    """Serve the page of a run while this is entered, and log its address. A run continues without it if it doesn't start."""
+    """A context manager that serves the page of a run and logs its address. If it can't be served, the run continues."""
     page = _started(run)
     try:
         if page is not None:

@@ -1,7 +1,7 @@
 """The parts of a run's page that a report doesn't have: its current state, its workers, a curve of any metric. Pure.
 
-Rule: text from run folders and from learners is escaped. The page uses plain words; the names of fields are next to them if
-    a reader may look for them elsewhere.
+Rule: text from run folders and from learners is escaped. The page uses plain words, and shows a field's name next to them if
+    a reader may know it from elsewhere.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from millrace.protocol.bounds import escaped
 from millrace.protocol.messages import Status, WorkerStatus
 
 WIDE = 1080, 360
-SHOWN_S = 180.0  # seconds in the picture of who waits for whom
+SHOWN_S = 180.0  # the time that the picture "Who waits for whom" covers
 LEAST_SHOWN_S = 30.0
 COLORS = {
     "collecting": "b1",
@@ -50,10 +50,10 @@ COLORS = {
     "waiting": "wait",
     "no worker": "gone",
 }
-"""Class in the style sheet for each activity of a lane or the learner"""
+"""For each activity of a lane or the learner, its class in the style sheet"""
 COLUMNS = {"Worker": "", "Process": "late", "Doing": "", "Lanes": "", "Steps/s": "number", "Weights": "",
            "Heard": "number", "Memory": "number"}  # fmt: skip
-"""Columns of the table of workers, with their classes in the style sheet"""
+"""The columns of the table of workers, with their classes in the style sheet"""
 MOST_SMOOTHED = 100
 MOST_LINES = 10  # most lines of evaluations
 MIB = 2**20
@@ -65,11 +65,11 @@ class Choice(NamedTuple):
     metric: str = RETURN_KEY
     over_time: bool = False
     smooth: int = 1
-    """number of rows over which a moving mean is taken"""
+    """number of rows in the moving mean; 1: no smoothing"""
 
     @staticmethod
     def of(query: Mapping[str, Sequence[str]]) -> Choice:
-        """The choice in the query of an address; missing or wrong parts are the defaults."""
+        """The choice in the query of an address. Missing or wrong parts are replaced by defaults."""
 
         def first(name: str, default: str) -> str:
             return query.get(name, [default])[0]
@@ -80,9 +80,9 @@ class Choice(NamedTuple):
 
 
 def head(line: RunLine, seen: Seen, report: ReportedRun | None, home: str) -> str:
-    """Which run it is, one sentence on what it is doing or how it ended, and its newest warning.
+    """The head of the page: which run it is, a sentence about what it is doing or how it ended, and its newest warning.
 
-    `home`: the page of all runs, if it shows others.
+    `home`: the address of the page of all runs; empty if the dashboard shows only this run.
     """
     warned = "" if report is None else last_warning(report.log)
     kicker = f'<a href="{home}">millrace: all runs</a>' if home else "millrace"
@@ -95,7 +95,10 @@ def head(line: RunLine, seen: Seen, report: ReportedRun | None, home: str) -> st
 
 
 def now_sentence(line: RunLine, problem: str) -> str:
-    """What the run is doing now, and what slows it down or is wrong. `problem`: why its learner doesn't answer."""
+    """Text about what the run is doing now, what slows it down, and what went wrong.
+
+    `problem`: why its learner doesn't answer, if it doesn't.
+    """
     if line.state != "training":
         return headline(line)
     held_up = f"Who waits for whom is not known: {problem}." if problem else bottleneck(line.progress)
@@ -104,7 +107,7 @@ def now_sentence(line: RunLine, problem: str) -> str:
 
 
 def last_warning(log: Sequence[LoggedLine]) -> str:
-    """The newest warning; empty if there was none."""
+    """The newest warning, with a link to the others; empty if there was none."""
     warnings = [line for line in log if line.level != "info"]
     if not warnings:
         return ""
@@ -115,7 +118,7 @@ def last_warning(log: Sequence[LoggedLine]) -> str:
 
 
 def facts(line: RunLine) -> str:
-    """The most important numbers."""
+    """The most important numbers of the run."""
     progress = line.progress
     evaluation = line.summary.evaluation if line.summary else None
     cells = {
@@ -159,7 +162,7 @@ def curve(rows: Sequence[Mapping[str, Any]], choice: Choice) -> str:
 
 
 def smoothed(y: Doubles, rows: int) -> Doubles:
-    """The mean of each value and the values before it, over at most this many rows."""
+    """The moving mean of each value [K] and the values before it, over at most this many rows."""
     sums = np.concatenate([[0.0], np.cumsum(y / rows)])
     ends = np.arange(1, len(y) + 1)
     begins = np.maximum(0, ends - rows)
@@ -194,7 +197,7 @@ def _option(value: str, text: str, chosen: str) -> str:
 
 
 def workers(seen: Seen) -> str:
-    """The workers by machine."""
+    """The table of workers, grouped by machine; empty if the learner hasn't answered."""
     if seen.status is None:
         return ""
     hosts: dict[str, list[WorkerStatus]] = {}
@@ -233,7 +236,7 @@ def _worker(worker: WorkerStatus, status: Status) -> str:
 
 
 def who_waits(seen: Seen) -> str:
-    """A row for the learner and for each lane, with its activities in the last minutes."""
+    """The picture with a row for the learner and for each lane, which shows their activities in the last minutes."""
     if not seen.samples:
         return ""
     end_s = seen.samples[-1].at_s
@@ -250,7 +253,7 @@ def who_waits(seen: Seen) -> str:
 
 
 def _segments(samples: Sequence[LaneSample], kinds: Sequence[str]) -> list[Segment]:
-    """Equal neighbours are one segment. A sample lasts until the next, and no longer than two seconds."""
+    """The segments of a row. Neighbours of the same kind are joined. A sample lasts until the next one, at most 2 s."""
     end_s = samples[-1].at_s + 1.0
     segments = list[Segment]()
     span_s = max(LEAST_SHOWN_S, end_s - samples[0].at_s)
@@ -272,14 +275,15 @@ def _segments(samples: Sequence[LaneSample], kinds: Sequence[str]) -> list[Segme
 
 
 def evaluations(rows: Sequence[Mapping[str, Any]], kept: Best | None = None) -> str:
-    """The newest evaluations, and the best of all.
+    """The table of the newest evaluations, with a sentence about the best one.
 
-    `kept`: the best one in the results of a run that has ended. It may be that of the final policy, which has no row here.
+    `kept`: the best evaluation in the summary of a run that has ended. It may be the evaluation of the final policy, which
+    isn't in `rows`.
     """
     returns, lengths = (points(rows, key) for key in (EVALUATION_KEY, EVALUATION_LENGTH_KEY))
     if not len(returns):
         return ""
-    best = len(returns) - 1 - int(returns[::-1, 1].argmax())  # the newest among equally good ones, like the run
+    best = len(returns) - 1 - int(returns[::-1, 1].argmax())  # the newest of equally good ones, as in the run
     at, highest = returns[best] if kept is None else (kept.env_steps, kept.chosen_by)
     length_at = dict(lengths.tolist())
     which = f"The best of {len(returns)}" if kept is None else "The best of all, that at the end included,"

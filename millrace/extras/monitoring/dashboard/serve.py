@@ -1,8 +1,7 @@
 """Serves the dashboard.
 
-As a program, it serves one for the program that started it, until that program ends or closes its input.
-
-`python -m millrace.extras.monitoring.dashboard.serve RUNS ...` prints the address of the first page, or why there is none.
+`python -m millrace.extras.monitoring.dashboard.serve RUNS ...` serves a dashboard for the program that started it, until
+that program ends or closes this program's standard input. It prints the address of the first page, or why there is none.
 """
 
 from __future__ import annotations
@@ -24,13 +23,13 @@ from millrace.learner.interrupts import Interrupts, Stopped
 from millrace.protocol.errors import UserFacingError
 
 LOOK_FOR_SIGNALS_S = 0.1
-LINGER_S = 2.5  # so that pages which are open show the end
+LINGER_S = 2.5  # time that is left for open pages to show the end of the run
 
 
 def serve(folders: Sequence[Path], host: str, port: int, listening: Callable[[str], None]) -> None:
     """Serve until Ctrl-C. `listening` is called with the address of the first page. Raises `UsageError`.
 
-    Training on this machine goes first: this process has the lowest priority.
+    This gives the process the lowest priority, so that it doesn't slow training on this machine.
     """
     os.nice(19)
     with Lookout() as lookout, Interrupts() as interrupts:
@@ -41,9 +40,9 @@ def serve(folders: Sequence[Path], host: str, port: int, listening: Callable[[st
 
 
 async def _until_stopped(serving: Coroutine[None, None, None], interrupts: Interrupts) -> None:
-    """Serve until a signal has come.
+    """Serve until a signal arrives.
 
-    Signals are polled, because an exception in a handler would end whatever runs at that moment.
+    Signals are polled, because an exception in a signal handler would interrupt any code that runs at that moment.
     """
     task = asyncio.ensure_future(serving)
     while not interrupts.received and not task.done():
@@ -57,7 +56,7 @@ async def _until_stopped(serving: Coroutine[None, None, None], interrupts: Inter
 def _end_with_input() -> None:
     sys.stdin.buffer.read()
     time.sleep(LINGER_S)
-    os._exit(0)  # there is nothing to save
+    os._exit(0)  # at once, because there is nothing to save
 
 
 def _say(line: str) -> None:
@@ -66,7 +65,7 @@ def _say(line: str) -> None:
 
 
 def main() -> None:
-    """Serve at a free port of this machine."""
+    """Serve at a free port of this machine, for the program that started this one."""
     threading.Thread(target=_end_with_input, daemon=True).start()
     try:
         serve([Path(folder) for folder in sys.argv[1:]], "127.0.0.1", 0, _say)

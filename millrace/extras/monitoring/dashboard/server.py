@@ -1,7 +1,7 @@
-"""The dashboard's sockets: connections in, answers of `site.py` out.
+"""The dashboard's sockets: they accept connections and send the answers of `site.py`. No files are written.
 
-No files are written. Rule: no client can block it. A connection has one request; its head, and each part of the answer, have
-a deadline and a size. If there are too many connections, the oldest one is closed. Pages are made one at a time in a thread.
+Rule: no client can block the server. A connection has one request. Its head, and each part of the answer, have a deadline
+and a largest size. If there are too many connections, the oldest one is closed. Pages are made one at a time in a thread.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class DashboardServer:
         finally:
             for connection in self._open:
                 connection.cancel()
-            await asyncio.gather(*self._open)  # before the thread that they wait for is gone
+            await asyncio.gather(*self._open)  # before the thread that they wait for ends
             self._pages.shutdown(wait=False, cancel_futures=True)
 
     async def _connected(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -64,7 +64,7 @@ class DashboardServer:
         self._open[task] = None
         if len(self._open) > MOST_CONNECTIONS:
             oldest = next(iter(self._open))
-            del self._open[oldest]  # so that the next one closes another
+            del self._open[oldest]  # so that the next new connection closes another one
             oldest.cancel()
         try:
             with suppress(

@@ -36,7 +36,7 @@ MOST_COMPARED = 50
 MEDIA = {".mp4": "video/mp4", ".png": "image/png"}
 
 Look = Callable[[Path], Seen]
-"""What is known about the learner of a run, which is asked from now on"""
+"""Returns what is known about the learner of a run, and has the learner asked from now on"""
 
 
 class Site:
@@ -47,7 +47,7 @@ class Site:
         self._look = look
 
     def answer(self, request: PageRequest) -> PageAnswer:
-        """The page, or part of it. The first part of the path, the token, is right."""
+        """The page, or the part of it that was requested. The token in the path was already checked."""
         home = f"/{quote(request.path[0])}/"
         match request.path[1:]:
             case ("",) if (run := self._runs.only) is not None:
@@ -127,7 +127,7 @@ class Site:
         return "\n".join(filter(None, parts))
 
     def _file(self, key: str, parts: Sequence[str]) -> PageAnswer:
-        """A file that a page of its run shows, and never another one."""
+        """A file of a run, if the run's page shows it; otherwise status 404."""
         run = self._runs.find().get(key)
         try:
             shown = self._runs.content(run).report if run is not None else None
@@ -145,7 +145,7 @@ class Site:
 
 
 def _stored(path: Path) -> StoredBody:
-    """The content of a file, if it is not too large. Raises `OSError`."""
+    """The content of a file. Raises `OSError` if it is too large or can't be read."""
 
     def read(begin: int, end: int) -> bytes:
         with os.fdopen(open_regular(path), "rb") as file:
@@ -159,7 +159,7 @@ def _stored(path: Path) -> StoredBody:
 
 
 def comparison(report: ReportData) -> list[str]:
-    """The parts of a report, without its videos."""
+    """The sections that compare runs: those of a report, without videos and pictures."""
     parts = [
         sections.results,
         sections.curves,

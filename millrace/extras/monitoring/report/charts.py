@@ -1,6 +1,6 @@
 """Charts as SVG text: axes, lines, bands, dots. Pure. The style sheet sets the colors, by class, so that dark mode works.
 
-Rule: up to 56 lines look different. After the seven colors of the style sheet, each is used again with dashes.
+Rule: up to 56 lines look different. After the seven colors of the style sheet, the colors are used again with dashes.
 """
 
 from __future__ import annotations
@@ -15,32 +15,32 @@ import numpy as np
 from millrace.protocol.arrays import Doubles
 
 COLORS = 7  # number of colors in the style sheet
-DASHES = ("", "7 6", "0.1 5", "9 5 0.1 5", "15 6", "9 5 0.1 5 0.1 5", "3 5", "14 5 4 5")  # with round ends
+DASHES = ("", "7 6", "0.1 5", "9 5 0.1 5", "15 6", "9 5 0.1 5 0.1 5", "3 5", "14 5 4 5")  # dashes have round ends
 LEFT = 52
 RIGHT = 14
 TOP = 10
 BOTTOM = 40
 MOST_POINTS = 500
-LEAST_SPAN = 1e-300  # smaller steps aren't numbers
+LEAST_SPAN = 1e-300  # for a smaller span, steps between ticks could underflow
 ON_A_PHONE = 420, 300
 MINUS = "\N{MINUS SIGN}"
 
 
 class Series(NamedTuple):
-    """Data that are drawn over env steps in one color and one kind of dashes."""
+    """Data that are drawn over env steps in one color and with one pattern of dashes."""
 
     kind: str
-    """line (bold), thin, band or dots; also its class in the style sheet"""
+    """line (bold), thin, band or dots; this is also its class in the style sheet"""
     color: int
-    """number of the color and of the dashes"""
+    """number that stands for a color and a pattern of dashes"""
     x: Doubles  # [K]
-    y: Doubles  # [K], or [K, 2] of a band
+    y: Doubles  # [K]; for a band, [K, 2]: lower and upper edge
     tooltip: str = ""
     """text that is shown when the pointer is on the series"""
 
 
 def ticks(low: float, high: float, about: int) -> list[float]:
-    """Round numbers from `low` to `high`, 1, 2 or 5 times a power of ten apart; about as many as `about`."""
+    """About `about` round numbers from `low` to `high`, whose distance is 1, 2 or 5 times a power of ten."""
     span = high - low
     if not LEAST_SPAN < span < math.inf:
         return [low]
@@ -52,7 +52,7 @@ def ticks(low: float, high: float, about: int) -> list[float]:
 
 
 def with_si_prefix(value: float) -> str:
-    """A number with k, M or G: 20000 is 20k, 1.5e6 is 1.5M."""
+    """A number with k, M or G, such as 20k for 20000 and 1.5M for 1.5e6."""
     for size, unit in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
         if abs(value) >= size:
             return f"{value / size:g}{unit}".replace("-", MINUS)
@@ -60,12 +60,12 @@ def with_si_prefix(value: float) -> str:
 
 
 def chart(all_series: Sequence[Series], width: int, height: int, x_label: str, describe: str) -> str:
-    """Several series on common axes. The x axis begins at 0. `describe` is the text for screen readers."""
+    """Draw several series on common axes. The x axis begins at 0. `describe`: the text for screen readers."""
     x_max = max((float(series.x.max()) for series in all_series if series.x.size), default=1.0) or 1.0
     ys = [series.y for series in all_series if series.y.size]
     low, high = (min(float(y.min()) for y in ys), max(float(y.max()) for y in ys)) if ys else (0.0, 1.0)
     if low == high:
-        margin = max(1.0, 1e-9 * abs(low))  # added to a very large number, 1 is lost
+        margin = max(1.0, 1e-9 * abs(low))  # relative, because adding 1 doesn't change a very large number
         low = low - margin
         high = high + margin
     room = 0.05 * (high - low)
@@ -105,30 +105,31 @@ def chart_for_all_widths(all_series: Sequence[Series], wide: tuple[int, int], x_
 
 
 def key(color: int) -> str:
-    """A piece of the line of this color, for legends."""
+    """A short line of this color and its dashes, for legends."""
     x = np.array([2.0, 32.0])
     y = np.array([5.0, 5.0])
     return f'<svg class="key" width="34" height="10">{_svg(Series("line", color, x, y), x, y)}</svg>'
 
 
 DOT_KEY = '<svg class="key" width="34" height="10"><g class="dots"><circle cx="17" cy="5" r="3.2"/></g></svg>'
-"""A dot without a group, for legends"""
+"""A dot in a neutral color, for legends"""
 
 
 class Segment(NamedTuple):
     """A part of a bar."""
 
     begin: float
-    """where it begins, as a share of the bar"""
+    """where the segment begins, as a share of the bar's length"""
     share: float
+    """length of the segment, as a share of the bar's length"""
     css: str
-    """its class in the style sheet, which is its color"""
+    """class of the segment in the style sheet, which sets its color"""
     tooltip: str = ""
     text: str = ""
 
 
 def bar(segments: Iterable[Segment]) -> str:
-    """A bar of colored segments, as wide as the page allows. Its sizes are attributes, because pages forbid styles."""
+    """A bar of colored segments, as wide as the page allows. Sizes are attributes, because pages forbid inline styles."""
     parts = []
     for each in segments:
         x = f"{100 * each.begin:.2f}%"
@@ -157,7 +158,7 @@ def _svg(series: Series, x: Doubles, y: Doubles) -> str:
 
 
 def _subsampled(x: Doubles, y: Doubles) -> tuple[Doubles, Doubles]:
-    """About 500 of the points, including the last one. More would not be visible."""
+    """About 500 of the points, including the last one, because more wouldn't be visible."""
     every = math.ceil(len(x) / MOST_POINTS)
     keep = np.unique([*range(0, len(x), every), len(x) - 1])
     return x[keep], y[keep]

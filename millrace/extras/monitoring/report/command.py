@@ -1,4 +1,4 @@
-"""`millrace plot` and `report`: runs in a picture, or on one HTML page."""
+"""`millrace plot` and `millrace report`: show runs in a picture, or on one HTML page."""
 
 from __future__ import annotations
 

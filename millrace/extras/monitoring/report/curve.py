@@ -1,4 +1,4 @@
-"""Data for a report or a plot, read from a run folder: its configuration, its metrics and learning curve. Reads files."""
+"""Data for a report or a plot, read from a run folder: the run's configuration, metrics and learning curve."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Curve(NamedTuple):
     """The learning curve of one run."""
 
     seed: int
-    env_steps: Doubles  # [K] rising
+    env_steps: Doubles  # [K] ascending
     returns: Doubles  # [K] mean return of the last 100 training episodes
 
 
@@ -35,12 +35,14 @@ class RunRecord(NamedTuple):
     """The configuration (config.toml) and the rows of metrics of one run folder."""
 
     env: str
-    """The environment's name, with keyword arguments that its preset doesn't set, because they make another environment."""
+    """The environment's name. It includes keyword arguments that the preset doesn't set, because they make another
+    environment.
+    """
     algo: str
     seed: int
     config: dict[str, Any]
     workers_elsewhere: bool
-    """Whether its workers were started elsewhere: then the setting `workers` has no meaning."""
+    """Whether the run's workers were started elsewhere. Then the setting `workers` has no meaning."""
     rows: list[dict[str, Any]]
 
     def curve(self) -> Curve | None:
@@ -50,9 +52,10 @@ class RunRecord(NamedTuple):
 
 
 def points(rows: Sequence[Mapping[str, Any]], key: str, *, over_time: bool = False) -> Doubles:
-    """Env steps, or seconds of training, and value of this metric: [K, 2], for the K rows that have both.
+    """The values of a metric over env steps: [K, 2] env steps and value, for the K rows that have both.
 
-    Numbers are cut to ±1e300: axes are longer. The env steps of an evaluation are those of the evaluated policy.
+    `over_time`: seconds of training instead of env steps. Numbers are clipped to ±1e300, so that an axis can be a little
+    longer. For an evaluation, env steps are those of the evaluated policy.
     """
 
     def at(row: Mapping[str, Any]) -> Any:
@@ -81,10 +84,10 @@ def read_run_files(run: Path, rows: list[dict[str, Any]] | None = None) -> RunRe
 
 
 def common_grid(curves: Sequence[Curve]) -> tuple[Doubles, Doubles]:
-    """Put curves on common env steps by linear interpolation.
+    """Interpolate curves linearly at common env steps.
 
-    Returns the env steps [G], which all curves cover, and the returns [curves, G]. Mean and band over them end where the
-    shortest curve ends, so that no curve is extrapolated.
+    Returns the env steps [G], which all curves cover, and the returns [curves, G]. They end where the shortest curve ends,
+    so that no curve is extrapolated.
     """
     first = max(curve.env_steps[0] for curve in curves)
     last = min(curve.env_steps[-1] for curve in curves)

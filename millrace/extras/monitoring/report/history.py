@@ -9,12 +9,12 @@ from millrace.extras.monitoring.report.reported_runs import ReportData
 from millrace.learner.run_folder.json_log import LoggedLine
 from millrace.protocol.bounds import escaped
 
-MOST_HISTORY = 30  # lines
-AT_ONCE = 8  # lines shown; the others are in a closed block
+MOST_HISTORY = 30  # largest number of lines on the page
+AT_ONCE = 8  # number of lines shown at first; the others are in a block that is closed at first
 
 
 def history(report: ReportData) -> str:
-    """The warnings of the runs, the newest first."""
+    """The warnings and notices of the runs, the newest first."""
     names = report.short_names() if len(report.runs) > 1 else [""]
     lines = [(line, name) for name, (_, run) in zip(names, report.runs, strict=True) for line in reversed(run.log)]
     lines.sort(key=lambda each: each[0].time, reverse=True)

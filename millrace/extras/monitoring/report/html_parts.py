@@ -10,7 +10,7 @@ from millrace.learner.run_folder.sentences import return_in_words
 
 
 def document(title: str, head: Sequence[str], main: str) -> str:
-    """A whole page. `head` is HTML: its policy, its style, its script. `main` is HTML too."""
+    """A whole page. `head` (elements for the policy, style and script) and `main` are HTML; `title` is text."""
     first = "\n".join(head)
     return f"""<!doctype html>
 <html lang="en">
@@ -38,5 +38,5 @@ def section(name: str, about: str, content: str, key: str = "") -> str:
 
 
 def return_text(value: float) -> str:
-    """A return in words, with a typographic minus sign."""
+    """A return as text, with a typographic minus sign."""
     return return_in_words(value).replace("-", MINUS)

@@ -1,8 +1,8 @@
-"""Reads a metrics.jsonl that may grow, from where the last read ended, and keeps a bounded number of its rows.
+"""Reads a growing metrics.jsonl, each time from where the last read ended, and keeps a bounded number of its rows.
 
-Rule: of a long file, it keeps rows at equal distances, all rows with an evaluation as long as these are few, and the newest
-row. The newest row is read again each time, because a run may add to it. A file that was replaced, as a resumed run does, is
-read from its beginning.
+Rule: of a long file, it keeps rows at equal distances, rows with an evaluation (all of them as long as they are few), and
+the newest row. The newest row is read again each time, because a run may add numbers to it. If the file was replaced, as a
+resumed run does, it is read from the beginning.
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ from millrace.learner.run_folder.regular_files import MOST_BYTES, open_regular
 from millrace.learner.run_folder.results import EVALUATION_KEY
 from millrace.protocol.arrays import Ints
 
-MOST_ROWS = 256  # least number of rows; at most twice as many are kept: a chart has 500 points
+MOST_ROWS = 256  # of a long file, at least this many rows are kept, and at most twice as many: a chart has 500 points
 CHUNK_BYTES = 1 << 22
 NEWLINE = 10
 OF_AN_EVALUATION = b'"%s"' % EVALUATION_KEY.encode()
 
 
 class MetricsTail:
-    """The rows of one run."""
+    """The rows of metrics of one run."""
 
     def __init__(self, run: Path, most: int = MOST_ROWS) -> None:
         self._path = run / METRICS_FILE
         self._most = most
-        self._seen: tuple[int, ...] = ()  # identity, size and time of the file
+        self._seen: tuple[int, ...] = ()  # inode, size and modification time of the file
         self._newest: bytes | None = None
         self._begin_anew()
 
@@ -45,7 +45,7 @@ class MetricsTail:
         return [row for _, line in sorted(lines.items()) if (row := decoded_row(line)) is not None]
 
     def read(self) -> bool:
-        """Read on. Returns whether there is anything new. Raises OSError."""
+        """Read the rows that were added since the last read. Returns whether the file has changed. Raises OSError."""
         with os.fdopen(open_regular(self._path), "rb") as file:
             status = os.fstat(file.fileno())
             seen = status.st_ino, status.st_size, status.st_mtime_ns
@@ -64,13 +64,13 @@ class MetricsTail:
         return True
 
     def _begin_anew(self) -> None:
-        self._offset = 0  # where the newest whole row begins
+        self._offset = 0  # offset in the file at which the newest whole row begins
         self._newest = None
         self._all = _Thinned(self._most)
         self._evaluations = _Thinned(self._most)
 
     def _add(self, text: bytes) -> bytes:
-        """Add the lines of this text. Returns its end, from the newest whole line on, which may change."""
+        """Add the lines of this text. Returns the rest, from the newest whole line on, because that line may change."""
         ends = np.flatnonzero(np.frombuffer(text, np.uint8) == NEWLINE)
         begins = np.concatenate([[0], ends + 1])
         if np.diff(begins, append=len(text)).max() > MOST_LINE_BYTES:
@@ -88,16 +88,20 @@ class MetricsTail:
 
 
 class _Thinned:
-    """At most twice `most` of the added lines, at equal distances."""
+    """Keeps at most `2 * most` of the lines that are added, at equal distances."""
 
     def __init__(self, most: int) -> None:
         self._most = most
         self._every = 1
-        self.count = 0  # lines that were added
-        self.lines: dict[int, bytes] = {}  # by their numbers in the file
+        self.count = 0  # number of lines that were added
+        self.lines: dict[int, bytes] = {}  # the kept lines, by their numbers in the file
 
     def add(self, text: bytes, first: int, spans: Ints, which: Ints) -> None:
-        """`which` of the lines at these places of the text. `first`: the number of its first line in the file."""
+        """Add lines of a text.
+
+        `spans`: [lines, 2] begin and end of each line in the text. `which`: indices of the lines to add. `first`: the number
+        of the text's first line in the file.
+        """
         before = self.count
         every = self._every
         self.count += len(which)
@@ -111,7 +115,7 @@ class _Thinned:
 
 
 def _places(text: bytes, part: bytes) -> Iterator[int]:
-    """The offsets of this part in the text."""
+    """The offsets at which `part` occurs in the text."""
     place = text.find(part)
     while place >= 0:
         yield place

@@ -33,7 +33,10 @@ def write_page(runs: Sequence[Path], out: Path) -> Path:
 
 
 def page(runs: Sequence[Path]) -> str:
-    """The page as HTML text. Raises `UsageError`, with a one-line message, if a run folder cannot be read."""
+    """The page about these run folders, as HTML text.
+
+    Raises `UsageError`, with a one-line message, if a run folder can't be read.
+    """
     report = group_runs([read_run(run) for run in dict.fromkeys(runs)])
     body = [
         sections.head(report),

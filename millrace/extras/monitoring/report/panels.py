@@ -1,8 +1,8 @@
-"""The contents of learning curves, in the report and in the picture of `millrace plot`: lines, bands, dots and legends.
+"""The lines, bands, dots and legends of learning curves, in the report and in the picture of `millrace plot`. Pure.
 
-Pure. There is a panel for each environment, and a color for each group of runs. In a group of several runs, each run is a
-thin line, their mean is a bold line, and a band reaches from the worst to the best. A run that an error or an interrupt
-ended is a thin line and not part of a mean; the legend says so.
+There is a panel for each environment, and a color for each group of runs. In a group of several runs, each run is a thin
+line, their mean is a bold line, and a band reaches from the worst to the best run. If an error or an interrupt ended a run,
+the run is a thin line but isn't part of the mean, and the legend says so.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def panels(report: ReportData) -> list[Panel]:
 
 
 def how_it_is_drawn(report: ReportData) -> str:
-    """Explains bold and thin lines and bands; empty if there is no mean."""
+    """A text that explains bold and thin lines and bands; empty if no group has a mean."""
     if not any(group.averaged for group in report.groups):
         return ""
     return "Bold: the mean over seeds, as far as the shortest of them goes. Band: from the worst to the best. Thin: a seed."

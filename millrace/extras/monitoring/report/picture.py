@@ -23,13 +23,13 @@ from millrace.extras.monitoring.report.reported_runs import ReportData, group_ru
 from millrace.learner.run_folder.atomic_write import write_file
 from millrace.protocol.errors import UsageError
 
-WIDTH = 640  # of a panel's axes
+WIDTH = 640  # width of a panel's chart
 HEIGHT = 380
 MARGIN = 28
 HEAD = 50
 LINE = 20
-LETTERS = 92  # about as many as fit into WIDTH
-ZOOM = 2  # pixels of the PNG for each of the SVG
+LETTERS = 92  # about the number of letters that fit into WIDTH
+ZOOM = 2  # size of the PNG, as a multiple of the size of the SVG
 OWN_STYLE = (
     ".picture { font: 13px system-ui, sans-serif; color: var(--soft); }",
     ".picture text { fill: currentColor; }",
@@ -50,7 +50,7 @@ class Drawing:
         return self.svg
 
     def png(self) -> bytes:
-        """The picture as a PNG. Raises `UsageError` if its packages are not installed."""
+        """The picture as the bytes of a PNG file. Raises `UsageError` if the packages for this are not installed."""
         try:
             from PIL import ImageFont
             from resvg_py import svg_to_bytes
@@ -67,7 +67,7 @@ class Drawing:
         return png
 
     def save(self, out: str | os.PathLike[str]) -> Path:
-        """Write it to a file, whose name ends in .svg or .png. Raises `UserFacingError`, with a one-line message."""
+        """Write the picture to a file, whose name ends in .svg or .png. Raises `UserFacingError` with a one-line message."""
         path = Path(out)
         match path.suffix:
             case ".svg":
@@ -81,9 +81,9 @@ class Drawing:
 
 
 def draw(runs: Sequence[Path]) -> Drawing:
-    """Draw the runs, without those in which no episode has ended: a warning names each.
+    """Draw the learning curves of these runs. Runs in which no episode has ended are left out, with a warning for each.
 
-    Raises `UsageError` for a folder that cannot be read, and if there is nothing to draw.
+    Raises `UsageError` if a folder can't be read, or if there is nothing to draw.
     """
     reported = [read_run(run) for run in dict.fromkeys(runs)]
     empty = [f"run {run.path}: nothing to plot, no episode has ended" for run in reported if run.curve is None]
@@ -115,7 +115,7 @@ def _svg(report: ReportData) -> str:
 
 
 def _panel(panel: Panel) -> tuple[str, int]:
-    """A panel, and its height."""
+    """A panel as SVG text, and its height."""
     title = shorten(panel.env, LETTERS * 3 // 4, placeholder=" …")
     drawn = chart(panel.series, WIDTH, HEIGHT, "env steps", f"Learning curves of {panel.env}")
     parts = [_text(0, 14, title, "title"), _text(0, 36, WHAT_IS_DRAWN), _at(0, HEAD, drawn)]
@@ -139,7 +139,10 @@ def _at(x: float, y: float, inner: str) -> str:
 
 
 def _style() -> str:
-    """The rules of the style sheet about charts, and those of a picture. Few programs but browsers know its variables."""
+    """The style sheet's rules for charts, and the picture's own rules.
+
+    Variables are replaced by their values, because few programs other than browsers support them.
+    """
     sheet = STYLE.read_text()
     colors = dict(re.findall(r"(--\w+): (#\w+)", sheet.partition("@media")[0]))
     rules = re.findall(r"^(?:\.chart |path\.|\.dots |\.c\d).*$", sheet, re.MULTILINE)

@@ -1,8 +1,8 @@
 """The data of the page: the runs, read from their folders, and the groups of runs.
 
-Rule: of a run that has not finished, the page shows its curve and how far it is. Runs with other keyword arguments of the
-environment are runs of another environment. Runs form a group if they differ only in their seeds and in settings on which it
-does not depend what is learned from an env step. A run that an error or an interrupt ended is in its group, and in no mean.
+Rule: if a run hasn't finished, the page shows its curve and its progress. Runs whose environments have different keyword
+arguments are runs of different environments. Runs form a group if they differ only in their seeds and in settings that don't
+affect what is learned from an env step. A run that an error or an interrupt ended is in its group, but isn't part of a mean.
 """
 
 from __future__ import annotations
@@ -25,29 +25,29 @@ from millrace.protocol.arrays import Doubles
 from millrace.protocol.progress import RunProgress
 
 MAY_DIFFER_IN_A_GROUP = frozenset({
-    # what a group is for
+    # what distinguishes the runs of a group
     "seed",
-    # when training ends, and how often and how long it is evaluated; what is evaluated (eval_env_kwargs) may not differ
+    # when training ends, how often and how long policies are evaluated; but not on which environment (eval_env_kwargs)
     "steps", "target_return", "target_mean_return",
     "eval_episodes", "eval_every", "eval_workers", "eval_copies", "eval_max_steps",
-    # who collects and computes, and where: the same rollouts and updates, but for rounding
+    # which processes collect and compute, and where: rollouts and updates are the same except for rounding
     "workers", "min_workers", "launched_workers", "max_env_copies", "inference", "device", "torch_threads",
     "transport", "bind", "advertise", "keys", "insecure",
-    # what is done about failures
+    # how failures are handled
     "worker_timeout_s", "no_workers_timeout_s", "start_timeout_s", "step_timeout_s", "grace_s", "max_env_failures",
-    # what is written, and where
+    # what is written, and to which place
     "run_dir", "checkpoint_every_s", "keep_checkpoints", "record", "info_keys", "metrics_bind", "dashboard",
 })  # fmt: skip
-"""Settings on which it does not depend what is learned from an env step"""
-MOST_IMAGES = 16  # of one observation
-MOST_DIFFERENCES = 3  # settings that are listed after the name of a group, if no more are needed to tell groups apart
+"""Settings that don't affect what is learned from an env step, so runs of a group may differ in them"""
+MOST_IMAGES = 16  # largest number of pictures of one observation
+MOST_DIFFERENCES = 3  # number of settings listed after a group's name, unless more are needed to distinguish groups
 ELSEWHERE = "started elsewhere"
-"""What is shown as the number of workers if the learner started none."""
+"""Shown as the number of workers if the learner started none"""
 
 
 @dataclass(frozen=True)
 class ReportedRun:
-    """One run."""
+    """A run, as the page shows it."""
 
     path: Path
     env: str
@@ -58,26 +58,29 @@ class ReportedRun:
     algorithm_settings: frozenset[str]
     """Names of the settings that belong to the algorithm."""
     progress: RunProgress
-    """how far it is, or was when it ended"""
+    """the progress now, or when the run ended"""
     summary: Summary | None
-    """None if it has not ended"""
+    """the summary; None if the run has not ended"""
     curve: Curve | None
-    """None before the first episode has ended"""
+    """the learning curve; None before the first episode has ended"""
     evaluations: Doubles  # [K, 2] env steps and mean return of the evaluations during training
     videos: tuple[Path, ...]
     images: tuple[Path, ...]
     """pictures of what the policy sees, one for each image of an observation"""
     log: tuple[LoggedLine, ...] = ()
-    """its newest warnings and notices, the oldest first"""
+    """the run's newest warnings and notices, the oldest of them first"""
 
     @property
     def evaluation(self) -> Evaluation | None:
-        """The evaluation of its final policy."""
+        """The evaluation of the final policy, if there was one."""
         return None if self.summary is None else self.summary.evaluation
 
     @property
     def of_group(self) -> dict[str, str]:
-        """The settings that all runs of its group share: `steps` too, if something falls or grows until they are done."""
+        """The settings that all runs of the group share, by name.
+
+        They include `steps` if a schedule depends on it, such as a learning rate that decreases until all steps are done.
+        """
         schedules = [self.settings.get(name) for name in ("learning_rate_schedule", "clip_range_schedule")]
         until_done = "linear" in schedules or self.settings.get("priority_alpha", "0") != "0" or ":" in self.algo
         may_differ = MAY_DIFFER_IN_A_GROUP - {"steps"} if until_done else MAY_DIFFER_IN_A_GROUP
@@ -86,15 +89,15 @@ class ReportedRun:
 
 @dataclass(frozen=True)
 class RunGroup:
-    """Runs of one environment of which a mean makes sense. One color on the page."""
+    """Runs of one environment whose mean is meaningful. They have one color on the page."""
 
     env: str
     name: str
     """Name of the algorithm, and a letter if the environment has several groups of that algorithm."""
     differences: str
-    """Settings that distinguish this group from those groups; empty if there are none."""
+    """Settings that distinguish this group from those other groups; empty if there are no other groups."""
     color: int
-    """number of its color; groups of the same environment have different ones"""
+    """number of the group's color; groups of the same environment have different colors"""
     runs: tuple[ReportedRun, ...]
 
     @property
@@ -104,17 +107,20 @@ class RunGroup:
 
     @property
     def averaged(self) -> list[Curve]:
-        """The curves of which mean and band are drawn; empty if there is no mean. Runs that were cut short are left out."""
+        """The curves that are averaged for the mean and the band; empty if there is no mean.
+
+        Runs that were cut short are left out.
+        """
         whole = [run.curve for run in self.runs if run.curve is not None and not run.progress.cut_short]
         return whole if len(whole) > 1 else []
 
     @property
     def label(self) -> str:
-        """Its name and its differences."""
+        """The group's name and its differences."""
         return f"{self.name} ({self.differences})" if self.differences else self.name
 
     def legend(self) -> str:
-        """Which runs a color of the learning curves stands for."""
+        """The text in the legend: which runs the group's color stands for."""
         label = self.label
         curves = self.curves
         if not curves:
@@ -135,7 +141,7 @@ class ReportData:
     """All runs of the page, in groups."""
 
     groups: tuple[RunGroup, ...]
-    """groups of the same environment follow each other"""
+    """the groups; those of the same environment are adjacent"""
 
     @property
     def runs(self) -> list[tuple[RunGroup, ReportedRun]]:
@@ -148,7 +154,7 @@ class ReportData:
         return list(dict.fromkeys(group.env for group in self.groups))
 
     def short_names(self) -> list[str]:
-        """A unique name for each run. It contains the environment and the group only if there are several."""
+        """A unique name for each run, in the order of `runs`. It has the environment and group only if there are several."""
         groups_of_env = Counter(group.env for group in self.groups)
         names = []
         for group, run in self.runs:
@@ -159,7 +165,10 @@ class ReportData:
 
 
 def read_run(path: Path, rows: list[dict[str, Any]] | None = None) -> ReportedRun:
-    """Read a run folder. `rows`: of its metrics, if they are read already. Raises `UsageError`, with a one-line message."""
+    """Read a run folder. `rows`: the rows of its metrics, if they have been read already.
+
+    Raises `UsageError`, with a one-line message.
+    """
     files = read_run_files(path, rows)
     of_algorithm = files.config.get(files.algo)
     summary = RunFolder(path).summary()
@@ -181,7 +190,7 @@ def read_run(path: Path, rows: list[dict[str, Any]] | None = None) -> ReportedRu
 
 
 def group_runs(runs: Sequence[ReportedRun]) -> ReportData:
-    """Put runs into groups. Environments stay in the order of their first run; the runs of a group are sorted by seed."""
+    """Put runs into groups. Environments are in the order of their first runs; the runs of a group are sorted by seed."""
     groups = []
     for env in dict.fromkeys(run.env for run in runs):
         by_settings: dict[frozenset[tuple[str, str]], list[ReportedRun]] = {}
@@ -198,19 +207,22 @@ def group_runs(runs: Sequence[ReportedRun]) -> ReportData:
 
 
 def differing_settings(settings: Sequence[Mapping[str, str]]) -> list[str]:
-    """Names of the settings that are not the same in all of these, in the order of the configuration."""
+    """Names of the settings that differ between these runs, in the order of the configuration."""
     names = dict.fromkeys(name for each in settings for name in each)
     return [name for name in names if len({each.get(name) for each in settings}) > 1]
 
 
 def _names(firsts: Sequence[ReportedRun]) -> Iterator[tuple[Path, tuple[str, str]]]:
-    """Name and differences of all groups of an algorithm, by the path of the first run of each."""
+    """The name and the differences of each group of an algorithm, by the path of the group's first run.
+
+    `firsts`: the first run of each group.
+    """
     label = algorithm_label(firsts[0].algo)
     if len(firsts) == 1:
         yield firsts[0].path, (label, "")
         return
     differing = differing_settings([run.of_group for run in firsts])
-    differing.sort(key=lambda name: name not in firsts[0].algorithm_settings)  # these first, because they say most
+    differing.sort(key=lambda name: name not in firsts[0].algorithm_settings)  # the algorithm's settings first
     needed = _distinguishing(firsts, differing)
     names = [*needed, *(name for name in differing if name not in needed)]
     shown = names[: max(len(needed), MOST_DIFFERENCES)]
@@ -221,7 +233,7 @@ def _names(firsts: Sequence[ReportedRun]) -> Iterator[tuple[Path, tuple[str, str
 
 
 def _distinguishing(runs: Sequence[ReportedRun], names: Sequence[str]) -> list[str]:
-    """A few of these settings, the earliest that will do, whose values together differ between any two of the runs."""
+    """A few of these settings whose values together distinguish all runs. Earlier settings are preferred."""
     chosen: list[str] = []
 
     def kinds(more: str) -> int:
@@ -238,7 +250,7 @@ def _letters(i: int) -> str:
 
 
 def _flatten(config: dict[str, Any], algo: str) -> dict[str, str]:
-    """All settings as text. Those of a table other than the algorithm's carry the name of the table, as env_kwargs.g."""
+    """All settings as text. Names of settings in tables other than the algorithm's include the table, as in env_kwargs.g."""
     settings: dict[str, str] = {}
     for name, value in config.items():
         if isinstance(value, dict):

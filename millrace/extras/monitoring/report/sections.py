@@ -1,4 +1,4 @@
-"""The sections of the page, as HTML text: results, curves, videos, settings. Pure, except that it reads films and pictures.
+"""The sections of the page, as HTML text: results, curves, videos, settings. Pure, except that it reads videos and pictures.
 
 Rule: text from run folders is escaped.
 """
@@ -21,17 +21,17 @@ from millrace.learner.run_folder.sentences import duration, per_second
 
 WIDE = (1080, 360)
 NARROW = (540, 320)
-MOST_BYTES_OF_ONE = 4 * 2**20  # film or picture
+MOST_BYTES_OF_ONE = 4 * 2**20  # largest size of a video or picture on the page
 MOST_BYTES_OF_ALL = 24 * 2**20
 
 
 def title(report: ReportData) -> str:
-    """The environments of the page."""
+    """The title of the page: the names of its environments."""
     return report.envs[0] if len(report.envs) == 1 else f"{', '.join(report.envs[:-1])} and {report.envs[-1]}"
 
 
 def head(report: ReportData) -> str:
-    """Title and totals."""
+    """The head of the page: its title, and totals over all runs."""
     runs = [run.progress for _, run in report.runs]
     facts = [
         f"{len(runs)} runs" if len(runs) > 1 else "1 run",
@@ -109,13 +109,13 @@ def curves(report: ReportData) -> str:
 
 
 class Embedded:
-    """Puts films and pictures into the page itself, as long as they are small."""
+    """Puts videos and pictures into the page itself, if they are small enough."""
 
     def __init__(self) -> None:
         self._room = MOST_BYTES_OF_ALL
 
     def __call__(self, path: Path, kind: str) -> str:
-        """The address of a file, which is its content; empty if it is too large. `kind`: its media type."""
+        """The address of a file: a data URL with its content; empty if the file is too large. `kind`: its media type."""
         size = path.stat().st_size
         if size > min(MOST_BYTES_OF_ONE, self._room):
             return ""
@@ -124,11 +124,11 @@ class Embedded:
 
 
 AddressOf = Callable[[Path, str], str]
-"""The address of a film or picture, by its path and media type; empty if the page shows none of it."""
+"""Returns the address of a video or picture from its path and media type; empty if it is too large for the page."""
 
 
 def images(report: ReportData, address_of: AddressOf | None = None) -> str:
-    """What the policy sees: of each environment with images, the picture of its first run that has one."""
+    """What the policy sees: for each environment with images, the pictures of the first run that has some."""
     figures = []
     address_of = address_of or Embedded()
     for env in report.envs:
@@ -146,7 +146,7 @@ def images(report: ReportData, address_of: AddressOf | None = None) -> str:
 
 
 def videos(report: ReportData, address_of: AddressOf | None = None) -> str:
-    """The newest video of each run. Large ones are named instead of shown."""
+    """The newest video of each run. If it is too large, only its path is shown."""
     figures = []
     address_of = address_of or Embedded()
     for name, (group, run) in zip(report.short_names(), report.runs, strict=True):
@@ -162,14 +162,14 @@ def videos(report: ReportData, address_of: AddressOf | None = None) -> str:
 
 
 def _shown(path: Path, address: str, before: str, after: str) -> str:
-    """A film or picture as part of the page, or why it is not."""
+    """A video or picture as part of the page, or a text that it is too large."""
     if not address:
         return f'<p class="none">{path.stat().st_size / 2**20:.1f} MiB, too large for this page:<br>{escape(str(path))}</p>'
     return f"{before}{escape(address)}{after}"
 
 
 def settings(report: ReportData) -> str:
-    """Settings: first those that differ, with a column for each group. The others are in a block that is closed at first."""
+    """The settings that differ, with a column for each group, and the others in a block that is closed at first."""
     runs = [run for _, run in report.runs]
     differ = differing_settings([run.settings for run in runs])
     same = {name: value for name, value in runs[0].settings.items() if name not in differ}
@@ -189,7 +189,7 @@ def settings(report: ReportData) -> str:
 
 
 def _setting(name: str, report: ReportData) -> str:
-    """A row of the table: the value of a setting in each group, or its values."""
+    """A row of the table: the value or values of a setting in each group."""
     cells = []
     for group in report.groups:
         values = dict.fromkeys(run.settings[name] for run in group.runs if name in run.settings)
@@ -198,6 +198,6 @@ def _setting(name: str, report: ReportData) -> str:
 
 
 def foot(report: ReportData) -> str:
-    """The paths of the run folders."""
+    """The foot of the page: the paths of the run folders."""
     paths = "".join(f"<li><code>{escape(str(run.path))}</code></li>" for _, run in report.runs)
     return f"<footer><details><summary>Run folders</summary><ul>{paths}</ul></details></footer>"
