@@ -1,1 +1,1 @@
-"""What millrace costs, and what its peers cost: each module prints a table and writes JSON."""
+"""Measures the speed and memory of millrace and of its peers. Each benchmark prints a table and writes JSON."""

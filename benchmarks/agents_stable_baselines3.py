@@ -1,7 +1,7 @@
 """Stable-Baselines3's PPO on tasks of several agents: `python -m benchmarks.agents_stable_baselines3 TASK SEED`.
 
-It needs `pip install stable-baselines3 supersuit mpe2 pygame-ce`, has 8 copies and minibatches of 256, and otherwise
-Stable-Baselines3's own settings. It prints the mean return, the sum over all agents, of 100 greedy episodes.
+It needs `pip install stable-baselines3 supersuit mpe2 pygame-ce`. It uses 8 env copies and minibatches of 256, and otherwise
+Stable-Baselines3's own settings. It prints the mean return of 100 greedy episodes, summed over all agents.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import statistics
 from importlib import import_module
 from typing import Any
 
-TASKS: dict[str, tuple[str, str, dict[str, Any], int]] = {  # module, what makes the environment, arguments, env steps
+TASKS: dict[str, tuple[str, str, dict[str, Any], int]] = {  # module, name of the factory, its arguments, env steps
     "spread": ("mpe2.simple_spread_v3", "parallel_env", {"local_ratio": 0.5}, 150_000),
     "exit": ("benchmarks.leaving", "Exit", {}, 40_000),
 }
@@ -29,7 +29,7 @@ def main() -> None:
     supersuit = import_module("supersuit")
     sb3 = import_module("stable_baselines3")
     vec_env = import_module("stable_baselines3.common.vec_env")
-    import_module("stable_baselines3.common.utils").set_random_seed(arguments.seed)  # its copies have no `seed`
+    import_module("stable_baselines3.common.utils").set_random_seed(arguments.seed)  # env copies have no `seed`
     module, name, settings, steps = TASKS[arguments.task]
     make = getattr(import_module(module), name)
     env = make(**settings)
@@ -37,7 +37,7 @@ def main() -> None:
     copies = supersuit.concat_vec_envs_v1(copies, 8, num_cpus=1, base_class="stable_baselines3")
     normalized = vec_env.VecNormalize(vec_env.VecMonitor(copies))
     model = sb3.PPO("MlpPolicy", normalized, n_steps=128, batch_size=256, device="cpu")
-    model.learn(steps * len(env.possible_agents))  # it counts the steps of agents
+    model.learn(steps * len(env.possible_agents))  # Stable-Baselines3 counts each agent's step
     returns = []
     for seed in range(100):
         observations, _ = env.reset(seed=1_000 + seed)

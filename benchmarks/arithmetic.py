@@ -1,8 +1,9 @@
-"""What an update would take if it were arithmetic alone: its matrix products, at the best speed that one core has for them.
+"""The time of an update's matrix products alone, at the best speed that one core reaches: a lower bound for an update.
 
-Rule: both numbers are measured, not assumed. torch counts the products of one update, forward and backward, while it passes
-in torch; the speed is that of the fastest square product that was tried. Activations, the loss, the optimizer and every call
-come on top, so an update can come close to this time, but not reach it.
+Rule: both numbers are measured, not assumed. torch counts the floating-point operations of the products in one update,
+forward and backward, while the networks run in torch. The speed is that of the fastest square product that was tried.
+Activations, the loss, the optimizer and every call take additional time, so an update can come close to the bound, but not
+reach it.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ TRIES = 15
 def products_ms(run: Callable[[], object], updates: int) -> float:
     """Milliseconds that the matrix products of an update take at the speed of `flop_per_s`.
 
-    `run` makes so many updates, whose networks pass in torch.
+    `run` makes this number of updates, with networks that run in torch.
     """
     with FlopCounterMode(display=False) as counter:
         run()
@@ -32,7 +33,10 @@ def products_ms(run: Callable[[], object], updates: int) -> float:
 
 @cache
 def flop_per_s() -> float:
-    """Floating-point operations per second of CPU time in the fastest product of two square float32 matrices, one thread."""
+    """Floating-point operations per second of CPU time in the fastest product of two square float32 matrices.
+
+    It is measured with one thread.
+    """
     with threadpool_limits(1):
         return max(_speed(size) for size in SIZES)
 
@@ -46,7 +50,7 @@ def _speed(size: int) -> float:
 
 
 def _seconds(work: Callable[[], object], repeats: int) -> float:
-    """CPU seconds of one call."""
+    """Mean CPU seconds of one call."""
     start = time.process_time()
     for _ in range(repeats):
         work()

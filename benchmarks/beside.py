@@ -1,9 +1,10 @@
-"""What evaluations cost a slow environment: none, those for which training waits, and those beside it.
+"""Compares the speed of training without evaluations, with evaluations that it waits for, and with evaluations alongside.
 
 `python -m benchmarks.beside`, or for one algorithm with `--algo sac`. A step of the environment sleeps for 50 ms, so that
-the number of cores does not matter. Four workers train with a copy each. An evaluation is four episodes of eight steps on
-one worker, and one is due whenever training has taken twice its time: as a barrier it takes a third of the time. The rate is
-that of the seconds between two updates, evaluations included. All contenders take turns.
+the number of cores doesn't matter. Four workers train, with one env copy each. An evaluation is four episodes of eight steps
+on one worker. An evaluation is due whenever training has taken twice its time, so that evaluations take a third of the time
+if training waits for them. The rate is env steps/s between the first counted update and the last, including evaluations. All
+contenders take turns.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from benchmarks.writing import write
 COPIES = 4
 EPISODES = 4
 EPISODE_STEPS = 8
-EVERY = 2 * EPISODES * EPISODE_STEPS * COPIES  # env steps, in twice the time of an evaluation, whose copies share a worker
+EVERY = 2 * EPISODES * EPISODE_STEPS * COPIES  # env steps in twice an evaluation's time; its copies share a worker
 WARM_UP_STEPS = 2 * COPIES * 16
 SETTINGS: dict[str, Any] = {
     "env": "benchmarks.slow_env:FiftyMilliseconds-v0",

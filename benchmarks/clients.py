@@ -1,8 +1,9 @@
-"""The C++ client beside the Python worker: `python -m benchmarks.clients`. It needs a C++ compiler and CMake.
+"""Compares the C++ client with the Python worker: `python -m benchmarks.clients`. It needs a C++ compiler and CMake.
 
 `steps`: env steps/s of CartPole-v1 in one worker on loopback that only steps, with random actions (`millrace.make_vec`).
-Both kinds of worker take turns. `loop`: a program that owns its loop at 50 Hz and acts itself, while a learner updates all
-the time; how long an action took. `many`: a hundred C++ clients of one learner. All figures depend on what else runs.
+Both kinds of worker take turns. `loop`: the time of an action in a program that owns its loop at 50 Hz and acts itself,
+while a learner updates all the time. `many`: a hundred C++ clients of one learner. All figures depend on what else runs on
+the machine.
 """
 
 from __future__ import annotations
@@ -39,21 +40,21 @@ LONGEST_S = 300.0
 
 
 def build(folder: Path) -> None:
-    """Build the examples. Raises `CalledProcessError`."""
+    """Build the C++ examples in this folder. Raises `CalledProcessError`."""
     flags = ["cmake", "-S", str(SOURCE), "-B", str(folder), "-DCMAKE_BUILD_TYPE=Release"]
     for command in (flags, ["cmake", "--build", str(folder), "--target", "cartpole", "control_50hz"]):
         subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
 
 
 def free_address() -> str:
-    """An address on loopback that nothing listens at."""
+    """An address on loopback that is free."""
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         return f"tcp://127.0.0.1:{taken.getsockname()[1]}"
 
 
 def started(stack: ExitStack, command: Sequence[str], **streams: Any) -> subprocess.Popen[str]:
-    """A process that is ended with the stack."""
+    """Start a process, which `stack` ends."""
     process = subprocess.Popen(list(command), text=True, **{"stderr": subprocess.DEVNULL, **streams})
 
     def end() -> None:
@@ -66,7 +67,7 @@ def started(stack: ExitStack, command: Sequence[str], **streams: Any) -> subproc
 
 
 def step_rate(command: Sequence[str], copies: int, seconds: float) -> float:
-    """Env steps/s of one worker with so many copies, in one lane."""
+    """Env steps/s of one worker with this number of env copies in one lane."""
     address = free_address()
     with ExitStack() as stack:
         started(stack, [*command, address], stdout=subprocess.DEVNULL)
@@ -86,7 +87,7 @@ def step_rate(command: Sequence[str], copies: int, seconds: float) -> float:
 
 
 def loop_at_50_hz(folder: Path, ticks: int) -> dict[str, float]:
-    """A program that owns its loop, while a learner updates all the time. Times in µs."""
+    """Run a program that owns its loop, while a learner updates all the time. Returns shares, and times in µs."""
     address = free_address()
     flags = (
         f"CartPole-v1 --preset none --bind {address} --envs 1 --lanes 1 --rollout-steps 50 --batch-size 25 --n-epochs 200"
@@ -105,7 +106,7 @@ def loop_at_50_hz(folder: Path, ticks: int) -> dict[str, float]:
 
 
 def many_clients(folder: Path, steps: int) -> dict[str, float]:
-    """A hundred clients of one learner: all join, train and leave."""
+    """Train with a hundred clients of one learner, which join, collect rollouts and leave."""
     address = free_address()
     flags = f"CartPole-v1 --bind {address} --envs {CLIENTS} --lanes {CLIENTS} --rollout-steps 32 --min-workers {CLIENTS}"
     flags += f" --steps {steps} --eval-episodes {CLIENTS} --run-dir {folder / 'many'}"

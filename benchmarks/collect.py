@@ -2,15 +2,15 @@
 
 `ours` is the `Collector` of `workers/collect`, as a worker runs it: a policy acts (64-64 in numpy, or convolutions in
 torch), rollouts of T = 128 steps are stored with their log-probabilities, and episodes are counted. `bare` is a loop that
-takes random actions, stores nothing and resets at an episode's end. There are two kinds of it. `sampled`, to which the
-targets refer, uses plain `gymnasium.make` and `action_space.sample()`, as the field measures it. `drawn` is the fastest loop
-over these copies: without gymnasium's checker, which the collector leaves out, too, and with actions drawn beforehand.
-`native` is the vectorized form of the environment and `envpool` that of envpool, both bare and as a lane. `bfloat16`
-processes images in bfloat16. `no network` has a policy without a network, so it measures storing and stepping. What is not
-installed is left out.
+takes random actions, stores nothing and resets at an episode's end. There are two kinds of bare loop. `sampled`, to which
+the targets refer, uses plain `gymnasium.make` and `action_space.sample()`, which is the usual way to measure. `drawn` is the
+fastest loop over these copies: without gymnasium's checker, which the collector also leaves out, and with actions that were
+sampled beforehand. `native` is the environment's vectorized form and `envpool` the environment in envpool, both in a bare
+loop and as a lane. `bfloat16` processes images in bfloat16. `no network` has a policy without a network, so it measures
+storing and stepping. Contenders that aren't installed are left out.
 
-All contenders of a case take turns, one pair of processes at a time, with one thread each. The figures are medians of the
-rounds. On a machine that does other work, too, `--cpu` counts seconds of CPU time, which other work does not change.
+All contenders of a case take turns, one pair of processes at a time, with one thread each. The figures are medians over the
+rounds. On a machine that also does other work, use `--cpu`: it counts CPU time, which other work doesn't change.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ PROCESSES = 2
 STEPS = 128  # T
 CARTPOLE = EnvSpec("CartPole-v1")
 FRAMES = EnvSpec("benchmarks.frames:Frames-v0")
-PONG = EnvSpec("millrace.extras.envs:millrace/Atari-v0")  # with its module, because the bare loop uses plain gymnasium.make
+PONG = EnvSpec("millrace.extras.envs:millrace/Atari-v0")  # names the module, because the bare loop uses gymnasium.make
 BARE = ("bare, sampled", "bare, drawn")
 OURS = ("ours, 2 lanes", "ours, 1 lane")
 NARROW = ("ours, 1 lane, bfloat16", "native, 1 lane, bfloat16")
@@ -62,16 +62,16 @@ POOL = ("bare, envpool", "envpool, 1 lane")
 
 
 class Case(NamedTuple):
-    """What is collected, and the targets."""
+    """An environment to collect from, with the contenders and the targets."""
 
     env: EnvSpec
     copies: int
-    """in each process"""
+    """number of env copies in each process"""
     contenders: tuple[str, ...]
     share: float | None = None
-    """target of ours, as a share of `bare, sampled`"""
+    """target for `ours`, as a share of the rate of `bare, sampled`"""
     rate: int | None = None
-    """target of ours, in env steps/s"""
+    """target for `native` lanes, in env steps/s"""
 
 
 CASES = (
@@ -84,11 +84,11 @@ CASES = (
     Case(CARTPOLE, 512, ("bare, native", "native, 4 lanes", "native, 1 lane", *POOL), rate=1_500_000),
 )
 
-Turn = Callable[[], int]  # steps copies once or a few times -> env steps
+Turn = Callable[[], int]  # steps the copies once or a few times, and returns the number of env steps
 
 
 def bare_sampled(spec: EnvSpec, copies: int, number: int) -> Turn:
-    """A bare loop with `action_space.sample()`, as the field measures it."""
+    """A bare loop with `action_space.sample()`, the usual way to measure an environment."""
     envs = [gymnasium.make(spec.id) for _ in range(copies)]
     for seed, env in enumerate(envs, start=number * copies):
         env.reset(seed=seed)
@@ -105,7 +105,7 @@ def bare_sampled(spec: EnvSpec, copies: int, number: int) -> Turn:
 
 
 def bare_drawn(spec: EnvSpec, copies: int, number: int) -> Turn:
-    """The fastest bare loop: without the checker, and with actions drawn beforehand."""
+    """The fastest bare loop: without gymnasium's checker, and with actions that were sampled beforehand."""
     envs = [spec.make() for _ in range(copies)]
     for seed, env in enumerate(envs, start=number * copies):
         env.reset(seed=seed)
@@ -122,7 +122,10 @@ def bare_drawn(spec: EnvSpec, copies: int, number: int) -> Turn:
 
 
 def bare_vector(kind: str, spec: EnvSpec, copies: int, number: int) -> Turn:
-    """A vectorized form, with actions drawn beforehand. Steps that only reset a copy are not counted."""
+    """A bare loop over a vectorized environment, with actions that were sampled beforehand.
+
+    Steps that only reset a copy aren't counted.
+    """
     if kind == "native":
         env = make_native(spec, copies)
         env.reset(seed=number)
@@ -139,27 +142,30 @@ def bare_vector(kind: str, spec: EnvSpec, copies: int, number: int) -> Turn:
 
 
 def _drawn(space: gymnasium.Space[Any], copies: int, number: int) -> Iterator[npt.NDArray[Any]]:
-    """An endless cycle of actions [copies, *action], drawn beforehand."""
+    """An endless cycle of actions [copies, *action] that were sampled beforehand."""
     space.seed(number)
     return itertools.cycle([np.array([space.sample() for _ in range(copies)]) for _ in range(500)])
 
 
 class ZeroPolicy:
-    """A policy without a network: its distribution parameters are zeros."""
+    """A policy without a network. The parameters of its distribution are zeros."""
 
     def __init__(self, spec: PolicySpec) -> None:
         self._params = distribution(spec).params_size
 
     def load(self, parameters: object, buffers: object) -> None:
-        """Do nothing: it has no weights."""
+        """Do nothing, because there are no weights."""
 
     def __call__(self, leaves: Sequence[npt.NDArray[Any]], state: object = None) -> npt.NDArray[np.float32]:
-        """Zeros [L, N, P]."""
+        """Return zeros [L, N, P]."""
         return np.zeros((*leaves[0].shape[:2], self._params), np.float32)
 
 
 def ours(kind: str, lanes: int, images: ActingDtype, spec: EnvSpec, copies: int, number: int) -> Turn:
-    """The collector on `lanes` lanes that share the copies. `images`: precision in which the policy processes images."""
+    """The collector on `lanes` lanes, among which the copies are divided.
+
+    `images`: the dtype in which the policy processes images.
+    """
     made = spec.make()
     policy_spec = PolicySpec(observation_leaves(made.observation_space), action_spec(made.action_space))
     vector: Literal["loop", "native", "envpool"] = "loop"
@@ -207,7 +213,7 @@ def _make(name: str, env: EnvSpec, copies: int, number: int) -> Turn:
 
 
 def _process(name: str, env: EnvSpec, copies: int, number: int, cpu: bool, pipe: Connection) -> None:
-    """Step for as many seconds as each request of the pipe says, and answer with the rate."""
+    """For each number of seconds that arrives through the pipe, step for this time and send back the rate."""
     turn = _make(name, env, copies, number)
     clock = time.process_time if cpu else time.perf_counter
     while (seconds := pipe.recv()) is not None:
@@ -246,7 +252,7 @@ class Pair:
 
 
 def collecting(case: Case, rounds: int, seconds: float, *, cpu: bool) -> list[dict[str, object]]:
-    """A row for each contender: its rate, and its share of the rates of the bare loops in this case."""
+    """A row for each contender of this case: its rate, and the ratios to the rates of the bare loops."""
     available = [name for name in case.contenders if "envpool" not in name or find_spec("envpool")]
     pairs = {name: Pair(name, case.copies, case.env, cpu=cpu) for name in available}
     for pair in pairs.values():

@@ -1,7 +1,7 @@
-"""Connect Four against two programs: opponents to train against, and the score of greedy policies in 200 games with each.
+"""Connect Four against two programs, which are opponents for training and for measuring a policy's score.
 
-The opponents are `benchmarks.connect_four:LookAhead` and `benchmarks.connect_four:AtRandom`. Scores:
-`python -m benchmarks.connect_four RUN ...`
+The opponents are `benchmarks.connect_four:LookAhead` and `benchmarks.connect_four:AtRandom`. To print the scores of runs'
+greedy policies in 200 games against each: `python -m benchmarks.connect_four RUN ...`
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ import millrace
 
 ROWS = 6
 COLUMNS = 7
-GAMES = 200  # with each program; the policy begins in every other one
+GAMES = 200  # number of games against each program; the policy begins in every other game
 
 Array = np.ndarray[Any, Any]
 
 
 def lines_of_four() -> Array:
-    """The cells of each line of four [69, 4], as numbers row · COLUMNS + column."""
+    """The cells of each line of four, [69, 4]. A cell has the number row · COLUMNS + column."""
     starts = [
         (r, c, down, right) for r in range(ROWS) for c in range(COLUMNS) for down, right in ((0, 1), (1, 0), (1, 1), (1, -1))
     ]
@@ -37,7 +37,7 @@ LINES = lines_of_four()
 
 
 class AtRandom:
-    """Any column that is not full."""
+    """An opponent that chooses any column that isn't full."""
 
     def act(
         self, obs: dict[str, Array], state: Array, rng: np.random.Generator, mask: Array
@@ -46,12 +46,12 @@ class AtRandom:
         return np.array([self.column(board, np.flatnonzero(allowed), rng) for board, allowed in boards]), state, {}
 
     def column(self, board: Array, columns: Array, rng: np.random.Generator) -> int:
-        """One of these columns, for a board [ROWS, COLUMNS, 2] with the pieces of the player and those of the other one."""
+        """Choose one of these columns. `board`: [ROWS, COLUMNS, 2], the player's own pieces and the opponent's pieces."""
         return int(rng.choice(columns))
 
 
 class LookAhead(AtRandom):
-    """A column that wins at once; else one that would let the other player win at once; else any."""
+    """An opponent that prefers a column that wins at once, then one in which the other player would win at once."""
 
     def column(self, board: Array, columns: Array, rng: np.random.Generator) -> int:
         for pieces in np.moveaxis(board.astype(bool), -1, 0):
@@ -64,7 +64,7 @@ class LookAhead(AtRandom):
 
 
 def score(policy: Any, program: AtRandom) -> float:
-    """The share of games that the policy wins, acting greedily; a tie is half a win."""
+    """The share of games that the policy wins if it acts greedily. A tie counts as half a win."""
     env = connect_four_v3.env()
     rng = np.random.default_rng(1)
     total = 0.0

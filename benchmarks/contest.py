@@ -1,6 +1,6 @@
-"""Times several implementations of the same work in turns. Reports medians, also of the ratios within each turn.
+"""Times several implementations of the same work in turns. Reports medians of the times, and of the ratios in each turn.
 
-It measures CPU seconds of this process with one thread, which depend less on other load than wall-clock time.
+It measures CPU seconds of this process with one thread, which depend less on other load than wall-clock time does.
 """
 
 from __future__ import annotations
@@ -16,22 +16,29 @@ from millrace.learner.algorithms.kernels import trained_networks
 
 
 class Contest(NamedTuple):
-    """A piece of work. Each implementation in `runs` does some of it and returns its CPU seconds."""
+    """A piece of work, and several implementations of it."""
 
     title: str
     rows: int
+    """number of rows in an update"""
     peer: str
-    """the system behind the run `peer`; the other runs are `graph` (ours by autograd) and `ours` (what millrace chooses)"""
+    """the system that the run `peer` measures"""
     repeats: int
-    """the updates of one run"""
+    """number of updates in one call of a run"""
     target: float | None
-    """our time should be at most this fraction of the peer's"""
+    """the largest fraction of the peer's time that `ours` should take"""
     runs: Mapping[str, Callable[[], float]]
+    """`peer`, `graph` (millrace with autograd) and `ours` (what millrace chooses): functions that make some updates and
+    return the CPU seconds of one
+    """
 
 
 @contextmanager
 def passes_in_torch(all_of_them: bool) -> Iterator[None]:
-    """Networks that are made here pass in torch: all of them, or those that are not small or not on the CPU, as in a run."""
+    """Within this context, all networks that are made run in torch if `all_of_them`.
+
+    Otherwise, as in a run, networks run in torch only if they aren't small or aren't on the CPU.
+    """
     is_small = trained_networks.is_small
     if all_of_them:
         trained_networks.is_small = lambda spec, device: False
@@ -50,7 +57,7 @@ def repeated(work: Callable[[], object], times: int) -> float:
 
 
 def measure(contest: Contest, rounds: int) -> dict[str, object]:
-    """Medians of the times in milliseconds and of the ratios. Every other round runs in reverse order."""
+    """Medians of the times in milliseconds, and of the ratios. Every other round runs in reverse order."""
     names = list(contest.runs)
     times: dict[str, list[float]] = {name: [] for name in names}
     for turn in range(-3, rounds):

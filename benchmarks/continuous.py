@@ -1,11 +1,13 @@
 """SAC and TD3 on Pendulum-v1 with Stable-Baselines3's hyperparameters: `python -m benchmarks.continuous`.
 
-Rule: the same networks, batch, buffer, learning rates, replay ratio (1) and one env copy for both. Stable-Baselines3 makes a
-gradient step after each env step. millrace makes 8 after each 8 env steps, in the learner; one worker process collects.
+Rule: both systems use the same networks, batch size, replay buffer, learning rates and replay ratio (1), and one env copy.
+Stable-Baselines3 makes a gradient step after each env step. millrace makes 8 gradient steps after every 8 env steps, in the
+learner, while one worker process collects.
 
-Env steps/s are measured after `learning_starts`. The time to -200 is from the command (with imports, start and evaluations)
-until the mean return of a greedy evaluation is -200; there is an evaluation of 10 episodes every 1,000 env steps. The share
-of the arithmetic is the time that the matrix products of a gradient step alone take, divided by the time of an env step.
+Env steps/s are measured after `learning_starts`. The time to -200 is measured from the start of the command (with imports
+and evaluations) until the mean return of a greedy evaluation is -200. There is an evaluation of 10 episodes every 1,000 env
+steps. The share of the arithmetic is the time that the matrix products of a gradient step alone take, divided by the time of
+an env step.
 """
 
 from __future__ import annotations
@@ -48,7 +50,7 @@ LONGEST = 20_000
 
 
 def products_s(algo: str, width: int, repeats: int = 200) -> float:
-    """Seconds of the matrix products of one gradient step alone, with two hidden layers of this width."""
+    """Seconds that the matrix products of one gradient step take, with networks of two hidden layers of this width."""
 
     def seconds(n: int, k: int, m: int) -> float:
         a = torch.randn(n, k)
@@ -63,9 +65,9 @@ def products_s(algo: str, width: int, repeats: int = 200) -> float:
 
     hidden = seconds(width, width, ROWS)
     first = seconds(width, OBSERVATION + ACTION, ROWS)
-    # In passes through one network: targets 1 actor and 2 critics; critics 2 forward, 2 backward by weights and 2 by inputs;
-    # SAC's actor 1 forward, 2 critics forward and 2 backward by inputs, the actor's backward by both. TD3 changes its actor
-    # every second step, by one critic.
+    # Number of passes through one network. Targets: 1 actor and 2 critics. Critics: 2 forward, 2 backward by weights and 2
+    # by inputs. SAC's actor: 1 forward, 2 critics forward and 2 backward by inputs, and the actor backward by both. TD3
+    # updates its actor only in every second step, with one critic.
     passes = 3 + 2 + 4 + (1 + 2 + 2 + 2 if algo == "sac" else (1 + 1 + 1 + 2) / 2)
     return passes * (hidden + first)
 
@@ -77,7 +79,7 @@ def rate(name: str, settings: dict[str, Any], steps: int, seed: int) -> float:
 
 
 def seconds_to_solve(name: str, settings: dict[str, Any], seed: int) -> float:
-    """Seconds from the command to a greedy evaluation of -200; NaN if the run has not come there."""
+    """Seconds from the start of the command to a greedy evaluation of -200; NaN if the run didn't reach it."""
     return run(name, settings | {"steps": LONGEST, "seed": seed}, SOLVED, contender=CONTENDERS[name]).solved_s
 
 

@@ -1,8 +1,8 @@
-"""What an environment without a preset reaches with the defaults, and with other settings: `python -m benchmarks.defaults`.
+"""Returns of policies trained with the default settings, and with other settings: `python -m benchmarks.defaults`.
 
 Rule: each run is `millrace train ENV --preset none` with the flags of a variant. A figure is the mean return of the final
 policy over the run's own greedy episodes. Finished runs are kept in benchmarks/results/defaults, by the name of the variant,
-and a later call makes only the missing ones: remove that folder after a change of the code or of a variant.
+and a later call makes only the missing runs. So remove that folder after you have changed the code or a variant.
 
 `--variant NAME=FLAGS` adds a variant; without one, only the defaults are run.
 """
@@ -36,14 +36,15 @@ NOW = "defaults"
 
 
 class Case(NamedTuple):
-    """An environment of the table."""
+    """An environment in the table."""
 
     env: str
     flags: str = ""
-    """without which it cannot be trained"""
+    """flags without which the environment can't be trained"""
     continuous: bool = False
+    """whether its actions are continuous"""
     needs: str = ""
-    """package without which it is left out"""
+    """module that must be installed; otherwise the environment is left out"""
 
 
 MINIGRID = "--wrappers minigrid.wrappers:ImgObsWrapper gymnasium.wrappers:FlattenObservation"
@@ -69,13 +70,13 @@ CASES = (
 
 
 def command(case: Case, algo: str, seed: int, flags: str) -> list[str]:
-    """The command of a run."""
+    """The command that trains a run."""
     words = [sys.executable, "-m", "millrace", "train", case.env, "--algo", algo, "--seed", str(seed), "--preset", "none"]
     return [*words, "--workers", "1", "--action-masks", "none", *shlex.split(case.flags), *shlex.split(flags)]
 
 
 def final_return(case: Case, algo: str, seed: int, variant: str, flags: str) -> float | None:
-    """The return that the run reached; None if it failed. It is trained unless that was done."""
+    """The return of the final policy; None if the run failed. The run is trained unless a finished one is kept."""
     where = RESULTS / "defaults" / algo / variant / as_folder_name(case.env) / f"seed{seed}"
     if (found := _read(where)) is not None:
         return found
@@ -95,7 +96,7 @@ def _read(where: Path) -> float | None:
 
 
 def show(found: dict[tuple[str, str], list[float]], cases: Sequence[Case], variants: Sequence[str], title: str) -> Table:
-    """A row for each environment, a column for each variant: the mean of the seeds, and each of them."""
+    """A table with a row for each environment and a column for each variant: the mean over the seeds, and each seed."""
     table = Table(title=title)
     for column in ("environment", *variants):
         table.add_column(column)

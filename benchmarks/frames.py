@@ -1,8 +1,8 @@
-"""An environment that costs and looks like a preprocessed Atari game, for benchmarks: no emulator is needed.
+"""An environment that looks like a preprocessed Atari game and takes as much time, for benchmarks. It needs no emulator.
 
-A step draws four screens of 210 × 160 pixels, each a ball on noise that moves, turns them grey, keeps the brighter of the
-last two, makes it 84 × 84 and stacks the last four such frames: [84, 84, 4] bytes, about 0.4 ms of work. Episodes last 1,000
-steps.
+A step draws four screens of 210 × 160 pixels, each with a ball on moving noise. It converts them to grayscale, takes the
+maximum of the last two, scales it to 84 × 84, and stacks the last four such frames: [84, 84, 4] bytes, about 0.4 ms of work.
+Episodes last 1,000 steps.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from gymnasium import spaces
 
 from millrace.protocol.arrays import Bytes
 
-SKIP = 4  # screens in a step
+SKIP = 4  # number of screens in a step
 _LUMINANCE = np.array([0.299, 0.587, 0.114], np.float32)
 _ROWS, _COLUMNS = np.ix_(np.linspace(0, 209, 84).astype(int), np.linspace(0, 159, 84).astype(int))
 
 
 class Frames(gymnasium.Env[Bytes, Any]):
-    """Six actions; the ball moves by them, every step gives 0."""
+    """Frames of a ball that moves according to six actions. Rewards are 0."""
 
     def __init__(self) -> None:
         self.observation_space = spaces.Box(0, 255, (84, 84, 4), np.uint8)
@@ -36,13 +36,13 @@ class Frames(gymnasium.Env[Bytes, Any]):
         return np.stack(self._frames, -1), {}
 
     def step(self, action: Any) -> tuple[Bytes, float, bool, bool, dict[str, Any]]:
-        """Draw four screens; show the last four frames."""
+        """Draw four screens, and return the last four frames."""
         grey = [self._draw(int(action)) for _ in range(SKIP)]
         self._frames = [*self._frames[1:], np.maximum(grey[-1], grey[-2])[_ROWS, _COLUMNS]]
         return np.stack(self._frames, -1), 0.0, False, self._at >= 1_000 * SKIP, {}
 
     def _draw(self, action: int) -> Bytes:
-        """The next screen [210, 160], grey."""
+        """The next screen [210, 160], in grayscale."""
         self._at += 1
         screen = self._screen = np.roll(self._screen, (1, 1), (0, 1))
         screen[..., 0] ^= self.np_random.integers(256, size=(210, 160), dtype=np.uint8)

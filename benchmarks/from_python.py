@@ -1,7 +1,8 @@
-"""Training from a script and a notebook beside the command line: `millrace bench python`.
+"""Compares training from a script and from a notebook with training from the command line: `millrace bench python`.
 
-They differ in who imports numpy and PyTorch first, and must be equally fast, also while two other processes are busy. All
-take turns; each ratio is within a turn. The notebook is left out where nbclient and ipykernel are not installed.
+The three ways differ in which program imports numpy and PyTorch first. They must be equally fast, even while two other
+processes are busy. All take turns, and ratios are computed within a turn. The notebook is left out if nbclient and ipykernel
+aren't installed.
 """
 
 from __future__ import annotations

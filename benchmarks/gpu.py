@@ -1,10 +1,10 @@
-"""Measures training from frames on this machine by its parts: `python -m benchmarks.gpu`, or `millrace bench gpu`.
+"""Measures the parts of training from frames on this machine: `python -m benchmarks.gpu`, or `millrace bench gpu`.
 
-PPO with the settings for Atari, on frames of 84 × 84 × 4 bytes from an environment that costs as much as an emulator
-(`benchmarks/frames.py`). It is for a machine with a GPU and many cores, where it takes ten minutes, and tells which part is
-the limit: collecting with 1, 8, 12 and 16 workers (those for which there are cores), stacking a batch, copying it to the
-device, the update, and publishing weights. Then it trains, and compares: what is not the sum of the parts is lost
-somewhere. On a machine without a GPU, the device is the CPU.
+It runs PPO with the settings for Atari, on frames of 84 × 84 × 4 bytes from an environment that takes as much time as an
+emulator (`benchmarks/frames.py`). It is meant for a machine with a GPU and many cores, where it takes ten minutes, and shows
+which part is the bottleneck: collecting with 1, 8, 12 and 16 workers (as far as there are cores), stacking a batch, copying
+it to the device, the update, or publishing weights. Then it trains and compares the time of an update with the sum of the
+parts: a difference is time that is lost elsewhere. On a machine without a GPU, the device is the CPU.
 """
 
 from __future__ import annotations
@@ -39,15 +39,15 @@ from millrace.protocol.specs import PolicySpec
 ENV = "benchmarks.frames:Frames-v0"
 ATARI = "millrace/Atari-v0"
 WORKERS = (1, 8, 12, 16)
-COPIES = 4  # of a worker
-STEPS = 128  # of a rollout
-WARM_UP = 2  # batches, or updates
+COPIES = 4  # number of env copies in a worker
+STEPS = 128  # number of steps in a rollout
+WARM_UP = 2  # number of batches, or updates, that aren't counted
 REPEATS = 5
 LAGS = (0, 1)
 
 
 class Parts(NamedTuple):
-    """Seconds of each part of an update, for the batch of so many env steps."""
+    """Seconds that each part of an update takes, for a batch of `env_steps` env steps."""
 
     env_steps: int
     collect_s: float
@@ -58,24 +58,24 @@ class Parts(NamedTuple):
 
     @property
     def in_turn_s(self) -> float:
-        """The sum: what an update takes if workers and learner take turns. Stacking is a part of collecting."""
+        """The time of an update if workers and learner take turns. Stacking is a part of collecting."""
         return self.collect_s + self.copy_s + self.update_s + self.publish_s
 
 
 def settings(workers: int, **others: Any) -> Config:
-    """Those of the preset for Atari, for so many workers."""
+    """The settings of the preset for Atari, with this number of workers. `others`: further settings."""
     of_atari = {name: value for name, value in environment_presets("ppo")[ATARI].items() if name not in TABLES}
     sizes = {"workers": workers, "lanes": workers, "envs": COPIES * workers, "rollout_steps": STEPS}
     return resolve(ENV, preset="none", **of_atari | sizes | others)
 
 
 def numbers_of_workers(cores: int) -> list[int]:
-    """Those that this many cores can run, and the number of cores."""
+    """The numbers of workers to measure: those in `WORKERS` for which there are cores, and the number of cores."""
     return sorted({*(each for each in WORKERS if each <= cores), cores})
 
 
 def median_s(call: Callable[[], object]) -> float:
-    """Median seconds of a call. Waits for the device."""
+    """Median seconds of a call, including the time until the device has finished."""
     taken = []
     for _ in range(REPEATS):
         began_s = time.perf_counter()
@@ -87,7 +87,7 @@ def median_s(call: Callable[[], object]) -> float:
 
 
 class Collected(NamedTuple):
-    """What collecting a batch takes."""
+    """The times of collecting a batch and of publishing weights, with the last batch."""
 
     collect_s: float
     publish_s: float
@@ -96,7 +96,7 @@ class Collected(NamedTuple):
 
 
 def collected(workers: int, seconds: float) -> Collected:
-    """Collect batches for so many seconds, with medians of the seconds for each."""
+    """Collect batches for this many seconds. Returns median times."""
     config = settings(workers)
     with millrace.RolloutService(
         ENV, millrace.CNN(), workers=workers, lanes=config.lanes, envs=config.envs, rollout_steps=STEPS
@@ -118,7 +118,7 @@ def collected(workers: int, seconds: float) -> Collected:
 
 
 def parts(workers: int, seconds: float) -> Parts:
-    """What each part of an update takes with so many workers."""
+    """Measure each part of an update with this number of workers."""
     collect_s, publish_s, batch, policy = collected(workers, seconds)
     config = settings(workers)
     device = torch_device(config)
@@ -140,7 +140,7 @@ def parts(workers: int, seconds: float) -> Parts:
 
 
 def trained(workers: int, lag: int, updates: int) -> float:
-    """Seconds of an update of a whole run, the median after the first ones."""
+    """Median seconds of an update in a whole training run, without the first updates."""
     with tempfile.TemporaryDirectory() as folder:
         config = settings(
             workers,

@@ -1,7 +1,8 @@
-"""Compare `--inference workers` with `--inference learner`: `python -m benchmarks.inference`. PPO runs of both, in turn.
+"""Compares `--inference workers` with `--inference learner`: `python -m benchmarks.inference`.
 
-It measures env steps/s of two workers while the learner waits for rollouts, without updates, and the memory of a worker. The
-machine need not be idle, because the two are compared within a round.
+It trains PPO in both modes, in turns. It measures env steps/s of two workers while the learner waits for rollouts, which
+leaves out updates, and the memory of a worker. The machine need not be idle, because the two modes are compared within a
+round.
 """
 
 from __future__ import annotations
@@ -28,12 +29,12 @@ from millrace.learner.config.layers import resolve
 from millrace.learner.run_folder.progress import Progress
 from millrace.protocol.env_spec import EnvSpec
 
-WARM_UP = 2  # updates that are not counted: env copies are opened and torch is imported meanwhile
+WARM_UP = 2  # number of updates that aren't counted, because env copies are made and torch is imported meanwhile
 MODES = ("workers", "learner")
 
 
 class Frames(gymnasium.Env[Any, Any]):
-    """An environment whose 84×84×4 uint8 frames change with every step and take almost no time to make."""
+    """An environment with frames of 84×84×4 uint8, which change in every step and take almost no time."""
 
     def __init__(self) -> None:
         self.observation_space = gymnasium.spaces.Box(0, 255, (84, 84, 4), np.uint8)

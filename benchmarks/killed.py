@@ -1,10 +1,12 @@
-"""Trains in a folder while faults happen to it: processes of the run are killed and stopped at times that a seed decides.
+"""Trains a run while it injects faults: it kills and stops processes of the run, at times that depend only on a seed.
 
 `python -m benchmarks.killed FOLDER --faults 40 -- millrace train ENV ...` repeats the command with `--resume auto` whenever
-the learner has ended before the run has. `--faults 0` is the same run undisturbed. `benchmarks.killed_tables` compares them.
+the learner ends before the run is finished. `--faults 0` trains the same run undisturbed. `benchmarks.killed_tables`
+compares such runs.
 
-Rule: a fault comes when the run reaches a number of env steps, so that a slow machine has as many faults as a fast one. Only
-processes that descend from this one are touched. FOLDER contains the run folder, what the learners said, and faults.jsonl.
+Rule: a fault is injected when the run reaches a certain number of env steps, so that a slow machine has as many faults as a
+fast one. Only processes that descend from this one are affected. FOLDER contains the run folder, the output of the learners,
+and faults.jsonl.
 """
 
 from __future__ import annotations
@@ -30,23 +32,24 @@ STOPPED_S, HANGS_S = 8.0, 30.0
 FAULTS, SAID = "faults.jsonl", "said.log"
 WORKER, NOT_A_SIMULATOR = " -m millrace.workers ", "resource_tracker"
 FIRST_STEPS, LAST_PART = 500, 0.97
-"""faults come between this number of env steps and this part of the run"""
+"""faults are injected between this number of env steps and this fraction of the run"""
 
 
 @dataclass
 class Fault:
-    """A fault, and when training went on."""
+    """A fault, and how long it took until training continued."""
 
     kind: str
     due: int
-    """env steps of the run at which it is due"""
+    """number of env steps at which the fault is due"""
     time: str = ""
+    """time at which the fault was injected"""
     env_steps: int = 0
-    """of the newest update, when the fault came"""
+    """env steps of the newest update at that time"""
     saved: int = 0
     """env steps of the newest checkpoint at that time"""
     seconds: float = 0.0
-    """until an update with more env steps"""
+    """seconds from the fault until an update with more env steps"""
 
 
 class Run:
@@ -62,21 +65,21 @@ class Run:
             return psutil.Popen(self._command, stdin=subprocess.DEVNULL, stdout=said, stderr=said)
 
     def resume(self) -> None:
-        """Start the next learner, when the last one has ended."""
+        """Wait until the learner has ended, and start the next one."""
         self.learner.wait()
         self.learner = self._started()
 
     def workers(self) -> list[psutil.Process]:
-        """Local workers that are alive."""
+        """The local workers that are running."""
         return [one for one in _children(self.learner) if WORKER in _line(one)]
 
     def simulators(self) -> list[psutil.Process]:
-        """Processes that workers have started, except Python's own helper."""
+        """The processes that workers have started, except Python's resource tracker."""
         found = [one for worker in self.workers() for one in _children(worker)]
         return [one for one in found if NOT_A_SIMULATOR not in _line(one)]
 
     def env_steps(self) -> int:
-        """Those of the newest update."""
+        """The env steps of the newest update."""
         found = 0
         for rows in self.folder.glob("*/metrics.jsonl"):
             with rows.open("rb") as file:
@@ -85,12 +88,12 @@ class Run:
         return found
 
     def saved(self) -> int:
-        """Env steps of the newest checkpoint."""
+        """The env steps of the newest checkpoint; 0 before the first one."""
         return max((int(path.stem) for path in self.folder.glob("*/checkpoints/*.pt")), default=0)
 
 
 Cause = Callable[[Run, random.Random], bool]
-"""Causes a fault. False if there is nothing yet that it could happen to."""
+"""Injects a fault. Returns False if there is no process yet that it could affect."""
 
 
 def _children(process: psutil.Process) -> list[psutil.Process]:
@@ -112,7 +115,7 @@ def _line(process: psutil.Process) -> str:
 
 
 def _to(processes: Callable[[Run], list[psutil.Process]], number: signal.Signals, stopped_s: float = 0.0) -> Cause:
-    """A fault that sends a signal to one of these processes; a stopped one continues after `stopped_s`."""
+    """A fault that sends a signal to one of these processes. If the signal stops it, it continues after `stopped_s`."""
 
     def fault(run: Run, generator: random.Random) -> bool:
         if not (found := processes(run)):
@@ -129,7 +132,7 @@ def _to(processes: Callable[[Run], list[psutil.Process]], number: signal.Signals
 
 
 def _to_the_learner(number: signal.Signals) -> Cause:
-    """A fault that ends the learner. Not before the run has a checkpoint."""
+    """A fault that ends the learner, and starts the next one. It can't be injected before the run has a checkpoint."""
 
     def fault(run: Run, generator: random.Random) -> bool:
         if not run.saved():
@@ -151,11 +154,14 @@ KINDS: Mapping[str, Cause] = {
     f"simulator: SIGSTOP for {HANGS_S:.0f} s": _to(Run.simulators, signal.SIGSTOP, HANGS_S),
 }
 WEIGHTS = {"worker: SIGKILL": 3, "learner: SIGKILL": 2, "simulator: SIGKILL": 2}
-"""how often a kind comes, beside the others, which come once"""
+"""relative frequency of a kind; other kinds have 1"""
 
 
 def drawn(count: int, steps: int, victims: list[str], generator: random.Random) -> list[Fault]:
-    """`count` faults of a run of `steps` env steps, in order. Each kind comes at least once if there are enough."""
+    """Sample `count` faults for a run of `steps` env steps, in order. Each kind occurs, if there are enough faults.
+
+    `victims`: the kinds of processes that faults affect.
+    """
     kinds = [kind for kind in KINDS if kind.partition(":")[0] in victims]
     weights = [WEIGHTS.get(kind, 1) for kind in kinds]
     chosen = (kinds + generator.choices(kinds, weights, k=count))[:count]
@@ -165,7 +171,7 @@ def drawn(count: int, steps: int, victims: list[str], generator: random.Random) 
 
 
 def disturbed(run: Run, faults: list[Fault], generator: random.Random) -> Iterator[Fault]:
-    """Train to the end, and yield each fault when training has gone on after it."""
+    """Train to the end, and yield each fault once training has continued after it."""
     coming, open_faults = list(faults), list[tuple[float, Fault]]()
     while True:
         code, now, steps = run.learner.poll(), time.monotonic(), run.env_steps()
@@ -187,7 +193,7 @@ def disturbed(run: Run, faults: list[Fault], generator: random.Random) -> Iterat
 
 
 def main() -> int:
-    """Train with faults. Returns the exit code."""
+    """Train with faults, and log them. Returns the exit code."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--faults", type=int, default=40)

@@ -1,7 +1,7 @@
-"""The tables of docs/explanation/killed.md: `python -m benchmarks.killed_tables FOLDER ...`, the undisturbed run first.
+"""Prints the tables of docs/explanation/killed.md: `python -m benchmarks.killed_tables FOLDER ...`.
 
-The folders are those of `benchmarks.killed`, whose runs had `--log-json`. A fault's report is what the learner logged until
-the next fault.
+The folders are those that `benchmarks.killed` wrote, with runs that had `--log-json`; name the undisturbed run first. A
+fault's report is what the learner logged between the fault and the next one.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ SHORTER = (
     (r"(?s)\n.*", ""), (r"; (this counts|\d).*", ""), (r", after update.*", ""), (r"^run \S+ cont", "the run cont"),
     (r", at /\S+, in \w+", ""), (r" w\d( \(\S+\))?", ""), (r"lane \d, copy \d, step \d+: ", ""), (r"[\d,]+ env", "… env"),
 )  # fmt: skip
-"""what makes reports of one kind differ, and what stands in its place"""
+"""Patterns in which reports of the same kind differ, with their replacements"""
 Events = list[dict[str, Any]]
 
 
 class Killed:
-    """A run, its faults and what its learners logged."""
+    """A run, its faults, and the events that its learners logged."""
 
     def __init__(self, folder: Path) -> None:
         self.name = folder.name
@@ -45,21 +45,21 @@ class Killed:
         self.policy = hashlib.sha256((run / "policy.safetensors").read_bytes()).hexdigest()
 
     def after(self, number: int) -> Events:
-        """What was logged after this fault, until the next one."""
+        """The events that were logged between this fault and the next one."""
         begins = self.faults[number]["time"]
         ends = self.faults[number + 1]["time"] if number + 1 < len(self.faults) else "later"
         return [event for event in self.events if begins <= event["time"] < ends]
 
     def replayed(self) -> int:
-        """Env steps that new copies repeated, so that episodes went on."""
+        """Number of env steps that new env copies replayed in order to continue their episodes."""
         return sum(event["repeated_steps"] for event in self.events if event["event"] == "lane_continued")
 
     def begun(self) -> int:
-        """Env copies that began new episodes instead."""
+        """Number of env copies that began new episodes instead."""
         return sum(event["new_episodes"] for event in self.events if event["event"] == "lane_continued")
 
     def made_again(self) -> int:
-        """Env steps after the checkpoint from which a resumed run continued."""
+        """Number of env steps that were made twice, because they were made after the checkpoint of a resumed run."""
         found = 0
         for number, fault in enumerate(self.faults):
             saved = [CONTINUES.search(event["message"]) for event in self.after(number)]
@@ -68,7 +68,7 @@ class Killed:
         return found
 
     def column(self) -> list[str]:
-        """Of the table that compares runs."""
+        """The run's column in the table that compares runs."""
         learners = 1 + sum(bool(CONTINUES.search(event["message"])) for event in self.events)
         return [
             f"{len(self.faults)}",
@@ -92,14 +92,14 @@ ROWS = (
 
 
 def _lines(path: Path) -> Iterator[dict[str, Any]]:
-    """The lines of JSON in a file. A run's last lines are text for people."""
+    """The lines of JSON in a file. Other lines, such as a run's last ones, are text for people."""
     for line in path.read_text().splitlines():
         if line.startswith("{"):
             yield json.loads(line)
 
 
 def _report(events: Events) -> str:
-    """The first report of a fault, without the numbers of workers, lanes and steps."""
+    """The first report about a fault, without the numbers of workers, lanes and steps."""
     for event in events:
         if event["event"] in REPORTS or CONTINUES.search(event["message"]):
             line = str(event["message"])
@@ -110,7 +110,7 @@ def _report(events: Events) -> str:
 
 
 def kinds(runs: Sequence[Killed]) -> str:
-    """A row for each kind of fault."""
+    """The table with a row for each kind of fault."""
     seconds: dict[str, list[float]] = defaultdict(list)
     reports: dict[str, Counter[str]] = defaultdict(Counter)
     for run in runs:

@@ -1,7 +1,7 @@
 """A task whose agents leave one by one: each walks to the exit of a grid, gets 1 there, and pays for each step until then.
 
-No two agents can be in one cell, so they get in each other's way. An agent sees the way to the exit, where it is itself, and
-which of the four cells beside it are taken or outside.
+Two agents can't be in the same cell, so they get in each other's way. An agent observes the way to the exit, its own
+position, and which of the four adjacent cells are taken or outside the grid.
 """
 
 from __future__ import annotations

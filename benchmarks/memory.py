@@ -1,8 +1,8 @@
 """Memory of all processes of a CartPole-v1 run, compared with Stable-Baselines3: `python -m benchmarks.memory`.
 
-Reports the highest memory of the whole process tree at one time. Pages of files (libraries) are counted once for all
-processes, private pages are added up. PSS is not used, because it divides the pages of a library among all programs of the
-machine: another program with torch would halve it.
+It reports the peak memory of the whole process tree. Pages of files (libraries) are counted once for all processes; private
+pages are added up. PSS isn't used, because it divides the pages of a library among all programs on the machine, so another
+program with torch would halve it.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from benchmarks.writing import bars, write
 
 STEPS = 20_000
 TARGET_WORKER_MB = 70
-INTERVAL_S = 0.3  # between two measurements
+INTERVAL_S = 0.3  # least time between two measurements
 
 
 class Tree:
-    """Highest memory of a process and its descendants at one time, in MB."""
+    """Peak memory of a process and its descendants, in MB."""
 
     def __init__(self) -> None:
         self.own = self.rss = self.child_rss = 0.0
@@ -33,7 +33,7 @@ class Tree:
         self._due_s = 0.0
 
     def measure(self, pid: int) -> None:
-        """Measure once, unless it is too soon: a measurement takes time."""
+        """Measure the memory, unless the last measurement was too short a time ago."""
         if time.monotonic() < self._due_s:
             return
         try:
@@ -63,7 +63,7 @@ class Tree:
 
 
 def measure_run(contender: str) -> Tree:
-    """Memory of one run."""
+    """The memory of one run."""
     tree = Tree()
     run(contender, ZOO | {"steps": STEPS, "seed": 1}, look=tree.measure)
     return tree

@@ -1,8 +1,8 @@
 """The effect of V-trace: A2C and IMPALA on CartPole-v1, with new and old weights (`python -m benchmarks.off_policy`).
 
-Rule: two runs differ only in the algorithm, `max_lag` and the seed. With `max_lag` 0 both algorithms compute the same
-update. With 8, rollouts may be eight versions old when they are used; A2C ignores this, and V-trace corrects for it. The
-actual lag of a run is measured. These are whole runs of `millrace.train`. The figure is docs/images/off_policy.png.
+Rule: runs differ only in the algorithm, `max_lag` and the seed. With `max_lag` 0 both algorithms compute the same update.
+With 8, a rollout's weights may be eight versions old when an update uses it; A2C ignores this, and V-trace corrects for it.
+The actual lag of each run is measured. These are whole runs of `millrace.train`. The figure is docs/images/off_policy.png.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ LAGS = (0, 8)
 SEEDS = 5
 SETTINGS: dict[str, Any] = {
     "steps": 200_000,
-    "workers": 4,  # many, and small batches, so that the learner is the slower side; otherwise no rollout is old
+    "workers": 4,  # many workers and small batches, so that the learner is the slower side, and rollouts get old
     "envs": 8,
     "lanes": 4,
     "rollout_steps": 16,
@@ -57,9 +57,9 @@ class Trained(NamedTuple):
     max_lag: int
     seed: int
     lag_mean: float
-    """mean lag of the rollouts that were used, in versions"""
+    """mean lag of the rollouts that updates used, in versions"""
     return_final: float
-    """mean return of greedy episodes of the final policy"""
+    """mean return of the final policy's greedy episodes"""
     wall_s: float
     curve: Curve
 
@@ -97,7 +97,7 @@ def show(runs: Sequence[Trained]) -> Table:
 
 
 def draw(runs: Sequence[Trained], out: Path) -> None:
-    """Draw a panel for each `max_lag`: the median over seeds, and a band from the worst to the best."""
+    """Draw a panel for each `max_lag`, with the median over seeds and a band from the worst to the best seed."""
     from matplotlib.figure import Figure
     from matplotlib.layout_engine import ConstrainedLayoutEngine
     from matplotlib.ticker import EngFormatter, MaxNLocator

@@ -1,8 +1,8 @@
-"""What packing saves of a rollout and what it takes: rollouts as large as Atari's, and CartPole's, packed every way.
+"""Measures how many bytes the packing of rollouts saves, and the time that it takes. Part of `benchmarks/wire.py`.
 
-CPU seconds of one thread at each end, less those of the same rollout as it lies; from them the speed of a network below
-which packing pays. And from end to end over an encrypted connection, where every byte costs. And what rounding weights
-takes.
+For rollouts of Atari's size and CartPole's, packed in every way, it measures CPU seconds of one thread at each end, minus
+those of the unpacked rollout. From these follows the speed of a network below which packing pays off. It also measures the
+time from end to end over an encrypted connection, where every byte costs time, and the time of rounding weights.
 """
 
 from __future__ import annotations
@@ -54,13 +54,13 @@ WAYS = {
     "zstd": Packing(zstd=True),
     "stack + zstd": Packing(stack=True, zstd=True),
 }
-MNIH = 1_687_206  # parameters of the network of Mnih et al. 2015, with six actions
+MNIH = 1_687_206  # number of parameters in the network of Mnih et al. (2015) with six actions
 
 
 def atari(run: RunSpec) -> Rollout:
-    """A rollout of noise, or, where the run's observations are frame stacks, of stacks; one episode ends in it."""
+    """A rollout of noise. If the run's observations are frame stacks, frames move through the stack, and an episode ends."""
     rollout = canned(run)
-    if run != STACKS:  # not `is`: it may come from another process
+    if run != STACKS:  # not `is`, because `run` may come from another process
         return rollout
     (noise,) = rollout.obs
     obs = noise.copy()
@@ -73,7 +73,7 @@ def atari(run: RunSpec) -> Rollout:
 
 
 def pong() -> Rollout | None:
-    """Frame stacks of the real game, played at random; None without the extra `atari`."""
+    """A rollout of frame stacks of the real game, with random actions; None if the pip extra `atari` isn't installed."""
     try:
         gymnasium.make("ale_py:ALE/Pong-v5")
     except (ImportError, gymnasium.error.Error):
@@ -86,13 +86,13 @@ def pong() -> Rollout | None:
         obs[0, n], _ = env.reset(seed=n)
         for t in range(1, len(obs)):
             obs[t, n], _, terminated, _, _ = env.step(env.action_space.sample())
-            assert not terminated  # of a game of 21 points, in half a minute
+            assert not terminated  # a game of 21 points doesn't end in half a minute
         env.close()
     return rollout
 
 
 def cartpole(copies: int, steps: int) -> Rollout:
-    """What a worker collects with weights of 0."""
+    """A rollout of CartPole that a worker collects with weights of 0."""
     run = msgspec.structs.replace(run_spec(1), env=EnvSpec("CartPole-v1"), copies=copies, rollout_steps=steps)
     policy = make_policy(run.policy)
     policy.load(np.zeros(acting_size(run.policy), np.float32), np.zeros(0, np.float32))
@@ -100,7 +100,7 @@ def cartpole(copies: int, steps: int) -> Rollout:
 
 
 def packing(rounds: int) -> list[dict[str, object]]:
-    """A row for each rollout and way of packing it; medians of the CPU seconds of one thread."""
+    """A row for each rollout and way of packing it, with medians of the CPU seconds of one thread."""
     stacks = {"frame stacks of noise": atari(STACKS)} | ({"frame stacks of Pong": game} if (game := pong()) else {})
     rows = [(name, each, "stack") for name, each in stacks.items()]
     rows += [(name, each, way) for name, each in stacks.items() if each is game for way in ("zstd", "stack + zstd")]
@@ -136,7 +136,7 @@ def packing(rounds: int) -> list[dict[str, object]]:
 
 
 def _send(address: str, token: Token, told: Connection) -> None:
-    """The sender's process: one rollout of frame stacks, packed as it is told to."""
+    """The sender's process: sends a rollout of frame stacks for each way of packing that arrives through the pipe."""
     link = WorkerLink(address, "w", zmq.Context(), token)
     rollout = pong() or atari(STACKS)
     told.send(None)
@@ -148,7 +148,7 @@ def _send(address: str, token: Token, told: Connection) -> None:
 
 
 def encrypted(rounds: int) -> dict[str, float]:
-    """Milliseconds of a rollout of frame stacks from before `encode` until after decoding, over CURVE and loopback TCP."""
+    """Milliseconds from before `encode` until after decoding, for a rollout of frame stacks over encrypted loopback TCP."""
     server = Key.new()
     client = Key.new()
     keyring = Keyring(server, ClientList().with_client("w", client.public, datetime.now(UTC)))
@@ -161,7 +161,7 @@ def encrypted(rounds: int) -> dict[str, float]:
     sender.start()
     here.recv()
     times: dict[str, list[float]] = {way: [] for way in WAYS}
-    for turn in range(-2, rounds):  # those before 0 warm up
+    for turn in range(-2, rounds):  # turns before 0 are warm-up
         for way, taken in times.items():
             here.send(way)
             assert link.poll(10)
@@ -178,7 +178,7 @@ def encrypted(rounds: int) -> dict[str, float]:
 
 
 def rounding(rounds: int) -> list[dict[str, object]]:
-    """A row for each dtype in which the weights of an image network may travel: MB, and CPU ms at each end; medians."""
+    """A row for each dtype in which weights of an image network may be sent: MB, and median CPU ms at each end."""
     parameters = np.random.default_rng(0).normal(0, 0.1, MNIH).astype(np.float32)
     found: list[dict[str, object]] = []
     dtypes: list[ActingDtype] = ["float32", "bfloat16"]

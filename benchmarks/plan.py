@@ -1,9 +1,9 @@
-"""Compares what `millrace plan` says with runs: `python -m benchmarks.plan`, or `millrace bench plan`.
+"""Compares the recommendations of `millrace plan` with runs: `python -m benchmarks.plan`, or `millrace bench plan`.
 
-For each of eight environments (`benchmarks/plan_envs.py`) it makes a plan. Then it trains with the algorithm, env copies and
-rollout steps of the plan on a grid of workers, lanes and lags, and takes the env steps/s of each run after its first
-updates. It says how far what was recommended is from the best of the grid, and what was expected from what was measured.
-The runs of a grid take turns. An algorithm with a replay buffer makes gradient steps from the second update on.
+For each of eight environments (`benchmarks/plan_envs.py`) it makes a plan. Then it trains with the plan's algorithm, env
+copies and rollout steps on a grid of workers, lanes and lags, and measures the env steps/s of each run after its first
+updates. It reports how close the recommended settings come to the best of the grid, and the expected speed to the measured
+one. The runs of a grid take turns. An algorithm with a replay buffer makes gradient steps from the second update on.
 """
 
 from __future__ import annotations
@@ -36,24 +36,24 @@ ENVS = {
 }
 LAGS = (0, 1, 2)
 Cell = tuple[int, int, int]
-"""workers, lanes, lag"""
+"""A point of the grid: workers, lanes, lag"""
 
 
 class Watch(millrace.Callback):
-    """Ends a run when it has been measured for some seconds, and for some updates."""
+    """Ends a run when it has been measured for some seconds and some updates."""
 
     LEAST_UPDATES = 2
-    LONGEST = 3.0  # times the seconds; then one update is enough
+    LONGEST = 3.0  # after this multiple of the seconds, one update is enough
 
     def __init__(self, seconds: float, warm_up: int) -> None:
-        """`warm_up`: updates that are not counted."""
+        """`seconds`: how long to measure. `warm_up`: number of first updates that aren't counted."""
         self._seconds = seconds
         self._warm_up = warm_up
         self.updates: list[tuple[float, int]] = []
-        """when each update ended, and the env steps until then"""
+        """for each update, the time of its end, and the env steps until then"""
 
     def on_update(self, progress: millrace.Progress) -> bool:
-        """One was made."""
+        """Record the update. Returns False to end the run."""
         self.updates.append((time.monotonic(), progress.env_steps))
         counted = self.updates[self._warm_up :]
         if len(counted) < 2:
@@ -64,13 +64,16 @@ class Watch(millrace.Callback):
 
     @property
     def steps_per_s(self) -> float:
-        """After the warm-up."""
+        """Env steps/s after the warm-up."""
         (began_s, before), *_, (ended_s, after) = self.updates[self._warm_up :]
         return (after - before) / (ended_s - began_s)
 
 
 def grid(plan: millrace.RunPlan) -> Iterator[Cell]:
-    """What to compare with: other numbers of workers, as few lanes as possible and as many; with those workers, all lags."""
+    """The cells to compare a plan with: several numbers of workers, each with as few and as many lanes as possible.
+
+    With the plan's number of workers, all lags are tried; otherwise only the plan's lag.
+    """
     envs = plan.settings["envs"]
     numbers = {1, usable_cores()} if plan.measured.alone.computes else {-(-envs // 2), envs}
     numbers.add(plan.settings["workers"])
@@ -82,7 +85,7 @@ def grid(plan: millrace.RunPlan) -> Iterator[Cell]:
 
 
 def rate(env: str, settings: dict[str, Any], cell: Cell, seconds: float) -> float:
-    """Env steps/s of a run with these settings but the workers, lanes and lag of this cell."""
+    """Env steps/s of a run with these settings, except for the workers, lanes and lag of this cell."""
     workers, lanes, lag = cell
     changed = settings | {"workers": workers, "lanes": lanes, "max_lag": lag}
     if "learning_starts" in HYPERPARAMETERS[settings["algo"]].__struct_fields__:
@@ -103,7 +106,7 @@ def rate(env: str, settings: dict[str, Any], cell: Cell, seconds: float) -> floa
 
 
 def compared(names: Sequence[str], seconds: float, rounds: int, say: Any, *, with_grid: bool) -> dict[str, dict[str, Any]]:
-    """For each environment its plan, and the env steps/s of each cell of its grid, or of what was chosen alone."""
+    """For each environment, its plan and the env steps/s of each cell of its grid (or of the plan's cell only)."""
     found = {}
     for name in names:
         env = f"{plan_envs.__name__}:{ENVS[name]}"

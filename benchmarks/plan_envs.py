@@ -1,6 +1,6 @@
-"""Eight environments, each slow or fast in a way of its own, for `benchmarks/plan.py`.
+"""Eight environments for `benchmarks/plan.py`, each slow or fast in a different way, such as `benchmarks.plan_envs:Waits`.
 
-`benchmarks.plan_envs:Waits` and so on. A step that waits sleeps; one that computes keeps its core busy for this CPU time.
+A step that waits sleeps. A step that computes keeps its core busy for the given CPU time.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from gymnasium.spaces import Box, Discrete
 
 STEP_S = 0.005
 RESET_S = 0.3
-EPISODE = 100  # steps
-LARGE = 4000  # numbers of an observation
+EPISODE = 100  # number of steps
+LARGE = 4000  # size of a large observation
 
 
 class _Timed(gymnasium.Env[Any, Any]):
-    """Steps take `step_s` and resets `reset_s`, and none uses the CPU. Its observations and actions are 4 and 2 numbers."""
+    """Steps take `step_s` and resets `reset_s`, without using the CPU. Observations have 4 numbers and actions 2."""
 
     numbers = 4
     step_s = STEP_S
@@ -44,11 +44,11 @@ class _Timed(gymnasium.Env[Any, Any]):
         return self.observation(), float(np.sum(action)), False, self._left == 0, {}
 
     def take_time(self) -> None:
-        """Of a step."""
+        """Take the time of a step."""
         time.sleep(self.step_s)
 
     def observation(self) -> Any:
-        """A new one."""
+        """A new random observation."""
         return self.np_random.uniform(-1, 1, self.numbers).astype(np.float32)
 
 
@@ -56,7 +56,7 @@ class Fast(_Timed):
     """A step takes microseconds."""
 
     def take_time(self) -> None:
-        """None."""
+        """Take no time."""
 
 
 class Waits(_Timed):
@@ -76,10 +76,10 @@ class Computes(_Timed):
 
 
 class Uneven(_Timed):
-    """A step waits for 5 ms in the mean (lognormal, sigma 1)."""
+    """A step waits for 5 ms on average (lognormal, sigma 1)."""
 
     def take_time(self) -> None:
-        """Sleep."""
+        """Sleep for a random time."""
         time.sleep(float(self.np_random.lognormal(math.log(self.step_s) - 0.5, 1.0)))
 
 
@@ -96,14 +96,14 @@ class LargeObservations(_Timed):
 
 
 class DoesNotRepeat(_Timed):
-    """What it shows does not depend on the seed. Actions are discrete, and a step waits for 5 ms."""
+    """Observations don't depend on the seed. Actions are discrete, and a step waits for 5 ms."""
 
     def __init__(self) -> None:
         super().__init__()
         self.action_space = Discrete(3)
 
     def observation(self) -> Any:
-        """From the system's random numbers."""
+        """An observation made of the system's random numbers."""
         return np.frombuffer(os.urandom(self.numbers), np.uint8).astype(np.float32) / 128 - 1
 
 
@@ -120,11 +120,11 @@ class Agents:
         self._left = 0
 
     def observation_space(self, agent: str) -> gymnasium.Space[Any]:
-        """Of each agent."""
+        """The observation space, which is the same for all agents."""
         return self._spaces[0]
 
     def action_space(self, agent: str) -> gymnasium.Space[Any]:
-        """Of each agent."""
+        """The action space, which is the same for all agents."""
         return self._spaces[1]
 
     def reset(self, seed: int | None = None, options: Any = None) -> Any:
@@ -136,7 +136,7 @@ class Agents:
         return self._shown(), {agent: {} for agent in self.agents}
 
     def step(self, actions: dict[str, Any]) -> Any:
-        """All agents act."""
+        """Step with the actions of all agents."""
         time.sleep(STEP_S)
         self._left -= 1
         over = dict.fromkeys(self.agents, self._left == 0)
@@ -153,7 +153,7 @@ class Agents:
         return answer
 
     def close(self) -> None:
-        """Nothing is to do."""
+        """Do nothing."""
 
     def _shown(self) -> dict[str, Any]:
         return {agent: self._random.uniform(-1, 1, 4).astype(np.float32) for agent in self.agents}

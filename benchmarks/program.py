@@ -1,7 +1,8 @@
 """`millrace bench [NAME [flags]]`, or `python -m benchmarks.program`: runs one benchmark, or all of them in turn.
 
-Rule: each benchmark is a module with a `main` and runs in its own process, so it does not inherit threads, imports or
-memory of another. It prints its results and writes them to `benchmarks/results`. An interrupt ends all its processes.
+Rule: each benchmark is a module with a `main`, and runs in a process of its own, so that it doesn't inherit threads, imports
+or memory of another benchmark. It prints its results and writes them to `benchmarks/results`. An interrupt ends all its
+processes.
 """
 
 from __future__ import annotations
@@ -27,9 +28,9 @@ class Benchmark(NamedTuple):
     module: str
     about: str
     peers: bool = False
-    """needs Stable-Baselines3"""
+    """whether it needs Stable-Baselines3"""
     brief: tuple[str, ...] = ()
-    """its flags when all benchmarks are run"""
+    """its flags when all benchmarks are run, which make it shorter"""
 
 
 BENCHMARKS = {
@@ -123,7 +124,9 @@ def main(argv: list[str]) -> int:
 
 
 def _run(command: list[str], env: dict[str, str]) -> int:
-    """Run the benchmark in a process group of its own, which an interrupt kills: its processes need not clean up."""
+    """Run the benchmark in a process group of its own. An interrupt kills the group, because its processes have nothing to
+    clean up. Returns the exit code.
+    """
     with subprocess.Popen(command, env=env, start_new_session=True) as process:
         try:
             return process.wait()

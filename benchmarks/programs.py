@@ -1,7 +1,7 @@
-"""Programs that train CartPole-v1 with the same settings: millrace, as its command line runs it, and other systems.
+"""Programs that train CartPole-v1 with the same settings: millrace's command line, and programs of other systems.
 
 Rule: all get the same hyperparameters, one torch thread, and a process tree of their own with a cold start. The first
-lines of each program in `benchmarks/peers` say which settings that system does not have.
+lines of each program in `benchmarks/peers` list the settings that its system lacks.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ COMMON: dict[str, Any] = {"env": "CartPole-v1", "eval_every": 5000, "eval_episod
 ACTOR_CRITIC = COMMON | {
     "vf_coef": 0.5, "max_grad_norm": 0.5, "normalize_observations": False, "normalize_rewards": False,
 }  # fmt: skip
-# RL Zoo's for CartPole-v1, and a large batch. Names are those of our flags.
+# RL Zoo's settings for CartPole-v1 (ZOO), and settings with a large batch (LARGE). Names are those of millrace's flags.
 ZOO = ACTOR_CRITIC | {
     "algo": "ppo", "envs": 8, "rollout_steps": 32, "batch_size": 256, "n_epochs": 20, "gamma": 0.98, "gae_lambda": 0.8,
     "ent_coef": 0.0, "learning_rate": 1e-3, "learning_rate_schedule": "linear", "clip_range": 0.2,
@@ -40,8 +40,8 @@ LARGE = ACTOR_CRITIC | {
     "ent_coef": 0.0, "learning_rate": 3e-4, "learning_rate_schedule": "constant", "clip_range": 0.2,
     "clip_range_schedule": "constant",
 }  # fmt: skip
-# These are RL Zoo's settings, too. Its DQN has one env copy, trains after 256 env steps, and copies the target network every
-# 10 steps: in effect before each update, which is after 128 gradient steps.
+# These are also RL Zoo's settings. Its DQN has one env copy, trains after every 256 env steps, and copies the target network
+# every 10 env steps. In effect, it copies the network before each update, which is after 128 gradient steps.
 A2C = ACTOR_CRITIC | {
     "algo": "a2c", "envs": 8, "rollout_steps": 5, "gamma": 0.99, "gae_lambda": 1.0, "ent_coef": 0.0, "learning_rate": 7e-4,
 }  # fmt: skip
@@ -50,8 +50,8 @@ DQN = COMMON | {
     "gradient_steps": 128, "learning_starts": 1000, "replay_size": 100_000, "net": [256, 256],
     "target_every": 128, "double": False, "epsilon_steps": 8000, "epsilon_end": 0.04, "max_grad_norm": 10.0,
 }  # fmt: skip
-LEAST_S = 0.05  # between two calls of `look`
-OUTPUT = "out"  # the file in a folder of a program that holds what it prints
+LEAST_S = 0.05  # time between two calls of `look`
+OUTPUT = "out"  # the file, in a program's folder, that contains its output
 LONGEST_S = 300.0
 
 
@@ -62,17 +62,17 @@ class Contender(NamedTuple):
     how: str = ""
     """mode of the program: its flag --how"""
     peer: str = ""
-    """the system whose virtual environment it needs; empty: this Python"""
+    """the system in whose virtual environment it runs; empty: this Python"""
     most_envs: int = 64
-    """largest number of env copies that fit on this machine"""
+    """largest number of env copies that it can run on this machine"""
     own: bool = False
-    """whether it has its own settings instead of the common ones"""
+    """whether it uses its own settings instead of the common ones"""
     flags: tuple[str, ...] = ()
     """additional flags of the program"""
 
     @property
     def ours(self) -> bool:
-        """Whether it is millrace."""
+        """Whether this is millrace."""
         return self.module == "millrace"
 
 
@@ -90,7 +90,7 @@ AS_SAMPLE_FACTORY = "millrace, as Sample Factory's own"
 
 
 def _flags(sizes: str, more: str) -> tuple[str, ...]:
-    """Flags for a peer's own settings: env copies, steps, minibatch, one epoch, and its network."""
+    """Flags of millrace for a peer's own settings: env copies, rollout steps, minibatch in `sizes`, the rest in `more`."""
     copies, steps, minibatch = sizes.split()
     given = f"--preset none --envs {copies} --lanes 2 --rollout-steps {steps} --batch-size {minibatch} --n-epochs 1 {more}"
     given += " --no-normalize-observations --no-normalize-rewards"
@@ -106,7 +106,7 @@ CONTENDERS = {
     AS_SAMPLE_FACTORY: Contender("millrace", own=True, flags=_flags("40 32 512", "--net 512 512 --shared-net --max-lag 1")),
     OURS_OWN: Contender("millrace", own=True),
     DUMMY: Contender(_SB3, "one"),
-    SUBPROC: Contender(_SB3, "subproc", most_envs=8),  # it has a process for each env copy
+    SUBPROC: Contender(_SB3, "subproc", most_envs=8),  # because each env copy has a process
     "CleanRL": Contender(f"{_PEERS}.cleanrl_ppo", "", "cleanrl"),
     "Sample Factory, one process": Contender(f"{_PEERS}.sample_factory_ppo", "serial", "sample_factory"),
     "Sample Factory, 2 workers": Contender(f"{_PEERS}.sample_factory_ppo", "async", "sample_factory"),
@@ -123,19 +123,22 @@ class ProgramResult(NamedTuple):
     """The result of running a program."""
 
     solved_s: float
-    """seconds from the command until the task was solved (millrace: until the program ended); NaN if it was not"""
+    """seconds from the command until the task was solved (for millrace, until the program ended); NaN if it wasn't solved"""
     updates: list[tuple[int, float]]
-    """env steps and time in seconds at the end of each update"""
+    """for each update, the env steps and the time in seconds at its end"""
 
     def steps_per_s(self, *, after_updates: int = 0, after_steps: int = 0) -> float:
-        """Env steps/s from the first update after both, which are the warm-up, until the last."""
+        """Env steps/s between the first update after the warm-up and the last update.
+
+        The warm-up lasts for at least this number of updates and this number of env steps.
+        """
         first, began_s = next(update for update in self.updates[after_updates:] if update[0] >= after_steps)
         last, ended_s = self.updates[-1]
         return (last - first) / (ended_s - began_s)
 
 
 def contenders(peers: bool = False) -> list[str]:
-    """The contenders that can run here. Other systems than Stable-Baselines3 are included only with `peers`."""
+    """The contenders that can run here. Systems other than Stable-Baselines3 are included only if `peers`."""
     here = ["", *install.installed()] if peers else [""]
     sb3 = importlib.util.find_spec("stable_baselines3") is not None
     return [name for name, each in CONTENDERS.items() if each.peer in here and (each.module != _SB3 or sb3)]
@@ -148,9 +151,9 @@ def missing() -> list[str]:
 
 @contextlib.contextmanager
 def started(command: Sequence[str], folder: Path) -> Iterator[subprocess.Popen[bytes]]:
-    """A program that runs in this folder, with one thread for numpy, and writes into its file `OUTPUT`.
+    """A context manager that starts a program in this folder, with one thread for numpy, and its output in `OUTPUT`.
 
-    In the end the program and its child processes are killed.
+    At the end of the context, the program and its child processes are killed.
     """
     threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
     path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
@@ -178,10 +181,10 @@ def run(
     look: Callable[[int], None] = lambda pid: None,
     contender: Contender | None = None,
 ) -> ProgramResult:
-    """Run a program to its end.
+    """Run a program to its end. Raises `RuntimeError` if it fails.
 
-    `look` is called with its pid from time to time. With a target it ends once that is reached. `contender`: the program, if
-    `CONTENDERS` does not have the name.
+    `target`: the mean return at which the program ends. `look` is called with the process id from time to time. `contender`:
+    the program, if the name isn't in `CONTENDERS`.
     """
     each = contender or CONTENDERS[name]
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
@@ -208,8 +211,8 @@ def run(
         json_lines = [line for line in out.read_text().splitlines() if line.startswith(('{"env_steps"', '{"solved"'))]
         lines = [
             json.JSONDecoder().raw_decode(line)[0] for line in json_lines
-        ]  # output of the peer may follow on the same line
-        solved = [line["at_s"] - began_s for line in lines if "solved" in line]  # one clock for all processes
+        ]  # other output of the peer may follow on the same line
+        solved = [line["at_s"] - began_s for line in lines if "solved" in line]  # all processes have the same clock
         return ProgramResult(
             solved[0] if solved else math.nan, [(line["env_steps"], line["at_s"]) for line in lines if "env_steps" in line]
         )
@@ -232,7 +235,7 @@ def _ours(contender: Contender, settings: dict[str, Any], target: float | None, 
 
 
 def flag(name: str, value: Any) -> list[str]:
-    """The words of the command line that give a setting this value."""
+    """The words of a command line that give a setting this value."""
     name = name.replace("_", "-")
     match value:
         case bool():

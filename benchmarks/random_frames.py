@@ -1,4 +1,4 @@
-"""An environment of random frames, which cost no time to make: `benchmarks.random_frames:RandomFrames-v0`."""
+"""An environment of random frames, which take almost no time to make: `benchmarks.random_frames:RandomFrames-v0`."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from millrace.protocol.arrays import Bytes
 
 
 class RandomFrames(gymnasium.Env[Bytes, Any]):
-    """Eight frames that are drawn when it is made, again and again. Six actions; every step gives 0."""
+    """Shows eight random frames, which are made once, again and again. It has six actions. Rewards are 0."""
 
     def __init__(self, side: int = 84, channels: int = 4) -> None:
-        """The frames have `side` × `side` pixels."""
+        """Frames are `side` × `side` pixels with this number of channels, uint8."""
         shape = (side, side, channels)
         self.observation_space = spaces.Box(0, 255, shape, np.uint8)
         self.action_space = spaces.Discrete(6)
@@ -23,7 +23,7 @@ class RandomFrames(gymnasium.Env[Bytes, Any]):
         self._steps = 0
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Bytes, dict[str, Any]]:
-        """Start at the first frame."""
+        """Show the first frame."""
         super().reset(seed=seed)
         self._steps = 0
         return self._frames[0].copy(), {}

@@ -1,11 +1,11 @@
-"""PPO on HalfCheetah-v5 and on Pong, compared with Stable-Baselines3's: `python -m benchmarks.real_sizes`.
+"""PPO on HalfCheetah-v5 and on Pong, compared with Stable-Baselines3's PPO: `python -m benchmarks.real_sizes`.
 
-Rule: the same hyperparameters, environments, networks and torch threads for both. HalfCheetah-v5: 8 copies of 256 steps,
-minibatches of 256, 10 epochs, 64-64, no normalization, one torch thread. Pong: 16 copies of 128 steps, minibatches of 256, 4
-epochs, the convolutions of Mnih et al. (2015), one torch thread for each core.
+Rule: both systems use the same hyperparameters, environments, networks and torch threads. HalfCheetah-v5: 8 env copies, 256
+steps, minibatches of 256, 10 epochs, a 64-64 network, no normalization, one torch thread. Pong: 16 env copies, 128 steps,
+minibatches of 256, 4 epochs, the convolutions of Mnih et al. (2015), one torch thread for each core.
 
-Env steps/s are measured from the second update on. The share of the arithmetic is the time that the network of the updates
-alone takes, forward and backward, divided by the time of the env steps.
+Env steps/s are measured from the second update on. The share of the arithmetic is the time that the network alone needs for
+the updates, forward and backward, divided by the time of the env steps.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ COMMON: dict[str, Any] = {
     "algo": "ppo", "batch_size": 256, "gamma": 0.99, "gae_lambda": 0.95, "vf_coef": 0.5, "max_grad_norm": 0.5,
     "clip_range": 0.2, "ent_coef": 0.0, "learning_rate": 3e-4, "normalize_observations": False, "normalize_rewards": False,
 }  # fmt: skip
-WARM_UP = 1  # updates
+WARM_UP = 1  # number of updates that aren't counted
 
 
 class Size(NamedTuple):
-    """One of the two environments."""
+    """One of the two environments, with its settings and contenders."""
 
     settings: dict[str, Any]
     contenders: dict[str, Contender]
@@ -50,7 +50,7 @@ class Size(NamedTuple):
 
 
 def sizes(cores: int) -> dict[str, Size]:
-    """Both, on this number of cores."""
+    """Both environments, by name. `cores`: number of torch threads for Pong."""
     sb3 = "benchmarks.train_stable_baselines3"
     flags = ("--lanes", "2", "--torch-threads")
     image = Leaf("", "box", (4, 84, 84), "uint8", divisor=255)
@@ -94,7 +94,7 @@ def rate(name: str, size: Size, seed: int) -> float:
 
 
 def network_s(size: Size, threads: int, repeats: int = 8) -> float:
-    """Seconds that the network of the updates takes for an env step, forward and backward, by itself."""
+    """Seconds that the network alone needs, forward and backward, in the updates for one env step."""
     torch.set_num_threads(threads)
     net = ActorCriticNetwork(size.policy)
     rows = size.settings["batch_size"]

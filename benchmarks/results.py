@@ -1,8 +1,8 @@
 """Adds runs to benchmarks/scores.json, and writes its tables into docs/explanation/results.md and benchmarks/README.md.
 
-`python -m benchmarks.results RUN ...`; without runs it only writes the tables. For each run it takes the best policy of the
-run's own evaluations, evaluated again on 100 other episodes, and the final policy. If a run's own evaluations had fewer
-episodes, the policies are evaluated here. Runs that differ only in their seed form one row.
+`python -m benchmarks.results RUN ...`; without runs, it only writes the tables. For each run it takes the returns of the
+final policy and of the best policy of the run's own evaluations, the latter evaluated again on 100 other episodes. If a
+run's own evaluations had fewer episodes, the policies are evaluated here. Runs that differ only in their seeds form one row.
 """
 
 from __future__ import annotations
@@ -41,15 +41,15 @@ PAGE_OF_COMMANDS = Path(__file__).with_name("README.md")
 RETURNS, COMMANDS = (
     re.compile(rf"^\| {first} \|.*?\n(?=\n|\Z)", re.MULTILINE | re.DOTALL) for first in ("environment", "seconds")
 )
-OTHER_EPISODES = 1_000_000  # the seed of `millrace evaluate`; no run chooses its best policy by these episodes
-NOT_IN_COMMANDS = ("env", "algo", "seed", "run_dir", "torch_threads")  # the last one is chosen for the machine
+OTHER_EPISODES = 1_000_000  # default seed of `millrace evaluate`; no run chooses its best policy by these episodes
+NOT_IN_COMMANDS = ("env", "algo", "seed", "run_dir", "torch_threads")  # torch_threads is chosen for the machine
 EVALUATION = ("eval_every", "eval_episodes")
 
 
 def read(path: Path, *, only_final: bool) -> Score | None:
-    """The score of a run, or None if it has not finished.
+    """The score of a run, or None if the run hasn't finished.
 
-    `only_final`: without the best policy; then the settings of evaluations, which change no weights, are not in the command.
+    `only_final`: leave out the best policy. Then the command has no settings of evaluations, because they change no weights.
     """
     folder = RunFolder.open(path)
     config = config_of_run(path)
@@ -73,7 +73,10 @@ def read(path: Path, *, only_final: bool) -> Score | None:
 
 
 def _played(path: Path, config: Config, found: Evaluation | None, which: Which) -> float | None:
-    """The mean return over `EPISODES` episodes. They are played here if the run's own evaluation had another number."""
+    """The mean return over `EPISODES` episodes, which are played here if the run's own evaluation had a different number.
+
+    None if the run has no such evaluation.
+    """
     if found is not None and found.episodes != EPISODES:
         plan = EvaluationPlan.of(EPISODES, OTHER_EPISODES, config.eval_copies, config.eval_max_steps)
         with policy_player(saved_policy(path, which), PlayingWorkers(local_workers(config)), lambda text: None) as player:
@@ -82,13 +85,13 @@ def _played(path: Path, config: Config, found: Evaluation | None, which: Which) 
 
 
 def command(config: Config, leave_out: Sequence[str] = ()) -> str:
-    """The shortest command line that repeats this run, with S as the seed and without the settings to leave out."""
-    leave_out = (*leave_out, *NOT_IN_COMMANDS, *(() if config.max_lag else ("workers",)))  # with max_lag 0 it has no effect
+    """The shortest command line that repeats this run, with S as its seed. `leave_out`: settings to leave out."""
+    leave_out = (*leave_out, *NOT_IN_COMMANDS, *(() if config.max_lag else ("workers",)))  # no effect with max_lag 0
     words = ["millrace", "train", config.env, "--seed", "S"]
     if config.algo != "ppo":
         words += ["--algo", config.algo]
     preset = resolve(config.env, algo=config.algo)
-    if any(getattr(preset, name).keys() - getattr(config, name).keys() for name in TABLES):  # a flag cannot remove an entry
+    if any(getattr(preset, name).keys() - getattr(config, name).keys() for name in TABLES):  # no flag can remove an entry
         preset = resolve(config.env, algo=config.algo, preset="none")
         words = [*words, "--preset", "none"]
     defaults = msgspec.to_builtins(preset)

@@ -1,9 +1,9 @@
-"""Env steps/s of `RolloutService` beside the built-in trainer's: `millrace bench service`.
+"""Compares the env steps/s of `RolloutService` with those of the built-in trainer: `millrace bench service`.
 
-All collect CartPole-v1 with two processes, the same policy, seed and sizes, over ipc. The service's loop only publishes the
-same weights again; the trainer's algorithm does the same, so its figure is its collecting rate. The ceiling is two
-collectors without any messages. The last row is the service with the same network written as an `OwnPolicy`. Rounds are
-interleaved, and a share is the median of the shares within a round.
+All contenders collect CartPole-v1 with two processes, the same policy, seed and sizes, over ipc. The loop over the service
+only publishes the same weights again. The trainer's algorithm does the same, so that its figure is the rate of collecting.
+The upper limit is two collectors without any messages. The last row is the service with the same network, written as an
+`OwnPolicy`. Rounds are interleaved, and a share is the median of the shares within a round.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ WARM_UP_S = 1.0
 
 
 class Unchanged(Algorithm):
-    """Learns nothing: it publishes the same weights after each batch."""
+    """An algorithm that learns nothing. It returns the same weights after each batch."""
 
     def __init__(self, config: Any, policy: PolicySpec, *, total_steps: int, seed: int, device: str = "cpu") -> None:
         self._weights = PolicyParameters(policy).initial(1)
@@ -42,11 +42,11 @@ class Unchanged(Algorithm):
         return {}
 
     def weights(self) -> tuple[Floats, Floats]:
-        """The initial ones."""
+        """The initial weights."""
         return self._weights.copy(), np.zeros(0, np.float32)
 
     def state_dict(self) -> dict[str, Any]:
-        """Nothing."""
+        """An empty state."""
         return {}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -54,14 +54,14 @@ class Unchanged(Algorithm):
 
 
 class Network:
-    """The forward pass of `MLP(64, 64)` and its sampling, as a user would write them."""
+    """The forward pass and the sampling of `MLP(64, 64)`, as a user would write them for an `OwnPolicy`."""
 
     def load(self, arrays: dict[str, Array]) -> None:
-        """Keep the arrays."""
+        """Store the arrays of the layers."""
         self.layers = [(arrays[f"{name}.weight"].T, arrays[f"{name}.bias"]) for name in ("actor.0", "actor.1", "actor.out")]
 
     def act(self, obs: Array, state: Array, rng: np.random.Generator) -> tuple[Array, Array, dict[str, Array]]:
-        """Sample, with log-probabilities."""
+        """Sample actions, and compute their log-probabilities."""
         x = obs
         for weight, bias in self.layers[:-1]:
             x = np.tanh(x @ weight + bias)
@@ -74,17 +74,17 @@ class Network:
 
 
 class Clock:
-    """Env steps/s after a warm-up."""
+    """Measures env steps/s after a warm-up."""
 
     def __init__(self, seconds: float) -> None:
         self._seconds = seconds
         self._began_s = time.perf_counter()
         self._since = (0, 0.0)
         self.rate = 0.0
-        """0 until the time is over"""
+        """env steps/s; 0 until the time is over"""
 
     def over(self, env_steps: int) -> bool:
-        """Whether the time is over, after so many env steps."""
+        """Whether the time is over. `env_steps`: the number of env steps so far."""
         now = time.perf_counter()
         if self.rate:
             return True
@@ -99,7 +99,7 @@ class Clock:
 
 
 def service(policy: Any, max_lag: int, envs: int, seconds: float) -> float:
-    """A loop that publishes the same weights again."""
+    """Env steps/s of a loop over the service that publishes the same weights again."""
     settings: dict[str, Any] = {"workers": PROCESSES, "envs": envs, "lanes": LANES, "max_lag": max_lag, "seed": 1}
     with millrace.RolloutService("CartPole-v1", policy, rollout_steps=STEPS, **settings) as made:
         parameters = _initial()
@@ -113,7 +113,7 @@ def service(policy: Any, max_lag: int, envs: int, seconds: float) -> float:
 
 
 def trainer(max_lag: int, envs: int, seconds: float) -> float:
-    """The built-in training loop."""
+    """Env steps/s of the built-in training loop."""
     clock: Clock | None = None
 
     def watch(progress: Any) -> bool:

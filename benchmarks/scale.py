@@ -1,10 +1,11 @@
-"""One learner before 10, 100 and 1,000 simulated workers: `python -m benchmarks.scale`.
+"""One learner with 10, 100 and 1,000 simulated workers: `python -m benchmarks.scale`.
 
-The learner's side is the real one (link, coordinator, hub, stacking into a batch); its update does nothing. The workers are
-`simulated.py`: real sockets over loopback TCP, real messages, rollouts of 9 KB, answered at once. One lane for each worker,
-one rollout of every lane for each update. CPU is that of the learner's whole process, ZeroMQ's thread included.
+The learner's side is real (link, coordinator, hub, stacking into a batch), except that its update does nothing. The workers
+are those of `simulated.py`: real sockets over loopback TCP, real messages, and rollouts of 9 KB, which they send at once.
+There is one lane for each worker, and an update takes one rollout of every lane. CPU time is that of the learner's whole
+process, including ZeroMQ's thread.
 
-Rule: not one rollout may be lost, and the CPU that a rollout costs must not grow with the number of workers.
+Rule: no rollout may be lost, and the CPU time for a rollout must not grow with the number of workers.
 """
 
 from __future__ import annotations
@@ -39,38 +40,38 @@ from millrace.protocol.wire.learner_link import LearnerLink
 
 WORKERS = (10, 100, 1000)
 PROCESSES = 2
-WARM_UP = 5  # updates that do not count
-FLAT = 1.2  # what a rollout may cost with the most workers, as a multiple of what it costs with the fewest
+WARM_UP = 5  # number of updates that aren't counted
+FLAT = 1.2  # target for the CPU time of a rollout with the most workers, as a multiple of that with the fewest
 
 
 class Measured(msgspec.Struct, frozen=True, kw_only=True):
-    """What one learner did."""
+    """The measurements of one learner."""
 
     workers: int
     join_s: float
-    """from the first worker's start until the last has joined"""
+    """seconds from the start of the first worker until the last one has joined"""
     updates: int
     rollouts_per_s: float
     mb_per_s: float
-    """received"""
+    """megabytes received per second"""
     cpu_us: float
-    """CPU time of the learner's process for each rollout: all it does, weights and heartbeats included"""
+    """CPU time of the learner's process for each rollout, including weights and heartbeats"""
     python_us: float
-    """of that, in the thread that runs Python"""
+    """the part of this CPU time in the thread that runs Python"""
     spread_ms: float
-    """from publishing weights until the last worker acts on them, median"""
+    """median time from publishing weights until the last worker acts with them"""
     start_mb: float
-    """resident, before the first worker"""
+    """resident memory before the first worker has joined"""
     worker_kb: float
-    """resident, what each worker added once all had joined and sent some rollouts"""
+    """resident memory that each worker adds, measured after all have joined and sent some rollouts"""
     growth_mb: float
-    """resident, added while it was measured"""
+    """growth of the resident memory during the measurement"""
     lost: int
-    """rollouts and tickets that were not used and should have been"""
+    """number of rollouts and tickets that should have been used but weren't"""
 
 
 def learn(workers: int, seconds: float, transport: str, folder: Path, told: Connection) -> None:
-    """The learner's process: tells its address, measures, tells what it measured."""
+    """The learner's process: sends its address through the pipe, measures, and sends the measurements."""
     me = psutil.Process()
     run = run_spec(workers)
     link = LearnerLink(f"ipc://{folder}/learner" if transport == "ipc" else "tcp://127.0.0.1:*")
@@ -112,7 +113,7 @@ def learn(workers: int, seconds: float, transport: str, folder: Path, told: Conn
     counts = coordinator.rollouts.ledger.counts()
     lost = counts["lost"] + sum(counts[f"transitions_{why}"] for why in ("duplicate", "late", "invalid"))
     lost += counts["messages_bad"] + abs(counts["issued"] - counts["used"] - counts["outstanding"])
-    for _ in range(2):  # so that the weights measured last arrive
+    for _ in range(2):  # so that the last weights of the measurement arrive
         hub.gather()
         publish()
     hub.drain("measured", 10)
@@ -142,7 +143,7 @@ def _resident_mb(process: psutil.Process) -> float:
 
 
 def measure(workers: int, seconds: float, transport: str) -> Measured:
-    """A learner of its own, and its workers in few processes."""
+    """Run a new learner with this number of workers, which share a few processes."""
     context = multiprocessing.get_context("spawn")
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -181,7 +182,7 @@ def show(rows: list[Measured], rounds: int) -> Table:
 
 
 def medians(turns: list[Measured]) -> Measured:
-    """Of each figure; but all that was lost, in any turn, is told."""
+    """The median of each figure, except `lost`, which is summed over all turns."""
     fields = {name: statistics.median(getattr(turn, name) for turn in turns) for name in Measured.__struct_fields__}
     fields |= {name: int(fields[name]) for name in ("workers", "updates")}
     return Measured(**fields | {"lost": sum(turn.lost for turn in turns)})

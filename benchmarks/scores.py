@@ -1,6 +1,7 @@
-"""Returns that millrace's runs have reached (scores.json), returns that others have published (published_scores.toml).
+"""Returns that millrace's runs have reached (scores.json), and returns that others have published (published_scores.toml).
 
-Run folders are not kept in the repository; what tables need of them is. `python -m benchmarks.results RUN ...` adds runs.
+The repository doesn't keep run folders, but only the numbers in them that tables need. `python -m benchmarks.results RUN
+...` adds runs.
 """
 
 from __future__ import annotations
@@ -16,45 +17,45 @@ from benchmarks.markdown_tables import table
 
 SCORES, PUBLISHED = (Path(__file__).with_name(name) for name in ("scores.json", "published_scores.toml"))
 EPISODES = 100
-"""greedy episodes of every score of ours"""
+"""number of greedy episodes in each of millrace's scores"""
 
 
 class Score(msgspec.Struct, kw_only=True, omit_defaults=True):
-    """Runs that differ in their seed only."""
+    """The returns of runs that differ only in their seeds."""
 
     env: str
     algo: str
     command: str
     """the command of each run, with S in place of the seed"""
     env_steps: int
-    """of the longest run"""
+    """env steps of the longest run"""
     final: dict[int, float]
     """mean return of the final policy, by seed"""
     best: dict[int, float] = {}
-    """by seed: mean return of the best policy of the run's own evaluations, on other episodes; empty without such"""
+    """mean return, on other episodes, of the best policy of the run's own evaluations, by seed; empty without evaluations"""
     seconds: float | None = None
-    """wall-clock seconds of the longest run, if they mean something"""
+    """wall-clock seconds of the longest run, if they are meaningful"""
     versions: dict[str, str] = {}
-    """versions of the packages that decide the results, if they are the same for all seeds"""
+    """versions of the packages that affect the results, if they are the same for all seeds"""
     note: str = ""
-    """what else a reader must know of the row"""
+    """a remark about the row"""
 
 
 class PublishedScore(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     """A return that another project has published."""
 
     env: str
-    """the environment of ours that it is compared with"""
+    """millrace's name of the environment with which it is compared"""
     algo: str
     system: str
     returns: float
     env_steps: int
     how: str = ""
-    """what differs: another version of the environment, how many runs, how it was evaluated"""
+    """what differs, such as the version of the environment, the number of runs, or the way of evaluating"""
 
 
 def read_scores() -> list[Score]:
-    """The scores of millrace, by environment, algorithm and number of env steps."""
+    """The scores of millrace, sorted by environment, algorithm and number of env steps."""
     return msgspec.json.decode(SCORES.read_bytes(), type=list[Score])
 
 
@@ -65,12 +66,12 @@ def write_scores(scores: Iterable[Score]) -> None:
 
 
 def read_published() -> list[PublishedScore]:
-    """The scores of others."""
+    """The scores that others have published."""
     return msgspec.convert(tomllib.loads(PUBLISHED.read_text())["score"], list[PublishedScore])
 
 
 def merged(old: Score | None, new: Score) -> Score:
-    """`new` and, of the seeds that it lacks, the runs of `old`."""
+    """The runs in `new`, and the runs in `old` with other seeds."""
     if old is None:
         return new
     return msgspec.structs.replace(
@@ -85,17 +86,20 @@ def merged(old: Score | None, new: Score) -> Score:
 
 
 def return_text(value: float) -> str:
-    """A return for a table: three digits or more."""
+    """A return for a table, with at least three digits."""
     return f"{value:,.{2 if abs(value) < 10 else 1 if abs(value) < 100 else 0}f}"
 
 
 def steps_text(env_steps: int) -> str:
-    """A number of env steps, rounded: 300k, 1M."""
+    """A rounded number of env steps, such as 300k or 1M."""
     return f"{round(env_steps / 1e6, 1):g}M" if env_steps > 0.95e6 else f"{round(env_steps / 1e3)}k"
 
 
 def seeds_text(returns: dict[int, float]) -> str:
-    """The interquartile mean with its interval of five seeds or more; else each return. Seeds other than 1 … N are named."""
+    """The interquartile mean with its interval, if there are five seeds or more; otherwise each return.
+
+    Seeds are named if they aren't 1 … N.
+    """
     if not returns:
         return "–"
     first_seeds = sorted(returns) == list(range(1, len(returns) + 1))
@@ -110,7 +114,7 @@ def seeds_text(returns: dict[int, float]) -> str:
 
 
 def returns_table(scores: Iterable[Score], published: Sequence[PublishedScore]) -> str:
-    """The first table of docs/explanation/results.md: our returns, and those that others published of the same algorithm."""
+    """The table of docs/explanation/results.md: millrace's returns, and published returns of the same algorithm."""
     head = ("environment", "algorithm", "env steps", "final policy", "best policy", "published (env steps)")
     rows = []
     for score in scores:
@@ -126,6 +130,6 @@ def returns_table(scores: Iterable[Score], published: Sequence[PublishedScore]) 
 
 
 def commands_table(scores: Iterable[Score]) -> str:
-    """The second table of docs/explanation/results.md: the command of each score, and how long it took."""
+    """The table of benchmarks/README.md: the command of each score, and how long it took."""
     rows = [("–" if score.seconds is None else f"{score.seconds:.0f}", f"`{score.command}`") for score in scores]
     return table(("seconds", "command"), rows)

@@ -1,10 +1,10 @@
-"""Rows/s of vector environments of several agents under random actions: `python -m benchmarks.seats`.
+"""Rows/s of vector environments with several agents under random actions: `python -m benchmarks.seats`.
 
-Each copy has 16 agents that all act in an episode of 100 steps, which costs little or sleeps 1 ms a step. A row is a step of
-an agent. The contenders are PufferLib's vector environment and supersuit's, where they are installed, and millrace's, with
-equally many processes, and a plain loop over the copies in this process, which stores nothing. In each round each contender
-is made, run and closed once, in an order that changes from round to round. Rates are medians over rounds; ratios are taken
-within a round.
+Each env copy has 16 agents, which all act in an episode of 100 steps. A step takes little time, or sleeps for 1 ms. A row is
+a step of one agent. The contenders are the vector environments of millrace, PufferLib and supersuit (as far as they are
+installed), with equally many processes, and a plain loop over the copies in this process, which stores nothing. In each
+round each contender is made, run and closed once, in an order that changes from round to round. Rates are medians over
+rounds; ratios are computed within a round.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ from rich.table import Table
 import millrace
 
 AGENTS = [f"agent_{number}" for number in range(16)]
-LENGTH = 100  # steps of an episode
+LENGTH = 100  # number of steps in an episode
 
 
 class Team(ParallelEnv[str, Any, Any]):  # type: ignore[misc]
-    """It costs little, or sleeps."""
+    """An environment with 16 agents, whose step takes little time or sleeps."""
 
     metadata: dict[str, Any] = {"name": "team"}
     render_mode = None
@@ -94,7 +94,10 @@ class Loop:
 
 
 def step_function(name: str, task: Task) -> tuple[Callable[[Any], object], Callable[[], None]]:
-    """What steps all copies with an array of actions, and what closes them. Raises `ImportError` if it is not installed."""
+    """Make a contender. Returns a function that steps all copies with an array of actions, and one that closes them.
+
+    Raises `ImportError` if the contender isn't installed.
+    """
     make = partial(Team, task.seconds)
     match name:
         case "plain loop":
@@ -120,7 +123,7 @@ def step_function(name: str, task: Task) -> tuple[Callable[[Any], object], Calla
 
 
 def wrapped(kind: Any, make: Callable[[], Team], buf: Any = None, seed: int = 0) -> Any:
-    """For PufferLib, which gives each copy its part of the arrays."""
+    """Make an env copy for PufferLib, which passes each copy its part of the arrays (`buf`)."""
     return kind(make(), buf=buf, seed=seed)
 
 
@@ -144,7 +147,7 @@ def rate(step: Callable[[Any], object], actions: Any, seconds: float) -> float:
 
 
 def measure(task: Task, rounds: int, seconds: float, table: Table) -> None:
-    """A row of the table for each contender."""
+    """Measure a task, and add a row to the table for each contender."""
     actions = np.random.default_rng(1).integers(4, size=(100, task.copies * len(AGENTS)))
     present = [*NAMES]
     found: list[dict[str, float]] = []

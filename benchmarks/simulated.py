@@ -1,6 +1,7 @@
-"""Workers without environments: real sockets, the real `millrace.workers.conversation`, one canned rollout for every ticket.
+"""Simulated workers without environments: they have real sockets and the real `millrace.workers.conversation`, and answer
+every ticket with the same canned rollout.
 
-Many live in one process, so that a thousand fit on a machine. They answer as fast as they can.
+Many of them share a process, so that a thousand fit on a machine. They answer as fast as they can.
 """
 
 from __future__ import annotations
@@ -26,19 +27,19 @@ from millrace.protocol.wire.codec import decode_to_worker, encode
 from millrace.workers.conversation.session import Leave, RolloutTask, SendMessage, Session, WorkerEffect, WorkerIdentity
 
 POLICY = PolicySpec((Leaf("", "box", (4,), "float32"),), ActionSpec("discrete", (), "int64", (2,), (0,)))
-STEPS = 32  # with these copies, a rollout has 9 KB
+STEPS = 32  # with 8 copies, a rollout has 9 KB
 COPIES = 8
-VERSIONS = 100_000  # rows of the table of arrivals: more than a run has
+VERSIONS = 100_000  # number of rows in the table of arrivals; more than a run has versions
 Arrivals = npt.NDArray[np.float64]
 
 
 def run_spec(workers: int) -> RunSpec:
-    """A run with a lane for each of so many workers."""
+    """A run with one lane for each worker."""
     return RunSpec(EnvSpec("canned"), POLICY, rollout_steps=STEPS, copies=COPIES, lanes=workers, seed=1)
 
 
 def canned(run: RunSpec) -> Rollout:
-    """A rollout of the run's shapes in which no episode ends."""
+    """A rollout with the run's shapes, in which no episode ends."""
     rng = np.random.default_rng(0)
     shape = (run.rollout_steps, run.copies)
     nothing = np.zeros(shape, bool)
@@ -67,7 +68,7 @@ def table(folder: Path, workers: int, mode: Any = "r") -> Arrivals:
 
 
 class Simulated:
-    """One worker."""
+    """A simulated worker."""
 
     def __init__(self, number: int, address: str, context: zmq.Context[zmq.Socket[bytes]], arrivals: Arrivals) -> None:
         self._number = number
@@ -81,11 +82,11 @@ class Simulated:
         self.left = False
 
     def tick(self, now: float) -> None:
-        """What is due by the clock."""
+        """Do what is due at this time, such as sending a heartbeat."""
         self._do(self._session.tick(now))
 
     def listen(self) -> None:
-        """Read all that has arrived; answer every ticket."""
+        """Read all messages that have arrived, and answer every ticket."""
         now = time.monotonic()
         try:
             while True:
@@ -136,8 +137,8 @@ class Simulated:
 
 
 def simulate(address: str, numbers: range, workers: int, folder: Path) -> None:
-    """A process of them, until the learner has told all to leave."""
-    os.nice(5)  # the learner is what is measured
+    """Run some of the workers in this process, until the learner has told all of them to leave."""
+    os.nice(5)  # give way to the learner, which is measured
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     arrivals = table(folder, workers, "r+")
     all_of_them = [Simulated(number, address, context, arrivals) for number in numbers]

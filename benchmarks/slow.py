@@ -1,11 +1,12 @@
 """Compares training on a slow environment: `python -m benchmarks.slow`, or `millrace bench slow`.
 
-PPO with 64 steps, minibatches of 256 and 10 epochs, on 16 env copies in 16 processes. The environment sleeps
-(`benchmarks/slow_env.py`), so that the number of cores does not matter and waiting is all that is measured. The ideal is 16
-copies that never wait: 16 processes that step and do nothing else. They reach less than the durations say, because a machine
-wakes a process a little late. Each run is a process tree of its own; all take turns. Two more rows are loops over
-`millrace.make_vec` that act at random and learn nothing: by `step`, and by `send` and `recv`. `--only-loops` measures these
-and the ideal. `--peers` adds the installed systems that can run 16 processes. `--picture FILE` draws who waits for whom.
+All run PPO with 64 steps, minibatches of 256 and 10 epochs, on 16 env copies in 16 processes. The environment sleeps
+(`benchmarks/slow_env.py`), so that the number of cores doesn't matter and only waiting is measured. The ideal is 16 copies
+that never wait: 16 processes that step and do nothing else. They are slower than the durations of steps and resets suggest,
+because a machine wakes a process a little late. Each run is a process tree of its own; all take turns. Two more rows are
+loops over `millrace.make_vec` that act at random and learn nothing: one with `step`, one with `send` and `recv`.
+`--only-loops` measures these and the ideal. `--peers` adds the installed systems that can run 16 processes. `--picture FILE`
+draws who waits for whom.
 """
 
 from __future__ import annotations
@@ -34,12 +35,12 @@ from benchmarks.slow_env import STEPS_PER_S, TIMELINE, Lognormal
 from benchmarks.writing import write
 
 COPIES = 16
-IDEAL = COPIES * STEPS_PER_S  # if a machine woke every process in time
+IDEAL = COPIES * STEPS_PER_S  # env steps/s if the machine woke every process in time
 NEVER_WAIT = "copies that never wait"
 NEVER_WAIT_S = 12.0
-WARM_UP = 3  # updates
-WIDTH = 640  # of the picture: letters are large enough on a phone
-ROW = 7  # the height of a copy
+WARM_UP = 3  # number of updates that aren't counted
+WIDTH = 640  # width of the picture; its letters are then large enough on a phone
+ROW = 7  # height of an env copy's row in the picture
 STYLE = (
     "text{fill:#2b3a42}.name{font-weight:600}.rows{fill:#8f9ba3;opacity:.16}.step{fill:#0072b2}.reset{fill:#e69f00}"
     "@media(prefers-color-scheme:dark){text{fill:#dde5ea}.step{fill:#4aa8e0}.reset{fill:#f0b440}}"
@@ -87,7 +88,7 @@ def rate(name: str, contender: Contender, seed: int) -> float:
 
 
 def rate_without_waiting(seed: int) -> float:
-    """Env steps/s of copies in processes that only step and reset."""
+    """Env steps/s of env copies in processes that only step and reset."""
     context = multiprocessing.get_context("spawn")
     begin = context.Barrier(COPIES)
     counts = context.Queue()
@@ -115,9 +116,9 @@ def _step_only(seed: int, begin: Barrier, counts: multiprocessing.Queue[int]) ->
 
 
 def rate_of_loop(seed: int, *, by_recv: bool) -> float:
-    """Env steps/s of a loop over a vector environment that acts at random; each copy has a worker of its own.
+    """Env steps/s of a loop over a vector environment with random actions, in which each copy has a worker of its own.
 
-    With SameStep every row of a step is an env step, whether it also resets or not.
+    The autoreset mode is SameStep, so that every row of a step is an env step, even if the copy is also reset.
     """
     env_id = f"{Lognormal.__module__}:Lognormal-v0"
     actions = np.random.default_rng(seed)
@@ -139,7 +140,7 @@ def rate_of_loop(seed: int, *, by_recv: bool) -> float:
 
 
 def timelines(name: str, contender: Contender, seed: int) -> list[np.ndarray[Any, Any]]:
-    """For each env copy, its calls [calls, 3]: start, end, whether it was a reset."""
+    """For each env copy, an array of its calls [calls, 3]: start, end, and whether the call was a reset."""
     with tempfile.TemporaryDirectory() as folder:
         os.environ[TIMELINE] = folder
         try:
@@ -147,11 +148,11 @@ def timelines(name: str, contender: Contender, seed: int) -> list[np.ndarray[Any
         finally:
             del os.environ[TIMELINE]
         found = [np.fromfile(path).reshape(-1, 3) for path in Path(folder).iterdir() if path.stat().st_size]
-    return sorted(found, key=len)[-COPIES:]  # an evaluation has copies of its own, with fewer calls
+    return sorted(found, key=len)[-COPIES:]  # without those of evaluations, which have fewer calls
 
 
 def draw(found: dict[str, list[np.ndarray[Any, Any]]], seconds: float = 1.2) -> str:
-    """An SVG for light and dark pages, with a row for each env copy: steps, resets, and nothing where it waits."""
+    """An SVG for light and dark pages, with a row for each env copy: its steps and resets, and nothing while it waits."""
     panels = [_panel(title, copies, seconds) for title, copies in found.items()]
     height = 34 + ROW * COPIES + 16
     about = f"{', '.join(found)}: what {COPIES} env copies do in {seconds:g} seconds"
@@ -167,13 +168,13 @@ def draw(found: dict[str, list[np.ndarray[Any, Any]]], seconds: float = 1.2) -> 
 
 def _panel(title: str, copies: list[np.ndarray[Any, Any]], seconds: float) -> str:
     began_s = min(calls[-1, 1] for calls in copies) - seconds - 0.5
-    paths = {False: "", True: ""}  # by whether it is a reset
+    paths = {False: "", True: ""}  # for steps and for resets
     busy_s = 0.0
     for row, calls in enumerate(copies):
         for start_s, end_s, is_reset in calls[(calls[:, 1] > began_s) & (calls[:, 0] < began_s + seconds)]:
             start, end = np.clip(np.array([start_s, end_s]) - began_s, 0.0, seconds)
             busy_s += end - start
-            width = max((end - start) * WIDTH / seconds - 0.3, 0.3)  # the gap shows where one step ends
+            width = max((end - start) * WIDTH / seconds - 0.3, 0.3)  # leave a gap between two steps
             paths[bool(is_reset)] += f"M{start * WIDTH / seconds:.1f} {ROW * row + 34}h{width:.1f}v{ROW - 2}h{-width:.1f}z"
     return (
         f'<text y="20"><tspan class="name">{escape(title)}</tspan>: {busy_s / seconds / len(copies):.0%} of the time in '

@@ -1,17 +1,17 @@
 """Environments whose steps and resets take time and no CPU, because they sleep.
 
-`benchmarks.slow_env:TenMilliseconds-v0` is Pendulum-v1 with 10 ms more for each step, `FiftyMilliseconds-v0` with 50 ms, and
-with episodes of 1,000 steps in place of 200.
+`benchmarks.slow_env:TenMilliseconds-v0` is Pendulum-v1 in which each step takes 10 ms longer. In `FiftyMilliseconds-v0`, a
+step takes 50 ms longer, and an episode has 1,000 steps instead of 200.
 
-`benchmarks.slow_env:Lognormal-v0`: a step takes 5 ms in the mean (lognormal, sigma 1), a reset 200 ms, and an episode has
-50 to 150 steps. The durations follow from the reset seed. A copy that never waits makes 100 steps in 0.7 s.
+`benchmarks.slow_env:Lognormal-v0`: a step takes 5 ms on average (lognormal, sigma 1), a reset 200 ms, and an episode has
+50 to 150 steps. The durations depend only on the reset seed. A copy that never waits makes 100 steps in 0.7 s.
 
 `benchmarks.slow_env:Constant-v0`: a step takes `seconds`, a reset no time, and an episode has `steps` steps.
 
 `StepTime` makes the steps of any environment take a given time: `--wrappers "benchmarks.slow_env:StepTime(seconds=0.05)"`.
 
-With the environment variable `SLOW_ENV_TIMELINE` each copy appends every step and reset to a file in that folder: three
-float64 numbers: start and end by the monotonic clock, and 1 for a reset.
+If the environment variable `SLOW_ENV_TIMELINE` names a folder, each copy of `Lognormal-v0` appends three float64 numbers to
+a file in it for every step and reset: start and end by the monotonic clock, and 1 for a reset.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ from gymnasium.spaces import Box, Discrete
 MEAN_STEP_S = 0.005
 SIGMA = 1.0
 RESET_S = 0.2
-SHORTEST = 50  # steps of an episode
+SHORTEST = 50  # least number of steps in an episode
 LONGEST = 150
 TIMELINE = "SLOW_ENV_TIMELINE"
-STEPS_PER_S = 1 / (MEAN_STEP_S + RESET_S / ((SHORTEST + LONGEST) / 2))  # of a copy that never waits
+STEPS_PER_S = 1 / (MEAN_STEP_S + RESET_S / ((SHORTEST + LONGEST) / 2))  # env steps/s of a copy that never waits
 
 
 class Lognormal(gymnasium.Env[Any, Any]):
-    """An environment that sleeps."""
+    """An environment whose steps and resets sleep; the times of steps are lognormal."""
 
     def __init__(self) -> None:
         self.observation_space = Box(-1.0, 1.0, (4,), np.float32)
@@ -94,7 +94,7 @@ class Constant(gymnasium.Env[Any, Any]):
 
 
 class StepTime(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """An environment whose steps take a given time: each sleeps until it is over. Resets are not changed."""
+    """A wrapper that makes each step take `seconds`, by sleeping until this time is over. Resets aren't changed."""
 
     def __init__(self, env: gymnasium.Env[Any, Any], seconds: float) -> None:
         super().__init__(env)
@@ -111,7 +111,7 @@ class SlowPendulum(PendulumEnv):
     """Pendulum-v1 whose steps take longer."""
 
     def __init__(self, render_mode: str | None = None, *, step_s: float) -> None:
-        """`step_s`: by how many seconds."""
+        """`step_s`: by how many seconds a step takes longer."""
         super().__init__(render_mode)
         self._step_s = step_s
 

@@ -1,8 +1,8 @@
-"""SAC at replay ratio 1 on an environment whose steps take 10 ms, eight workers: `python -m benchmarks.slow_replay`.
+"""SAC at replay ratio 1 with eight workers and steps that take 10 ms: `python -m benchmarks.slow_replay`.
 
-Two rates bound such a run: that of the workers without any gradient step, and that of the learner where env steps take no
-time. The slower one is what a run can reach. The environment sleeps (`benchmarks/slow_env.py`), so eight workers do not need
-eight cores. All runs take turns. Env steps/s are measured after the first updates with gradient steps.
+Two rates limit such a run: the rate of the workers if there are no gradient steps, and the rate of the learner if env steps
+take no time. A run can at best reach the lower one. The environment sleeps (`benchmarks/slow_env.py`), so eight workers
+don't need eight cores. All runs take turns. Env steps/s are measured after the first updates with gradient steps.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Draws docs/images/tickets.png, who collects and who learns when: `python -m benchmarks.tickets`.
+"""Draws docs/images/tickets.png, which shows when workers collect rollouts and when the learner makes updates.
 
-It plays the real coordinator (`learner/rollouts/ticket_coordinator.py`) in simulated time: three lanes, each on a worker of
-its own, rollouts of three durations in turn, an update that takes as long as a short rollout, and messages that take no
-time. So the picture shows what the rule for tickets does, and is the same on every machine.
+`python -m benchmarks.tickets` runs the real coordinator (`learner/rollouts/ticket_coordinator.py`) in simulated time. There
+are three lanes, each on a worker of its own. Rollouts take several durations in turn, an update takes as long as a short
+rollout, and messages take no time. So the picture shows the effect of the rule for tickets, and is the same everywhere.
 """
 
 from __future__ import annotations
@@ -24,39 +24,39 @@ from millrace.protocol.messages import PROTOCOL_VERSION, Collect, Hello
 
 OUT = Path(__file__).parents[1] / "docs" / "images" / "tickets.png"
 LANES = 3
-ROLLOUT_S = (1.0, 1.6, 1.1, 2.0)  # of lane n: the n-th first, then the others in turn
+ROLLOUT_S = (1.0, 1.6, 1.1, 2.0)  # durations of rollouts; lane n begins with the n-th, then takes the others in turn
 UPDATE_S = 1.0
 NOTHING = np.zeros(0, np.float32)
 
 
 class Span(NamedTuple):
-    """A rollout that was collected, or an update."""
+    """The time of a rollout or an update in the picture."""
 
     row: int
     """number of the lane; `LANES` is the learner"""
     start_s: float
     end_s: float
     version: int
-    """of the weights that acted, or that the update began with"""
+    """version of the weights with which the rollout was collected, or with which the update began"""
 
 
 class Played(NamedTuple):
-    """What happened."""
+    """The result of a simulation."""
 
     spans: list[Span]
     lags: list[int]
-    """of each rollout that an update used"""
+    """the lag of each rollout that an update used"""
 
 
 def play(max_lag: int, seconds: float) -> Played:
-    """What workers and learner do with tickets under this `max_lag`."""
+    """Simulate workers and learner with this `max_lag`."""
     run = run_spec(LANES)
     rollout = canned(run)
     coordinator = TicketCoordinator(run, RolloutDealer(run.lanes, Rounds(max_lag)), worker_timeout_s=1e9, first_session=1)
     spans: list[Span] = []
     lags: list[int] = []
-    events: list[tuple[float, int]] = []  # when a row's rollout or update ends
-    tickets: list[list[tuple[int, int]]] = [[] for _ in range(LANES)]  # with the version that acts
+    events: list[tuple[float, int]] = []  # time at which a rollout or update ends, and its row
+    tickets: list[list[tuple[int, int]]] = [[] for _ in range(LANES)]  # for each lane: ticket and version of the weights
     busy = [False] * (LANES + 1)
     collected = [0] * LANES
     now = 0.0
@@ -109,13 +109,13 @@ def play(max_lag: int, seconds: float) -> Played:
 
 
 def busy_share(played: Played, rows: range, seconds: float) -> float:
-    """Share of the time in which these rows collect or learn."""
+    """The share of the time in which these rows collect or learn."""
     began = [span for span in played.spans if span.row in rows and span.start_s < seconds]
     return sum(min(span.end_s, seconds) - span.start_s for span in began) / (seconds * len(rows))
 
 
 def draw(out: Path, seconds: float = 20.0) -> None:
-    """A panel for `max_lag` 0, 1 and 2: a row for the learner and for each lane."""
+    """Draw a panel for each of `max_lag` 0, 1 and 2, with a row for each lane and for the learner."""
     from matplotlib.figure import Figure
     from matplotlib.layout_engine import ConstrainedLayoutEngine
 

@@ -1,10 +1,11 @@
 """Compares training on CartPole-v1 with Stable-Baselines3, with the same hyperparameters: `python -m benchmarks.train`.
 
-`--peers` adds all other systems that `python -m benchmarks.peers.install` has installed, the memory, and A2C and DQN of
-Stable-Baselines3. Env steps/s are measured from the third update on. The time to solve is from the command (with imports,
-start and evaluations) until the mean return of a greedy evaluation is 475; there is an evaluation of 20 episodes every
-5,000 env steps. For millrace it lasts until the program has ended. Each run is a process tree of its own with a cold start;
-all take turns. A run that fails is reported and left out. The last row of the table is what the arithmetic would allow.
+`--peers` adds all other systems that `python -m benchmarks.peers.install` has installed, memory, and Stable-Baselines3's A2C
+and DQN. Env steps/s are measured from the third update on. The time to solve the task is measured from the start of the
+command (with imports and evaluations) until the mean return of a greedy evaluation is 475; for millrace, until the program
+has ended. There is an evaluation of 20 episodes every 5,000 env steps. Each run is a process tree of its own with a cold
+start; all take turns. A run that fails is reported and left out. The last row of the table is the speed that the arithmetic
+alone would allow.
 """
 
 from __future__ import annotations
@@ -24,14 +25,14 @@ from benchmarks.programs import A2C, CONTENDERS, DQN, DUMMY, LARGE, OURS, OURS_O
 from benchmarks.update_ppo import contest
 from benchmarks.writing import bars, write
 
-WARM_UP = 2  # updates
-TARGET = 5.0  # times the env steps/s of Stable-Baselines3 at its best
+WARM_UP = 2  # number of updates that aren't counted
+TARGET = 5.0  # target for env steps/s, as a multiple of Stable-Baselines3's best
 SOLVED = 475.0
 NAN = math.nan
 
 
 class Measure(NamedTuple):
-    """A measurement that is made of each contender in every turn."""
+    """A measurement, which each contender undergoes in every turn."""
 
     column: str
     settings: dict[str, Any]
@@ -40,19 +41,19 @@ class Measure(NamedTuple):
     """rate, solved or memory"""
 
     def fits(self, contender: str) -> bool:
-        """Whether it is made of this contender."""
+        """Whether this measurement is made for this contender."""
         each = CONTENDERS[contender]
         if self.settings["algo"] != "ppo":
             among = (OURS, DUMMY, SUBPROC) if self.settings["algo"] == "a2c" else (OURS, DUMMY)
             return contender in among or (contender == OURS_OWN and self.kind == "solved")
         if contender == OURS_OWN:
-            return False  # the preset of PPO has the same settings
+            return False  # PPO's preset has the same settings
         if each.ours and each.own and self.kind != "rate":
-            return False  # their settings differ, so only their env steps/s are measured
+            return False  # as their settings differ, only env steps/s are measured
         return self.settings["envs"] <= each.most_envs and not (each.own and self.settings is LARGE)
 
     def of(self, contender: str, seed: int) -> dict[str, float]:
-        """Run the contender; one or two numbers by column. Raises `RuntimeError`."""
+        """Run the contender. Returns one or two numbers, by column of the table. Raises `RuntimeError`."""
         settings = self.settings | {"steps": self.steps, "seed": seed}
         match self.kind:
             case "rate":
@@ -84,7 +85,7 @@ PEERS_MEASURES = [
     Measure("DQN solved, s", DQN, 50_000, "solved"),
 ]
 Turn = dict[str, dict[str, float]]
-"""by contender and column, the number that was measured"""
+"""The measured numbers, by contender and column"""
 
 
 def take_turns(names: list[str], measures: list[Measure], seed: int) -> Turn:
@@ -100,7 +101,7 @@ def take_turns(names: list[str], measures: list[Measure], seed: int) -> Turn:
 
 
 def summary(names: list[str], turns: list[Turn]) -> list[dict[str, object]]:
-    """A row for each contender: the medians and the numbers behind them."""
+    """A row for each contender, with medians and the numbers behind them."""
     rows: list[dict[str, object]] = []
     for name in names:
         asked = dict.fromkeys(column for turn in turns for column in turn[name])
@@ -112,7 +113,7 @@ def summary(names: list[str], turns: list[Turn]) -> list[dict[str, object]]:
 
 
 def _median(found: list[float]) -> float:
-    """The median. NaN (not solved) counts as longer than everything."""
+    """The median. NaN (not solved) counts as larger than all other numbers."""
     return statistics.median_low(sorted(found, key=lambda x: (math.isnan(x), x))) if len(found) % 2 else _middle(found)
 
 
@@ -122,7 +123,7 @@ def _middle(found: list[float]) -> float:
 
 
 def table(rows: list[dict[str, Any]], title: str, algo: str = "") -> Table:
-    """A table of medians with minimum and maximum; of PPO, or of the algorithm that is named."""
+    """A table of medians with minimum and maximum, for PPO or for another algorithm."""
     columns = [
         c for c in dict.fromkeys(c for row in rows for c in row["of"]) if c.startswith(algo or ("env", "solved", "mem"))
     ]
@@ -149,7 +150,7 @@ def _cell(median: float | None, found: list[float]) -> str:
 
 
 def products_alone() -> dict[str, Any]:
-    """A row: env steps/s of a learner that waits for nothing, and whose updates are their matrix products on one core."""
+    """The row of a learner that never waits, and whose updates consist only of matrix products on one core."""
     rates = {}
     for column, settings in ((SMALL_RATE, ZOO), (LARGE_RATE, LARGE)):
         minibatch = contest(settings["batch_size"], None)
@@ -163,7 +164,7 @@ def products_alone() -> dict[str, Any]:
 
 
 def against(rows: list[dict[str, Any]]) -> list[str]:
-    """Lines that compare millrace with the best peer. Contenders with their own settings are only compared by seconds."""
+    """Lines that compare millrace with the best peer. Contenders with their own settings are compared only by seconds."""
     lines = []
     for column in (SMALL_RATE, LARGE_RATE, SECONDS):
         fast = max if column != SECONDS else min
@@ -205,7 +206,7 @@ def main() -> None:
 
 
 def _without_nan(data: Any) -> Any:
-    """Replace NaN by None, because JSON has no NaN."""
+    """The data with None in place of NaN, because JSON has no NaN."""
     match data:
         case dict():
             return {key: _without_nan(value) for key, value in data.items()}

@@ -1,9 +1,9 @@
-"""PPO, A2C, DQN, SAC and TD3 of Stable-Baselines3 as a program, with our names for their settings.
+"""PPO, A2C, DQN, SAC and TD3 of Stable-Baselines3 as a program whose settings have millrace's names.
 
 `benchmarks/train.py`, `benchmarks/continuous.py` and `benchmarks/real_sizes.py` run it. It uses one torch thread, which is
-fastest for small networks, or `--threads`. For each update it prints a line of JSON: env steps, and the time by the
-monotonic clock. Two settings differ: our DQN counts the age of a hard target in gradient steps, and may have several env
-copies.
+fastest for small networks, or `--threads`. For each update it prints a line of JSON with the env steps and the time by the
+monotonic clock. Two settings differ: millrace's DQN counts the age of a hard target in gradient steps, and may have several
+env copies.
 """
 
 from __future__ import annotations
@@ -48,9 +48,9 @@ def make(s: dict[str, Any], env: VecEnv) -> BaseAlgorithm:
                 batch_size=s["batch_size"],
                 buffer_size=s["replay_size"],
                 learning_starts=s["learning_starts"],
-                train_freq=s["envs"] * s["rollout_steps"],  # for its single env copy
+                train_freq=s["envs"] * s["rollout_steps"],  # because SB3's DQN has a single env copy here
                 gradient_steps=s["gradient_steps"],
-                target_update_interval=10,  # in env steps; in effect before each update
+                target_update_interval=10,  # in env steps; in effect, the target is copied before each update
                 exploration_fraction=s["epsilon_steps"] / s["steps"],
                 exploration_final_eps=s["epsilon_end"],
                 max_grad_norm=s["max_grad_norm"],

@@ -1,10 +1,10 @@
-"""Compares workers on another host, with a link of 5 ms, with workers on loopback: `python -m benchmarks.two_hosts`.
+"""Compares workers on another host, over a link with a delay of 5 ms, with workers on loopback.
 
-The learner runs on one host and `millrace worker --processes 4` on the other. The hosts are network namespaces of this
-machine (this needs root, iproute2 and nftables). A TCP proxy delays the link by 5 ms in each direction. All processes share
-the cores of this machine, so the numbers show only the cost of the link. Each run trains PPO with keys and the same
-settings; env steps/s are measured from the fifth update on. There are two environments: CartPole-v1, where the link costs
-most, and one whose step sleeps for a millisecond.
+`python -m benchmarks.two_hosts`. The learner runs on one host and `millrace worker --processes 4` on the other. The hosts
+are network namespaces of this machine (this needs root, iproute2 and nftables). A TCP proxy delays the link by 5 ms in each
+direction. All processes share the cores of this machine, so the numbers show only the effect of the link. Each run trains
+PPO with keys and the same settings; env steps/s are measured from the fifth update on. There are two environments:
+CartPole-v1, where the link matters most, and one whose step sleeps for a millisecond.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from tests.system.stage.network import Network, why_not
 from tests.system.stage.processes import START_S, TOY, Stage, free_port
 
 PROCESSES = 4
-DELAY_S = 0.005  # one way
+DELAY_S = 0.005  # delay of the link in one direction
 ENVS: dict[str, dict[str, object]] = {
     "CartPole-v1": {"env-kwargs": "", "rollout-steps": 128, "envs": 32, "batch-size": 1024, "n-epochs": 1},
     TOY: {"env-kwargs": "seconds 0.001", "rollout-steps": 128, "envs": 8, "batch-size": 256, "n-epochs": 1},

@@ -1,7 +1,8 @@
-"""Updates of the learner against the usual style and Stable-Baselines3: `python -m benchmarks.update`.
+"""Compares the learner's updates with code in the usual style and with Stable-Baselines3: `python -m benchmarks.update`.
 
-One process, one thread; see `contest.py` for how it is timed, and the two files beside it for what the work is. Without
-Stable-Baselines3 (`pip install stable-baselines3`) the comparison with it is left out, and a line says so.
+It runs in one process with one thread. `contest.py` times the work, which `update_ppo.py` and `update_stable_baselines3.py`
+define. If Stable-Baselines3 isn't installed (`pip install stable-baselines3`), the comparison with it is left out, and a
+line says so.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ COLUMNS = ("update", "rows", "peer", "its ms", "graph ms", "ours ms", "products 
 
 
 def contests(console: Console) -> list[Contest]:
-    """All that can be measured here."""
+    """All contests that can be run here."""
     found = [update_ppo.contest(rows, target) for rows, target in ((64, 0.2), (256, 0.4), (2048, 0.65), (4096, None))]
     found += [update_ppo.contest(rows, None, width=256) for rows in (64, 512, 4096)]
     if importlib.util.find_spec("stable_baselines3") is None:

@@ -1,9 +1,9 @@
-"""A PPO minibatch update in three ways: the usual style, `PPO.step` with passes in torch, and `PPO.step` as it is.
+"""A PPO minibatch update in three ways: the usual style, `PPO.step` with networks in torch, and `PPO.step` as it is.
 
-All do the same work on the same rows (4 observations, 2 actions, actor and critic 4-64-64-·, tanh): take the minibatch out
-of the batch, normalize advantages, clipped surrogate, value loss, entropy, approx_kl, clip fraction, gradient clipped by
-its norm, Adam with eps 1e-5, losses read as numbers. The usual style is modules, `torch.distributions.Categorical`,
-`clip_grad_norm_` and Adam as it comes.
+All do the same work on the same rows (4 observations, 2 actions, actor and critic 4-64-64-·, tanh): they take the minibatch
+out of the batch, normalize advantages, compute the clipped surrogate, value loss, entropy, approx_kl and clip fraction, clip
+the gradient by its norm, make a step of Adam with eps 1e-5, and read the losses as numbers. The usual style uses modules,
+`torch.distributions.Categorical`, `clip_grad_norm_` and torch's own Adam.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ ROWS = 4096
 
 
 class UsualAgent(nn.Module):
-    """Actor and critic as most programs have them."""
+    """Actor and critic as most programs write them."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -49,7 +49,7 @@ class UsualAgent(nn.Module):
 
 
 def usual(rows: Minibatch, width: int) -> Callable[[Tensor], object]:
-    """An update in the usual style on rows of a batch, by their numbers."""
+    """An update in the usual style. It takes the indices of its rows in the batch."""
     agent = UsualAgent(width)
     optimizer = torch.optim.Adam(agent.parameters(), lr=CONFIG.learning_rate, eps=1e-5)
 
@@ -77,14 +77,14 @@ def usual(rows: Minibatch, width: int) -> Callable[[Tensor], object]:
 
 
 def ours(rows: Minibatch, policy: PolicySpec, graph: bool) -> Callable[[Tensor], object]:
-    """An update by `PPO.step` on rows of a batch, by their numbers."""
+    """An update by `PPO.step`. It takes the indices of its rows in the batch. `graph`: let networks run in torch."""
     with passes_in_torch(graph):
         algorithm = PPO(CONFIG, policy, total_steps=1, seed=0)
     return lambda index: algorithm.step(rows.select(index))
 
 
 def contest(size: int, target: float | None, width: int = 64) -> Contest:
-    """Minibatches of `size` rows."""
+    """The contest on minibatches of `size` rows, with layers of `width` units."""
     generator = torch.Generator().manual_seed(0)
 
     def normal(*shape: int) -> Tensor:

@@ -1,9 +1,9 @@
-"""Gradient steps of off-policy algorithms and updates of A2C against Stable-Baselines3's, with the same settings and shapes.
+"""Compares gradient steps of off-policy algorithms and updates of A2C with Stable-Baselines3's, on the same shapes.
 
-DQN: draw 64 transitions, targets by the target network, Huber loss, gradient clipped by its norm, Adam. A2C: 8 env copies;
-theirs is given the values that it keeps from acting, ours computes them anew, and both compute advantages, losses, one
-step of RMSProp and what they log. Continuous actions: the shapes of Pendulum, 256 transitions; TQC and CrossQ are those of
-sb3-contrib.
+DQN: both sample 64 transitions, compute targets with the target network and the Huber loss, clip the gradient by its norm,
+and make a step of Adam. A2C, with 8 env copies: Stable-Baselines3 already has the values from acting, while millrace
+recomputes them; both compute advantages, losses, one step of RMSProp, and what they log. Continuous actions: the shapes of
+Pendulum, with 256 transitions; the peers of TQC and CrossQ are those of sb3-contrib.
 """
 
 from __future__ import annotations
@@ -50,12 +50,12 @@ PUSH = ActionSpec("box", (1,), "float32", low=(-2.0,), high=(2.0,))
 COPIES = 8
 NEVER = 10**9
 ROWS = 256
-PLAYED = 500  # transitions that Stable-Baselines3 draws from; it learns nothing while it collects them
-STEPS = 8  # gradient steps, or updates, that are timed together
+PLAYED = 500  # number of transitions that Stable-Baselines3 samples from; it collects them without learning
+STEPS = 8  # number of gradient steps, or updates, that are timed together
 
 
 def some_batch(steps: int, seed: int) -> Batch:
-    """Noise of the shapes of CartPole, with ends now and then."""
+    """A batch of noise with CartPole's shapes, in which episodes end now and then."""
     generator = np.random.default_rng(seed)
     ends = generator.random((steps, COPIES)) < 0.02
     valid = np.ones((steps, COPIES), bool)
@@ -77,7 +77,7 @@ def some_batch(steps: int, seed: int) -> Batch:
 
 
 def dqn(width: int, target: float) -> Contest:
-    """A gradient step on 64 transitions."""
+    """The contest of a gradient step of DQN on 64 transitions."""
     rows = 64
     size = 10_000
     config = DQNConfig(
@@ -112,7 +112,7 @@ def dqn(width: int, target: float) -> Contest:
 
 
 class Continuous(NamedTuple):
-    """An algorithm for continuous actions, and what Stable-Baselines3 or sb3-contrib has of it."""
+    """An algorithm for continuous actions, and its counterpart in Stable-Baselines3 or sb3-contrib, if there is one."""
 
     algorithm: Any
     config: Any
@@ -120,14 +120,14 @@ class Continuous(NamedTuple):
     has_critic_net: bool = False
 
     def settings(self, width: int) -> Any:
-        """Ours, with critics whose two layers have this width."""
+        """The settings of our algorithm, with critics whose two layers have this width."""
         replay = {"batch_size": ROWS, "replay_size": 10_000}
         if self.has_critic_net:
             return self.config(critic_net=(width, width), policy_delay=3, **replay)
         return self.config(net=(width, width), **replay)
 
     def peers(self, width: int) -> Any:
-        """Theirs, which has collected what it learns from."""
+        """The counterpart's object, which has already collected transitions."""
         made = self.peer(
             "MlpPolicy",
             gymnasium.make("Pendulum-v1"),
@@ -141,7 +141,7 @@ class Continuous(NamedTuple):
         return made
 
     def steps(self, width: int, in_torch: bool = False) -> Callable[[], float]:
-        """What times our gradient steps."""
+        """A function that times our gradient steps, and returns the CPU seconds of one."""
         config = self.settings(width)
         with passes_in_torch(in_torch):
             policy = self.algorithm.policy_spec(config, PENDULUM, PUSH)
@@ -164,7 +164,7 @@ CONTINUOUS = {
 
 
 def continuous(name: str, width: int, target: float | None) -> Contest:
-    """A gradient step on 256 transitions, against that of Stable-Baselines3 or sb3-contrib."""
+    """The contest of a gradient step on 256 transitions, with Stable-Baselines3 or sb3-contrib as the peer."""
     one = CONTINUOUS[name]
     theirs = one.peers(width)
     runs = {
@@ -176,7 +176,7 @@ def continuous(name: str, width: int, target: float | None) -> Contest:
 
 
 def beside_sac(name: str, width: int) -> Contest:
-    """A gradient step on 256 transitions, against one of our SAC with layers of 256 units."""
+    """The contest of a gradient step on 256 transitions, with our own SAC with layers of 256 units as the peer."""
     one = CONTINUOUS[name]
     runs = {
         "peer": CONTINUOUS["SAC"].steps(256),
@@ -187,7 +187,7 @@ def beside_sac(name: str, width: int) -> Contest:
 
 
 def a2c(steps: int, target: float) -> Contest:
-    """An update on so many steps of 8 copies."""
+    """The contest of an update of A2C on this number of steps of 8 env copies."""
     batch = some_batch(steps, 0)
     config = A2CConfig(rollout_steps=steps)
 

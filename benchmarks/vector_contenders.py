@@ -1,7 +1,7 @@
-"""The vector environments that are measured side by side, each with the same interface: `rate(seconds)` and `close()`.
+"""The vector environments that are compared, all with the same interface: `rate(seconds)` and `close()`.
 
-All step the same env copies with actions that are sampled beforehand; only TorchRL samples its own, in its own format. All
-reset a copy whose episode has ended. tianshou leaves that to its user, so its step function here resets them.
+All step the same env copies with actions that were sampled beforehand, except TorchRL, which samples actions itself, in its
+own format. All reset a copy whose episode has ended. tianshou leaves this to its user, so the step function here does it.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class Task(NamedTuple):
     env: str
     copies: int
     workers: int
-    """processes of millrace and TorchRL; the other libraries start one for each copy"""
+    """number of processes of millrace and TorchRL; the other libraries start one for each copy"""
     kwargs: dict[str, Any] = {}
 
     def make(self) -> gymnasium.Env[Any, Any]:
@@ -53,7 +53,7 @@ class Contender(Protocol):
 
 
 class Stepping:
-    """A contender whose copies are all stepped by `step(actions)`."""
+    """A contender that steps all copies with `step(actions)`."""
 
     def __init__(self, task: Task, env: Any, step: Callable[[Any], Any] | None = None) -> None:
         self._env = env
@@ -131,7 +131,7 @@ def _torchrl(task: Task) -> Contender:
 
 
 def memory_mb(name: str, task: Task) -> tuple[int, float]:
-    """The number of processes it started, and their memory together: proportional set size, in MB."""
+    """The number of processes that a contender starts, and their memory together (proportional set size) in MB."""
     this_process = psutil.Process()
     before = {process.pid for process in this_process.children(recursive=True)}
     contender = make(name, task)

@@ -1,10 +1,11 @@
 """Env steps/s and memory of vector environments under random actions: `python -m benchmarks.vector_env`.
 
 The contenders are gymnasium's Sync and Async (shared memory), Stable-Baselines3's Dummy and Subproc, tianshou and TorchRL if
-they are installed, and millrace (through shared memory, and by messages over ipc and tcp). The upper limit is two processes
-that each step half of the copies in a bare loop and send nothing. The tasks are CartPole-v1 with two workers, an environment
-that sleeps, with as many workers as the other libraries have processes, and image frames. In each round all contenders run
-once, in an order that changes from round to round. Rates are medians over rounds; ratios are taken within a round.
+they are installed, and millrace (through shared memory, and with messages over ipc and tcp). The upper limit is two
+processes that each step half of the copies in a bare loop and send nothing. The tasks are CartPole-v1 with two workers, an
+environment that sleeps, with as many workers as the other libraries have processes, and image frames. In each round all
+contenders run once, in an order that changes from round to round. Rates are medians over rounds; ratios are computed within
+a round.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ Rows = list[dict[str, object]]
 
 
 def measure(task: Task, names: tuple[str, ...], rounds: int, seconds: float) -> Rows:
-    """A row for each contender: its rate, and the median of its ratios to gymnasium's Async and to the limit."""
+    """A row for each contender, with its rate and the medians of its ratios to gymnasium's Async and to the upper limit."""
     contenders: dict[str, Contender] = {}
     missing = []
     for name in names:
@@ -68,7 +69,7 @@ def measure(task: Task, names: tuple[str, ...], rounds: int, seconds: float) -> 
 
 
 def memory() -> Rows:
-    """Memory of the processes that 64 copies of CartPole-v1 need, without this process."""
+    """The memory of the processes that 64 copies of CartPole-v1 need, without this process."""
     task = Task("CartPole-v1", "CartPole-v1", 64, 2)
     rows: Rows = []
     for name in (ASYNC, "SB3 SubprocVecEnv", "millrace"):

@@ -1,11 +1,12 @@
-"""How long until a policy is good, if a step takes 10 ms, 50 ms or 1 s: `python -m benchmarks.wall_clock COMMAND`.
+"""How long it takes to train a good policy if a step takes 10 ms, 50 ms or 1 s: `python -m benchmarks.wall_clock COMMAND`.
 
-Rule: nothing waits for hours of slow steps. What is learned from an env step does not depend on how long it takes, if the
-lag is the same. So the minutes are computed from two things that are measured: curves (greedy return by env steps, trained
-on fast copies) and rates (env steps/s on 16 copies whose steps take a given time). Both are kept in the repository.
+Rule: nothing waits for hours of slow steps. What is learned from an env step doesn't depend on the duration of the step, if
+the lag is the same. So the minutes are computed from two measurements: curves (greedy return over env steps, trained on fast
+env copies) and rates (env steps/s on 16 copies whose steps take a given time). Both are kept in the repository.
 
-`commands` prints what trains the curves. `collect FOLDER ...` adds the curves of all runs in folders to curves.json. `rates`
-measures rates and adds them to rates.json; all programs take turns. `table` writes docs/explanation/wall_clock.md from both.
+`commands` prints the commands that train the curves. `collect FOLDER ...` adds the curves of all runs in these folders to
+curves.json. `rates` measures rates and adds them to rates.json; all programs take turns. `table` writes
+docs/explanation/wall_clock.md from both.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ def with_part(text: str, part: str) -> str:
 
 
 def table() -> None:
-    """Print the tables of what is kept, and write them into the page."""
+    """Print the tables made from the kept curves and rates, and write them into the page."""
     part = page_part(read_curves(), read_rates())
     PAGE.write_text(with_part(PAGE.read_text(encoding="utf-8"), part), encoding="utf-8")
     print(part)
@@ -48,7 +49,7 @@ def table() -> None:
 
 
 def collect(folders: list[Path], made_on: str | None) -> None:
-    """Add the curves of all runs in these folders to those that are kept."""
+    """Add the curves of all runs in these folders to the kept curves."""
     found = [curve for folder in folders for curve in wall_clock_curves.found_in(folder, made_on) if curve.points]
     kept = merged(read_curves(), found)
     for curve in found:
@@ -70,13 +71,13 @@ def different(curves: list[Curve]) -> Iterator[str]:
 
 
 def rates(arguments: argparse.Namespace) -> None:
-    """Measure rates, and keep each as soon as it is there."""
+    """Measure rates, and keep each one as soon as it was measured."""
     made_on = arguments.processor or processor()
     found: dict[tuple[Program, str, float], Rate] = {}
     turns = range(1, arguments.rounds + 1)
     for turn, env, program, step_s in product(turns, arguments.env, chosen(arguments), arguments.step_s):
         if not can_be_measured(program, env, step_s, arguments.seconds):
-            continue  # it is computed
+            continue  # this rate will be computed from others
         how = {"threads": arguments.threads, "device": arguments.device}
         try:
             rate = measure(program, env, step_s, turn, seconds=arguments.seconds, **how)

@@ -1,7 +1,7 @@
-"""Learning curves: greedy return by env steps of one run each. Those that are kept are in benchmarks/curves.json.
+"""Learning curves, each with the greedy returns of one run over env steps. They are kept in benchmarks/curves.json.
 
-Rule: a curve is that of one environment, system, algorithm and seed; a newer one takes its place. It has the evaluations
-that the run made itself, in raw returns.
+Rule: there is one curve for each environment, system, algorithm and seed; a newer curve replaces the older one. A curve
+consists of the run's own evaluations, as raw returns.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ EVALUATED_KEY = "eval/env_steps"
 
 
 class Curve(msgspec.Struct, kw_only=True):
-    """One run."""
+    """The curve of one run."""
 
     env: str
     system: str
@@ -39,11 +39,11 @@ class Curve(msgspec.Struct, kw_only=True):
     """the command of the run, with S in place of the seed"""
     processor: str
     points: list[tuple[int, float]] = []
-    """env steps, and the mean return of the greedy episodes of an evaluation"""
+    """for each evaluation, the env steps and the mean return of its greedy episodes"""
 
     @property
     def key(self) -> tuple[str, str, str, int]:
-        """What a newer curve has in common with the one whose place it takes."""
+        """The fields that identify the curve: a newer curve with the same key replaces it."""
         return self.env, self.system, self.algo, self.seed
 
 
@@ -53,17 +53,17 @@ class _Point(msgspec.Struct):
 
 
 def read_curves() -> list[Curve]:
-    """The curves that are kept."""
+    """Read the kept curves."""
     return kept_records.read(CURVES, Curve)
 
 
 def write_curves(curves: Iterable[Curve]) -> None:
-    """Keep these curves."""
+    """Write these curves to the file of kept curves."""
     kept_records.write(CURVES, curves)
 
 
 def found_in(folder: Path, made_on: str | None) -> Iterator[Curve]:
-    """The curves of all runs in this folder. `made_on`: the processor of millrace's runs, if it is not this machine's."""
+    """The curves of all runs in this folder. `made_on`: the processor of millrace's runs, if it isn't this machine's."""
     for path in sorted(folder.rglob(THEIR_CURVE)):
         yield of_their_file(path)
     for path in sorted(folder.rglob(CONFIG_FILE)):
@@ -78,9 +78,9 @@ def of_run(path: Path, made_on: str) -> Curve:
     points = [(int(row.get(EVALUATED_KEY) or row[ENV_STEPS_KEY]), row[RETURN_KEY]) for row in rows if RETURN_KEY in row]
     summary = RunFolder.open(path).summary()
     if summary is not None and summary.evaluation is not None and not (points and points[-1][0] >= summary.env_steps):
-        points.append((summary.env_steps, summary.evaluation.return_mean))  # it is not in metrics.jsonl
+        points.append((summary.env_steps, summary.evaluation.return_mean))  # the final one isn't in metrics.jsonl
     words = shlex.split(results.command(config))
-    if "--workers" not in words:  # the command leaves it out where it has no effect, but a reader looks for it
+    if "--workers" not in words:  # left out where it has no effect, but readers look for it
         words += ["--workers", str(local_workers(config))]
     return Curve(
         env=config.env,
@@ -94,7 +94,7 @@ def of_run(path: Path, made_on: str) -> Curve:
 
 
 def of_their_file(path: Path) -> Curve:
-    """The curve that `benchmarks/wall_clock_stable_baselines3.py` wrote. A last line that was cut off is ignored."""
+    """A curve that `benchmarks/wall_clock_stable_baselines3.py` wrote. An incomplete last line is ignored."""
     first, *lines = path.read_bytes().split(b"\n")[:-1]
     read = [msgspec.json.decode(line, type=_Point) for line in lines]
     points = _rounded((point.env_steps, point.returned) for point in read)

@@ -1,7 +1,7 @@
 """The programs that `benchmarks/wall_clock.py` compares, and the commands that train a curve or measure a rate. Pure.
 
-Rule: a rate is measured with the settings of the curve, except that steps take longer, that nothing is evaluated, and that
-gradient steps begin earlier (`LEARNING_STARTS`). A curve is trained by two workers, because its steps wait for nothing.
+Rule: a rate is measured with the settings of the curve, except that steps take longer, nothing is evaluated, and gradient
+steps begin earlier (`LEARNING_STARTS`). Two workers are enough to train a curve, because its steps don't wait.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ EVAL_EVERY = 10_000
 EVAL_EPISODES = 20
 STEPS = {"ppo": 1_000_000}
 MOST_STEPS = 300_000
-"""env steps of a curve, if `STEPS` has no others"""
+"""env steps of a curve, if its algorithm isn't in `STEPS`"""
 LEARNING_STARTS = 512
-"""env steps before the first gradient step where a rate is measured"""
+"""env steps before the first gradient step in a run whose rate is measured"""
 WARM_UP_STEPS = 768
-"""env steps of such a run that do not count"""
+"""env steps of such a run that aren't counted"""
 THEIR_PPO_STEPS = 2048
-"""steps of a copy in a rollout of Stable-Baselines3's PPO"""
+"""steps of each env copy in a rollout of Stable-Baselines3's PPO"""
 THEIR_PROGRAM = "benchmarks.wall_clock_stable_baselines3"
 
 
 class Program(NamedTuple):
-    """An algorithm of one of the two systems."""
+    """An algorithm in one of the two systems."""
 
     system: str
     algo: str
@@ -50,7 +50,7 @@ class Program(NamedTuple):
         return COPIES * (resolve(env).algorithm.rollout_steps if self.system == OURS else THEIR_PPO_STEPS)
 
     def warm_up_steps(self, env: str) -> int:
-        """Env steps that a rate leaves out: the first update of PPO; otherwise until some gradient steps were made."""
+        """Env steps that a rate leaves out: PPO's first update; for other algorithms, until it made some gradient steps."""
         return self.steps_of_an_update(env) if self.algo == "ppo" else WARM_UP_STEPS
 
 
@@ -58,7 +58,7 @@ PROGRAMS = tuple(Program(system, algo) for system, algorithms in ALGORITHMS.item
 
 
 def curve_command(program: Program, env: str, seed: int, out: str) -> list[str]:
-    """The command that trains a curve into a folder in `out`."""
+    """The command that trains a curve, whose run folder is in `out`."""
     steps = str(STEPS.get(program.algo, MOST_STEPS))
     if program.system == THEIRS:
         folder = f"{out}/{env}-sb3-{program.algo}-s{seed}"
@@ -67,14 +67,14 @@ def curve_command(program: Program, env: str, seed: int, out: str) -> list[str]:
 
 
 def training(env: str, algo: Sequence[str], seed: int, steps: str, out: str) -> list[str]:
-    """Our command that trains a curve. `algo`: the name of the algorithm, and flags of its own."""
+    """The command of millrace that trains a curve. `algo`: the name of the algorithm, followed by flags of its own."""
     words = ["millrace", "train", env, "--algo", *algo, "--seed", str(seed), "--steps", steps]
     evaluations = ["--eval-every", str(EVAL_EVERY), "--eval-episodes", str(EVAL_EPISODES)]
     return [*words, "--workers", "2", *_flags(algo[0]), *evaluations, "--run-dir", out]
 
 
 def rate_command(program: Program, env: str, step_s: float, seed: int | str, threads: int, device: str) -> list[str]:
-    """The command of a run that is stopped when its rate has been measured. It runs in an empty folder."""
+    """The command of a run whose rate is measured. The run is started in an empty folder, and stopped afterwards."""
     starts = [] if program.algo == "ppo" else ["--learning-starts", str(LEARNING_STARTS)]
     if program.system == THEIRS:
         words = [sys.executable, "-m", THEIR_PROGRAM, env, program.algo, str(seed), *starts, "--step-s", str(step_s)]

@@ -1,8 +1,8 @@
-"""Env steps/s of a program whose steps take a given time. Those that are kept are in benchmarks/rates.json.
+"""Rates: env steps/s of a program whose steps take a given time. They are kept in benchmarks/rates.json.
 
-Rule: a rate is measured after the warm-up, over whole updates, with the gradient steps that belong to them. For other step
-times it follows from the measured one: where env copies wait for updates, an env step takes its share of the updates and of
-the step time; where they step during updates, the slower of both decides.
+Rule: a rate is measured after the warm-up, over whole updates with their gradient steps. Rates at other step times are
+computed from the measured one. If env copies wait for updates, the time of an env step is its share of the updates plus its
+share of the step time. If copies step during updates, the slower of the two determines the rate.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ RATES = Path(__file__).with_name("rates.json")
 LOOK_S = 0.5
 LONGEST_S = 600.0
 LEAST_UPDATES = 2
-"""of those that are measured"""
+"""least number of updates over which a rate is measured"""
 
 
 class Rate(msgspec.Struct, kw_only=True):
-    """A program on one environment, with one step time."""
+    """The rate of a program on one environment, at one step time."""
 
     env: str
     system: str
@@ -46,12 +46,12 @@ class Rate(msgspec.Struct, kw_only=True):
 
     @property
     def key(self) -> tuple[str, str, str, float, str]:
-        """What a newer rate has in common with the one whose place it takes."""
+        """The fields that identify the rate: a newer rate with the same key replaces it."""
         return self.env, self.system, self.algo, self.step_s, self.processor
 
     @property
     def median(self) -> float:
-        """Env steps/s."""
+        """The median env steps/s over the rounds."""
         return statistics.median(self.rates)
 
 
@@ -60,23 +60,24 @@ class RateAt(NamedTuple):
 
     per_s: float
     computed: bool
-    """whether it follows from the rate at another step time"""
+    """whether it was computed from the rate at another step time"""
 
 
 def read_rates() -> list[Rate]:
-    """The rates that are kept."""
+    """Read the kept rates."""
     return kept_records.read(RATES, Rate)
 
 
 def write_rates(rates: Iterable[Rate]) -> None:
-    """Keep these rates."""
+    """Write these rates to the file of kept rates."""
     kept_records.write(RATES, rates)
 
 
 def rate_at(step_s: float, rates: Sequence[Rate]) -> RateAt | None:
-    """The rate of a program at a step time, from its rates at one or more; None if there are none.
+    """The rate of a program at a step time, from its measured rates; None if there are none.
 
-    The nearest shorter step time decides: at longer ones, updates count less, so that less can be learned of them.
+    If it wasn't measured, it is computed from the nearest shorter step time. At longer step times, updates are a smaller
+    part of the time, so that they are known less precisely.
     """
     if not rates:
         return None
@@ -86,7 +87,7 @@ def rate_at(step_s: float, rates: Sequence[Rate]) -> RateAt | None:
 
 
 def computed(step_s: float, base: Rate) -> float:
-    """The rate at a step time that follows from that at another one."""
+    """The rate at a step time, computed from the rate `base` at another one."""
     if Program(base.system, base.algo).overlaps:
         return min(base.median, COPIES / step_s)
     of_updates_s = max(0.0, 1 / base.median - base.step_s / COPIES)
@@ -94,7 +95,7 @@ def computed(step_s: float, base: Rate) -> float:
 
 
 def largest_error(rates: Iterable[Rate]) -> float | None:
-    """How far computed rates are from measured ones at most, as a share of these; None if no program has two step times."""
+    """The largest relative error of computed rates, compared with measured ones; None if no program has two step times."""
     of: dict[tuple[str, ...], list[Rate]] = {}
     for rate in sorted(rates, key=lambda rate: rate.step_s):
         of.setdefault((rate.env, rate.system, rate.algo, rate.processor), []).append(rate)
@@ -103,14 +104,14 @@ def largest_error(rates: Iterable[Rate]) -> float | None:
 
 
 def can_be_measured(program: Program, env: str, step_s: float, seconds: float) -> bool:
-    """Whether the steps of an update take no longer than what is measured."""
+    """Whether the env steps between two updates take no longer than the measurement."""
     return program.steps_of_an_update(env) / COPIES * step_s <= seconds
 
 
 def measure(
     program: Program, env: str, step_s: float, seed: int, *, seconds: float, threads: int = 1, device: str = "cpu"
 ) -> float:
-    """Env steps/s over at least so many seconds after the warm-up. Raises `RuntimeError`."""
+    """Measure env steps/s over at least this many seconds after the warm-up. Raises `RuntimeError`."""
     command = rate_command(program, env, step_s, seed, threads, device)
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as name:
         folder = Path(name)
@@ -133,7 +134,7 @@ def measure(
 
 
 def updates(program: Program, folder: Path) -> list[tuple[int, float]]:
-    """Env steps and time in seconds of each update of the run in this folder."""
+    """The env steps and the time in seconds at the end of each update of the run in this folder."""
     if program.system == OURS:
         return [
             (int(row["time/total_timesteps"]), row["time/time_elapsed"])
@@ -146,7 +147,7 @@ def updates(program: Program, folder: Path) -> list[tuple[int, float]]:
 
 
 def rate_of(found: Sequence[tuple[int, float]], warm_up_steps: int, seconds: float) -> float | None:
-    """Env steps/s between the first update after the warm-up and the last one; None if that is not long enough yet."""
+    """Env steps/s between the first update after the warm-up and the last one; None if they aren't far enough apart yet."""
     counted = [update for update in found if update[0] >= warm_up_steps]
     if len(counted) <= LEAST_UPDATES:
         return None

@@ -1,9 +1,9 @@
 """PPO and SAC of Stable-Baselines3, TQC and CrossQ of sb3-contrib, on 16 env copies, for `benchmarks/wall_clock.py`.
 
-Rule: the library's own settings, and one gradient step for each env step. `--out FOLDER` trains a curve at niceness 19: the
-folder's curve.jsonl says what it is, and then has a line for each evaluation, on copies of its own. The same command goes on
-from the last checkpoint in the folder. Otherwise the steps take `--step-s` seconds, and for each update a line has env steps
-and time by the monotonic clock, until the process is killed.
+Rule: it uses the library's own settings, with one gradient step for each env step. `--out FOLDER` trains a curve at niceness
+19. The first line of the folder's curve.jsonl describes the run; the others are evaluations, which use env copies of their
+own. The same command continues from the last checkpoint in the folder. Without `--out`, steps take `--step-s` seconds, and
+the program prints a line for each update, with env steps and the time by the monotonic clock, until it is killed.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ EVALUATIONS_OF_A_CHECKPOINT = 5
 
 
 class WriteCurve(BaseCallback):
-    """Evaluates the policy now and then, and saves what a later process needs to go on."""
+    """Evaluates the policy now and then, and saves checkpoints from which a later process continues."""
 
     def __init__(self, folder: Path, env: VecEnv, every: int, episodes: int) -> None:
         super().__init__()
@@ -53,8 +53,8 @@ class WriteCurve(BaseCallback):
         self._env = env
         self._every = every
         self._episodes = episodes
-        self._evaluated = 0  # times `every`
-        self._saved = 0  # times `every`
+        self._evaluated = 0  # env steps of the last evaluation, in multiples of `every`
+        self._saved = 0  # env steps of the last checkpoint, in multiples of `every`
 
     def _on_training_start(self) -> None:
         self._evaluated = self._saved = self.num_timesteps // self._every
@@ -69,7 +69,7 @@ class WriteCurve(BaseCallback):
             print(f"{self._folder.name}: {self.num_timesteps:,} env steps, return {found:,.1f}", flush=True)
         return True
 
-    def _on_rollout_start(self) -> None:  # PPO has learned from all its env steps only here
+    def _on_rollout_start(self) -> None:  # only at this point has PPO learned from all its env steps
         if self._evaluated >= self._saved + EVALUATIONS_OF_A_CHECKPOINT:
             self._saved = self._evaluated
             save(self.model, self._folder)
@@ -85,7 +85,7 @@ def make(algo: str, env: VecEnv, seed: int, device: str, learning_starts: int | 
 
 
 def save(model: BaseAlgorithm, folder: Path) -> None:
-    """Write a checkpoint in place of the last one."""
+    """Write a checkpoint that replaces the last one."""
     if isinstance(model, OffPolicyAlgorithm):
         model.save_replay_buffer(folder / f"new-{REPLAY}")
         (folder / f"new-{REPLAY}").replace(folder / REPLAY)
@@ -94,11 +94,11 @@ def save(model: BaseAlgorithm, folder: Path) -> None:
 
 
 def restore(algo: str, env: VecEnv, seed: int, device: str, folder: Path) -> BaseAlgorithm:
-    """The algorithm of the folder's checkpoint. The curve loses the evaluations that come after it."""
+    """Load the algorithm from the folder's checkpoint, and remove later evaluations from the curve."""
     model: BaseAlgorithm = KINDS[algo].load(folder / MODEL, env=env, device=device)
-    if isinstance(model, OffPolicyAlgorithm) and (folder / REPLAY).exists():  # a finished run has none
+    if isinstance(model, OffPolicyAlgorithm) and (folder / REPLAY).exists():  # a finished run has no replay buffer
         model.load_replay_buffer(folder / REPLAY)
-    model.set_random_seed(seed + model.num_timesteps)  # other random numbers than those of the beginning
+    model.set_random_seed(seed + model.num_timesteps)  # not the random numbers from the beginning again
     first, *points = (folder / CURVE).read_text().splitlines()
     kept = [point for point in points if json.loads(point)["env_steps"] <= model.num_timesteps]
     (folder / CURVE).write_text("\n".join([first, *kept]) + "\n")
@@ -106,7 +106,7 @@ def restore(algo: str, env: VecEnv, seed: int, device: str, folder: Path) -> Bas
 
 
 def train_curve(arguments: argparse.Namespace) -> None:
-    """Train with evaluations, from the folder's checkpoint if there is one."""
+    """Train with evaluations, continuing from the folder's checkpoint if there is one."""
     folder: Path = arguments.out
     folder.mkdir(parents=True, exist_ok=True)
     env = make_vec_env(
@@ -132,7 +132,7 @@ def train_curve(arguments: argparse.Namespace) -> None:
 
 
 def train_for_a_rate(arguments: argparse.Namespace) -> None:
-    """Train on slow copies, and print each update."""
+    """Train on slow env copies, and print each update."""
     env = make_vec_env(
         arguments.env,
         COPIES,

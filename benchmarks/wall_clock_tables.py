@@ -1,7 +1,8 @@
-"""The tables of docs/explanation/wall_clock.md: minutes until a return, from curves and rates. Pure.
+"""The tables of docs/explanation/wall_clock.md: minutes until a policy reaches a return, from curves and rates. Pure.
 
 Rule: the minutes of a seed are the env steps of its first evaluation that reaches the return, divided by the env steps/s.
-The return is that which our SAC reaches at about 300,000 env steps. What was never reached counts as longer than any time.
+The return is the one that millrace's SAC reaches at about 300,000 env steps. If a seed never reaches it, its time is
+infinite.
 """
 
 from __future__ import annotations
@@ -20,9 +21,9 @@ from benchmarks.wall_clock_rates import Rate, RateAt, largest_error, rate_at
 
 STEP_TIMES_S = (0.01, 0.05, 1.0)
 NEAR = range(275_000, 325_001)
-"""env steps whose evaluations decide a task's return"""
+"""the env steps whose evaluations determine a task's return"""
 BETWEEN = 24
-"""step times between two of the table, at which the quickest algorithm is looked for"""
+"""number of intervals between two step times of the table, to find where the quickest algorithm changes"""
 NOTHING = "No figures are kept yet; `benchmarks/README.md` says how to make them.\n"
 
 
@@ -31,28 +32,28 @@ class Row(NamedTuple):
 
     program: Program
     env_steps: list[float]
-    """of each seed, until the return was reached; infinite if it was not"""
+    """for each seed, the env steps until the return was reached; infinite if it wasn't"""
     rates: list[Rate]
 
     def minutes(self, step_s: float) -> list[float]:
-        """Of each seed; empty without a rate."""
+        """Minutes of each seed at this step time; empty without a rate."""
         rate = rate_at(step_s, self.rates)
         return [] if rate is None else [steps / rate.per_s / 60 for steps in self.env_steps]
 
     def median(self, step_s: float) -> float:
-        """Minutes of the median seed; infinite if it did not reach the return, or without a rate."""
+        """Minutes of the median seed; infinite if that seed didn't reach the return, or if there is no rate."""
         return statistics.median(self.minutes(step_s) or [math.inf])
 
 
 def steps_until(points: Sequence[tuple[int, float]], target: float) -> float:
-    """Env steps of the first evaluation of at least this return; infinite if there is none."""
+    """The env steps of the first evaluation with at least this return; infinite if there is none."""
     return next((float(env_steps) for env_steps, returned in points if returned >= target), math.inf)
 
 
 def target_of(curves: Sequence[Curve], env: str) -> float | None:
-    """The return of this task: the median of our SAC's seeds, rounded to two digits; None if no seed has come so far.
+    """The return to reach in this task: the median over the seeds of millrace's SAC, rounded to two digits.
 
-    That of a seed is the mean of its evaluations between 275,000 and 325,000 env steps.
+    A seed's return is the mean of its evaluations between 275,000 and 325,000 env steps. None if no seed has any.
     """
     means = []
     for curve in curves:
@@ -74,7 +75,7 @@ def rows_of(curves: Sequence[Curve], rates: Sequence[Rate], env: str, target: fl
 
 
 def minutes_table(rows: Sequence[Row]) -> str:
-    """Minutes until the return; the quickest of each column is bold."""
+    """The table of minutes until the return is reached. The quickest of each column is bold."""
     head = ("", "env steps", *(f"steps of {step_text(step_s)}" for step_s in STEP_TIMES_S))
     least = {step_s: min(row.median(step_s) for row in rows) for step_s in STEP_TIMES_S}
     cells = []
@@ -90,7 +91,7 @@ def minutes_table(rows: Sequence[Row]) -> str:
 
 
 def rates_table(rows: Sequence[Row]) -> str:
-    """Env steps/s of the same programs."""
+    """The table of the same programs' env steps/s."""
     head = ("env steps/s", *(f"steps of {step_text(step_s)}" for step_s in STEP_TIMES_S))
     return table(
         head,
@@ -103,7 +104,10 @@ def rates_table(rows: Sequence[Row]) -> str:
 
 
 def quickest(rows: Sequence[Row]) -> list[tuple[Program, float]]:
-    """Which program is the quickest from which step time on. A step time at which none reaches the return has none."""
+    """The quickest programs, each with the step time from which on it is the quickest.
+
+    Step times at which no program reaches the return are skipped.
+    """
     found: list[tuple[Program, float]] = []
     for step_s in step_times():
         best = min(rows, key=lambda row: row.median(step_s), default=None)
@@ -113,7 +117,7 @@ def quickest(rows: Sequence[Row]) -> list[tuple[Program, float]]:
 
 
 def step_times() -> list[float]:
-    """Those of the table, and others between them at equal ratios."""
+    """The step times of the table, and others between them at equal ratios."""
     times = [STEP_TIMES_S[0]]
     for first, last in pairwise(STEP_TIMES_S):
         times += [first * (last / first) ** (n / BETWEEN) for n in range(1, BETWEEN)] + [last]
@@ -121,14 +125,14 @@ def step_times() -> list[float]:
 
 
 def quickest_table(tasks: Mapping[str, Sequence[Row]]) -> str:
-    """From which step time on which algorithm is the quickest: of all, and of Stable-Baselines3."""
+    """The table that says from which step time on which algorithm is the quickest, of all and of Stable-Baselines3."""
     head = ("task", "of all", f"of {THEIRS}")
     theirs = {env: [row for row in rows if row.program.system == THEIRS] for env, rows in tasks.items()}
     return table(head, [[env, ranges_text(rows), ranges_text(theirs[env])] for env, rows in tasks.items()])
 
 
 def ranges_text(rows: Sequence[Row]) -> str:
-    """Names and step times, as in `millrace XQC; from 50 ms on millrace TQC`."""
+    """The quickest programs as text, such as `millrace XQC; from 50 ms on millrace TQC`."""
     texts = []
     for program, step_s in quickest(rows):
         since = "" if step_s == STEP_TIMES_S[0] else f"from {step_text(step_s)} on "
@@ -137,7 +141,7 @@ def ranges_text(rows: Sequence[Row]) -> str:
 
 
 def page_part(curves: Sequence[Curve], rates: Sequence[Rate]) -> str:
-    """What the page says of these curves and rates, as Markdown."""
+    """The part of the page about these curves and rates, as Markdown."""
     targets = {env: target for env in ENVS if (target := target_of(curves, env)) is not None}
     if not targets or not rates:  # minutes need both
         return NOTHING
@@ -170,12 +174,15 @@ def _sources(curves: Sequence[Curve], rates: Sequence[Rate], targets: dict[str, 
 
 
 def name_of(program: Program) -> str:
-    """System and algorithm."""
+    """The name of a program: its system and algorithm."""
     return f"{program.system} {NAMES[program.algo]}"
 
 
 def spread(values: Sequence[float], text: Callable[[float], str], *, about: bool = False) -> str:
-    """Median and range over seeds, or how many seeds came so far if not all did; a dash if the median seed did not."""
+    """The median and range over seeds as text. If some seeds are infinite, their share replaces the range.
+
+    If the median seed is infinite, a dash replaces the median. `about`: mark the median as approximate.
+    """
     reached = sorted(value for value in values if value < math.inf)
     middle = statistics.median(values)
     share = f"{len(reached)} of {len(values)}"
@@ -188,18 +195,18 @@ def spread(values: Sequence[float], text: Callable[[float], str], *, about: bool
 
 
 def minutes_text(minutes: float) -> str:
-    """Minutes, with one decimal place below ten."""
+    """Minutes as text, with one decimal place below ten."""
     return f"{minutes:,.{1 if minutes < 9.95 else 0}f}"
 
 
 def rate_text(rate: RateAt | None) -> str:
-    """Env steps/s, marked if it is computed."""
+    """Env steps/s as text, marked with ≈ if they were computed."""
     if rate is None:
         return ""
     return f"{'≈ ' if rate.computed else ''}{rate.per_s:,.{0 if rate.per_s >= 99.5 else 1}f}"
 
 
 def step_text(step_s: float) -> str:
-    """A step time with at most two digits."""
+    """A step time as text, with at most two digits."""
     rounded = float(f"{step_s:.2g}")
     return f"{rounded:g} s" if rounded >= 1 else f"{rounded * 1000:g} ms"

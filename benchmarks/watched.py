@@ -1,8 +1,9 @@
-"""What an open page of the dashboard costs the run that it shows: env steps/s with the page open, and without a dashboard.
+"""Measures how much an open page of the dashboard slows the run that it shows, compared with a run without a dashboard.
 
-`python -m benchmarks.watched`. The page is served and read by processes of their own, on the machine that trains, as with
-`--dashboard` and a browser there; it is asked for once a second. The rate is that between two updates after the same numbers
-of env steps: CartPole's episodes grow longer while it learns. Contenders take turns, and each goes first as often.
+`python -m benchmarks.watched`. Separate processes on the machine that trains serve and read the page, as with `--dashboard`
+and a browser there. The page is requested once a second. The rate is env steps/s between two updates after the same numbers
+of env steps in all runs, because CartPole's episodes grow longer while it learns. Contenders take turns, and each goes first
+equally often.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ while True:
     time.sleep(1.0)
 """
 STEPS = {"CartPole": (20_000, 80_000), "slow": (1_500, 6_500)}
-"""from how many env steps to how many the rate is measured"""
+"""The numbers of env steps between which the rate is measured"""
 SETTINGS: dict[str, dict[str, Any]] = {
     "CartPole": {"env": "CartPole-v1", "workers": 2},
     "slow": {
@@ -38,7 +39,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
 
 
 def rate(name: str, seed: int, *, page: bool) -> float:
-    """Env steps/s."""
+    """Env steps/s of a run. `page`: with an open page of the dashboard."""
     first, last = STEPS[name]
     moments: list[tuple[int, float]] = []
     to_open = page

@@ -1,9 +1,10 @@
-"""The way of a rollout from one process to another: `python -m benchmarks.wire`.
+"""Measures sending a rollout from one process to another: `python -m benchmarks.wire`.
 
-Large (14.6 MB, Atari): seconds from before `encode` in the sender until after decoding in the receiver, one rollout under
-way at a time, against plain ROUTER and DEALER sockets that carry the same arrays as they lie; in turns. Once of noise, and
-once of frame stacks, which travel packed. Small (9 KB, CartPole): CPU µs of the Python thread at each end. All: bytes of the
-frames and of ZeroMQ's framing against those of the arrays. Then what packing rollouts and rounding weights saves and takes.
+Large rollouts (14.6 MB, Atari): seconds from before `encode` in the sender until after decoding in the receiver, with one
+rollout on its way at a time, compared with plain ROUTER and DEALER sockets that send the same arrays unpacked, in turns. The
+rollouts consist of noise, or of frame stacks, which are sent packed. Small rollouts (9 KB, CartPole): CPU µs of the Python
+thread at each end. All rollouts: bytes of the frames and of ZeroMQ's framing, compared with the bytes of the arrays. Then
+what packing rollouts and rounding weights saves, and the time that it takes.
 """
 
 from __future__ import annotations
@@ -52,11 +53,14 @@ PACKING = {
     "unpack, ms": "unpack_ms",
     "pays below, Gbit/s": "pays_below_gbit_per_s",
 }
-BURST = 200  # small rollouts that are sent together
+BURST = 200  # number of small rollouts that are sent together
 
 
 def _send(run: RunSpec, addresses: dict[str, str], told: Connection) -> None:
-    """The sender's process: one rollout by one way, each time it is asked; seconds by the clock that both share."""
+    """The sender's process: sends a rollout in each way that arrives through the pipe, and sends back when it began.
+
+    Times are by the monotonic clock, which both processes share.
+    """
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     rollout = atari(run)
     frames = encode(rollout)
@@ -81,7 +85,7 @@ def _send(run: RunSpec, addresses: dict[str, str], told: Connection) -> None:
 
 
 def large(run: RunSpec, rounds: int) -> list[dict[str, object]]:
-    """A row for each transport."""
+    """A row for each transport, with median times of a large rollout of this run."""
     context = multiprocessing.get_context("spawn")
     zmq_context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     times: dict[str, list[float]] = {f"{kind} {transport}": [] for kind in ("raw", "ours") for transport in TRANSPORTS}
@@ -103,14 +107,14 @@ def large(run: RunSpec, rounds: int) -> list[dict[str, object]]:
         sender = context.Process(target=_send, args=(run, addresses, there))
         sender.start()
         here.recv()
-        for turn in range(-3, rounds):  # those before 0 warm up
+        for turn in range(-3, rounds):  # turns before 0 are warm-up
             for way in list(times)[:: 1 if turn % 2 else -1]:
                 here.send(way)
                 if way in links:
                     assert links[way].poll(10)
                     ((_, message),) = links[way].receive()
                     assert isinstance(message, Rollout)
-                    del message  # as that of the others: what is kept takes other memory the next time
+                    del message  # as with raw sockets; if it were kept, the next one would need new memory
                 else:
                     assert sockets[way].poll(10_000)
                     sockets[way].recv_multipart(copy=False)
@@ -138,7 +142,7 @@ def large(run: RunSpec, rounds: int) -> list[dict[str, object]]:
 
 
 def small(rounds: int) -> dict[str, float]:
-    """CPU µs of the Python thread for a rollout of 9 KB, and in which part; medians."""
+    """Median CPU µs of the Python thread for a rollout of 9 KB, by part of the work."""
     rollout = canned(CARTPOLE)
     parts: dict[str, list[float]] = {"encode": [], "send": [], "receive and decode": [], "validate": []}
     with tempfile.TemporaryDirectory() as folder:
@@ -152,7 +156,7 @@ def small(rounds: int) -> dict[str, float]:
             for frames in messages:
                 worker.send(frames)
             marks.append(time.thread_time())
-            time.sleep(0.05)  # all have arrived: what is timed is no waiting
+            time.sleep(0.05)  # until all have arrived, so that no waiting is timed
             assert learner.poll(10)
             before_s = time.thread_time()
             received = [message for _, message in learner.receive()]
@@ -173,12 +177,12 @@ def small(rounds: int) -> dict[str, float]:
 
 
 def on_the_wire(frames: Sequence[Buffer]) -> tuple[int, int]:
-    """Bytes of the arrays, and of all that a connection carries: each frame has a head of 2 bytes, or 9 if it is long."""
+    """The bytes of the arrays, and the bytes on the connection: each frame has a head of 2 bytes, or 9 if it is long."""
     return sum(map(len, frames[1:])), sum(len(frame) + (2 if len(frame) < 256 else 9) for frame in frames)
 
 
 def stack_sizes() -> tuple[int, int]:
-    """Bytes of a frame, and of a rollout of frame stacks on the wire."""
+    """The bytes of one image frame, and of a rollout of frame stacks on the connection."""
     (leaf,) = STACKS.policy.observation
     return math.prod(leaf.shape[1:]), on_the_wire(encode(atari(STACKS), Packing(stack=True)))[1]
 
@@ -202,7 +206,7 @@ def main() -> None:
     ends = {"worker": parts["encode"] + parts["send"], "learner": parts["receive and decode"]}
     second.add_row(*(f"{us:.1f}" for us in (*parts.values(), *ends.values())), f"≤ {PYTHON_US}")
     console.print(second)
-    ways = packing(rounds)  # from here on `benchmarks/packing.py`
+    ways = packing(rounds)  # the rest is in `benchmarks/packing.py`
     third = Table("rollout", "packing", *PACKING, title="Packing, CPU of one thread")
     for row in ways:
         third.add_row(str(row["rollout"]), str(row["packing"]), *(f"{row[key]:,.4g}" for key in PACKING.values()))

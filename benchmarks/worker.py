@@ -1,9 +1,9 @@
 """Start-up time and memory of a worker process: `python -m benchmarks.worker`.
 
-Measures the seconds from exec to the first rollout, and resident memory, of a real `python -m millrace.workers` over ipc
-with a hub alone. There are two policies: an MLP, which acts in numpy without torch, and an image policy, which needs torch.
-A last row is a supervisor with the MLP's worker: the seconds to the first rollout through it, and its own memory, in which
-pages that it shares with other processes count in part (PSS).
+It measures the seconds from exec to the first rollout, and the resident memory, of a real `python -m millrace.workers` over
+ipc, with only a hub in place of the learner. There are two policies: an MLP, which acts in numpy without torch, and an image
+policy, which needs torch. The last row is a supervisor with the MLP's worker: the seconds to the first rollout, and the
+supervisor's own memory, in which shared pages are divided among the processes that share them (PSS).
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ SUPERVISOR = "supervisor of the MLP's worker"
 
 
 def start_one(env: EnvSpec, *, supervised: bool = False) -> tuple[float, float]:
-    """Seconds from exec to the first rollout, and megabytes after it: of the worker, resident; of a supervisor, PSS."""
+    """The seconds from exec to the first rollout, and the memory after it in MB: a worker's RSS, or a supervisor's PSS."""
     spaces = EnvSpaces.of_description(read_description(describe(Describe(1, 1, env))))
     close_described()
     run = run_spec(resolve(env.id, lanes=1, envs=8, rollout_steps=128), env, spaces)

@@ -1,4 +1,4 @@
-"""Writes the results of a benchmark: JSON with machine, versions, commit and load, and a bar chart."""
+"""Writes the results of a benchmark: JSON, with machine, versions, commit and load, and a bar chart."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ DPI = 150
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")  # Okabe and Ito
 GREY = "#555555"
 Bars = tuple[str, Mapping[str, float]]
-"""a title, and the length of each bar by its label"""
+"""A bar chart: its title, and the length of each bar by its label"""
 
 
 def circumstances() -> dict[str, object]:
@@ -34,7 +34,7 @@ def circumstances() -> dict[str, object]:
 
 
 def processor() -> str:
-    """The cores of this machine and their name, as the system tells it."""
+    """The number of cores of this machine, and the processor's name as the system reports it."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:

@@ -1,7 +1,7 @@
-"""XQC without one of its parts each, to see what the part is worth.
+"""Variants of XQC that each lack one of its parts, to measure what the part contributes.
 
-`python -m benchmarks.xqc_ablations` prints the commands that train them. Each part that is no setting is left out by a class
-of its own, `--algo benchmarks.xqc_ablations:WithoutTarget`.
+`python -m benchmarks.xqc_ablations` prints the commands that train them. If no setting turns a part off, a class of its own
+does, as in `--algo benchmarks.xqc_ablations:WithoutTarget`.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ class WithoutTarget(XQC):
     """The newest critics value the next observations, as in CrossQ."""
 
     def move_target(self) -> None:
-        """The targets are the critics."""
+        """Copy the critics to the target critics."""
         self.target.critics.copy_(self.net.critics)
 
 
 class WithoutJointPass(XQC):
-    """Observations and those that followed pass the critics apart, each normalized by its own statistics."""
+    """Observations and next observations pass through the critics separately, each normalized by its own statistics."""
 
     def critic_loss(self, rows: Transitions) -> CriticLoss:
-        """As XQC's, in two passes."""
+        """XQC's loss, computed in two passes."""
         joint = self.joint(rows)
         size = len(rows.x)
         with torch.no_grad():
@@ -44,7 +44,7 @@ class WithoutJointPass(XQC):
 
 
 class WithoutWeightNorm(XQC):
-    """The norms of weights are free."""
+    """The norms of weights aren't constrained."""
 
     def shapes(self) -> tuple[MLPShape, MLPShape]:
         """See `XQC`."""
@@ -62,7 +62,7 @@ class NormalizedAfter(XQC):
 
 
 class OneValue(XQC):
-    """Critics of one value in place of categories, with a squared loss."""
+    """Critics predict one value instead of categories, with a squared loss."""
 
     def networks(self, device: str) -> ActorWithCritics:
         """See `Continuous`."""
@@ -109,11 +109,11 @@ VARIANTS: dict[str, tuple[str, ...]] = {
     "one value in place of categories": own(OneValue),
     "rewards by their deviation alone": own(ScaledByDeviation),
 }
-"""What each is, and its `--algo` and further flags"""
+"""For each variant, its name in `--algo` and further flags"""
 
 
 def command(env: str, flags: tuple[str, ...], seed: int, folder: str) -> str:
-    """The command that trains one, in a folder of its own."""
+    """The command that trains one variant, in a folder of its own."""
     return shlex.join([*training(env, flags, seed, str(STEPS), folder), "--torch-threads", "1", "--resume", "auto"])
 
 

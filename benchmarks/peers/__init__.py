@@ -1,4 +1,4 @@
-"""PPO of other systems as separate programs, each in its own environment. They take settings by millrace's names.
+"""PPO of other systems, as separate programs, each in a virtual environment of its own. Settings have millrace's names.
 
-Rule: a file here that runs in a peer's environment imports that peer and `benchmarks.peers`, and nothing else of millrace.
+Rule: a file here that runs in a peer's environment imports that peer and `benchmarks.peers`, but nothing else of millrace.
 """

@@ -1,7 +1,7 @@
-"""Runs CleanRL's installed ppo.py as a script. This file replaces its TensorBoard writer, to see the end of each update.
+"""Runs CleanRL's installed ppo.py as a script. This file replaces its TensorBoard writer, to notice the end of each update.
 
-Settings that it does not have: a falling clip range (it stays 0.2), the value of a truncated episode (it counts as
-terminated), and another vector environment than its own (one process).
+CleanRL lacks these settings: a decreasing clip range (it stays 0.2), bootstrapping from the value of a truncated episode
+(which counts as terminated), and any vector environment but its own (in one process).
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ import torch.utils.tensorboard
 
 from benchmarks.peers.peer_run import PeerRun
 
-LAST = "charts/SPS"  # the last figure that it writes for an update
+LAST = "charts/SPS"  # the last figure that ppo.py writes in an update
 
 
 def arguments(s: dict[str, Any]) -> list[str]:
-    """The settings by CleanRL's names. Its value loss is half the squared error, so it gets twice the coefficient."""
+    """The settings as flags of CleanRL. Its value loss is half the squared error, so its coefficient is doubled."""
     flags = {
         "env-id": s["env"], "seed": s["seed"], "num-envs": s["envs"], "num-steps": s["rollout_steps"],
         "num-minibatches": s["envs"] * s["rollout_steps"] // s["batch_size"], "update-epochs": s["n_epochs"],
@@ -35,7 +35,7 @@ def arguments(s: dict[str, Any]) -> list[str]:
 
 
 class Writer:
-    """Replaces TensorBoard's `SummaryWriter`."""
+    """Replaces TensorBoard's `SummaryWriter`, and reports each update."""
 
     run: PeerRun
 
@@ -56,7 +56,7 @@ class Writer:
 
 
 def greedy(script: FrameType, obs: Any) -> Any:
-    """The greedy actions of the agent of the running script."""
+    """The greedy actions of the agent in the running script."""
     with torch.no_grad():
         return script.f_globals["agent"].actor(torch.from_numpy(obs)).argmax(-1).numpy()
 
@@ -65,7 +65,7 @@ def main() -> None:
     torch.set_num_threads(1)
     Writer.run = PeerRun()
     torch.utils.tensorboard.SummaryWriter = Writer  # type: ignore[misc, assignment]
-    np.bool8 = np.bool_  # type: ignore[attr-defined]  # its gym is of 2022
+    np.bool8 = np.bool_  # type: ignore[attr-defined]  # CleanRL needs a gym of 2022
     found = importlib.util.find_spec("cleanrl.ppo")
     assert found is not None
     assert found.origin is not None

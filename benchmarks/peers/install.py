@@ -1,8 +1,9 @@
 """Installs the peers: `python -m benchmarks.peers.install [NAME …]`; without a name, all of them.
 
-Each peer has its own virtual environment in `benchmarks/peers/envs`, because their pinned versions conflict. They share one
-PyTorch in `envs/torch`. A file `shared_torch.pth` in each environment puts that folder after the environment's own packages,
-so that torch is found there unless the environment has its own. This takes about 1 GB for torch and 2 GB for the rest.
+Each peer has a virtual environment of its own in `benchmarks/peers/envs`, because their pinned versions conflict. They share
+one PyTorch in `envs/torch`. A file `shared_torch.pth` in each environment puts that folder behind the environment's own
+packages, so that torch is found there unless the environment has one of its own. The installation takes about 1 GB for torch
+and 2 GB for the rest.
 """
 
 from __future__ import annotations
@@ -19,14 +20,14 @@ from typing import NamedTuple
 
 ENVS = Path(__file__).parent / "envs"
 TORCH = ENVS / "torch"
-DONE = "installed"  # this file marks an environment that is complete
+DONE = "installed"  # a file of this name marks a complete environment
 
 
 class Peer(NamedTuple):
     """How to install one peer."""
 
     steps: tuple[tuple[str, ...], ...]
-    """arguments of pip, for one call after another"""
+    """arguments of `pip install`, for one call after another"""
     environ: tuple[tuple[str, str], ...] = ()
     """environment variables during the installation"""
     line: str = ""
@@ -42,8 +43,8 @@ PEERS = {
         )
     ),
     "sample_factory": Peer((("sample-factory==2.1.1", "gymnasium<1.0", "numpy<2"),)),
-    # A source package whose build needs a C++ compiler. NO_OCEAN leaves out its own environments, whose parts it would
-    # download. Then its setup.py lacks a name, which the line of Python defines during the build.
+    # A source package whose build needs a C++ compiler. NO_OCEAN leaves out its own environments, for which it would
+    # download files. Its setup.py then lacks a name, which the line of Python defines during the build.
     "pufferlib": Peer(
         (
             ("numpy<2", "Cython", "setuptools<80", "wheel"),
@@ -69,7 +70,7 @@ def installed() -> list[str]:
 
 
 def install(name: str) -> None:
-    """Make its environment from the beginning. Raises `CalledProcessError`."""
+    """Make the peer's environment from scratch. Raises `CalledProcessError`."""
     peer = PEERS[name]
     folder = ENVS / name
     share_torch()
@@ -86,7 +87,7 @@ def install(name: str) -> None:
 
 
 def _path() -> str:
-    """PATH without folders that hold a CUDA compiler. With a compiler, an extension would be built for a GPU."""
+    """PATH without folders that contain a CUDA compiler, because with one, an extension would be built for a GPU."""
     return os.pathsep.join(folder for folder in os.get_exec_path() if not (Path(folder) / "nvcc").exists())
 
 

@@ -1,7 +1,7 @@
 """Shared by the programs of all peers: reading settings, reporting each update, and finding out when the task is solved.
 
 Rule: the same code evaluates all peers, with greedy episodes, as often as millrace evaluates. The time of these evaluations
-counts for the peers, as it does for millrace.
+is included in a peer's time, as it is in millrace's.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Greedy = Callable[[NDArray[np.float32]], NDArray[np.int64]]
-"""observations [B, *obs] to actions [B]"""
+"""Takes observations [B, *obs], and returns greedy actions [B]."""
 FIRST_SEED = 1000
 
 
@@ -34,7 +34,7 @@ class PeerRun:
         self.how: str = arguments.how
         self._target: float | None = arguments.target
         self.until_solved = self._target is not None
-        self._due = self.settings["eval_every"]  # env steps
+        self._due = self.settings["eval_every"]  # env steps at which the next evaluation is due
 
     def update(self, env_steps: int, greedy: Greedy) -> bool:
         """Report an update. Returns whether the run must end, because the task is solved or all steps are done."""
@@ -49,7 +49,7 @@ class PeerRun:
 
 
 def mean_return(env_id: str, episodes: int, greedy: Greedy) -> float:
-    """The mean return of this many greedy episodes, which are played side by side."""
+    """The mean return of this many greedy episodes, which are played at the same time."""
     copies: list[gymnasium.Env[Any, Any]] = [gymnasium.make(env_id) for _ in range(episodes)]
     obs = [copy.reset(seed=FIRST_SEED + lane)[0] for lane, copy in enumerate(copies)]
     total = 0.0

@@ -1,9 +1,9 @@
 """PufferLib's PPO with its serial vector environment, its fastest on two cores. `--how own` selects its own settings.
 
-Settings that it does not have: minibatches of single rows (its minibatches are whole segments), a falling clip range (it
-stays 0.2), a learning rate that falls linearly (it falls as a cosine), and a separate network for the value in its own
-policy class (the class below is ours). Values change within an update, and the advantages change with them, as in V-trace.
-Rewards are clipped to [-1, 1].
+PufferLib lacks these settings: minibatches of single rows (its minibatches are whole segments), a decreasing clip range (it
+stays 0.2), a learning rate that decreases linearly (it decreases like a cosine), and a separate network for the value in its
+own policy class (so the class below is ours). It recomputes values within an update, and the advantages with them, as in
+V-trace. It clips rewards to [-1, 1].
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import torch
 from benchmarks.peers.peer_run import PeerRun
 
 OWN_COPIES = 16
-OWN_STEPS = 500_000  # from its classic_control.ini: its learning rate falls over these steps, and the run ends after them
+OWN_STEPS = 500_000  # from its classic_control.ini: the learning rate decreases over these steps, then the run ends
 
 
 class Policy(torch.nn.Module):
@@ -53,7 +53,7 @@ def make(env: str, **kwargs: Any) -> Any:
 
 
 def config(s: dict[str, Any], own: bool) -> dict[str, Any]:
-    """Its default.ini. Unless its own settings are requested, the common settings replace those in it."""
+    """The settings in PufferLib's default.ini. Unless `own`, the common settings replace them."""
     from pufferlib.pufferl import load_config
 
     argv = sys.argv
@@ -73,7 +73,7 @@ def config(s: dict[str, Any], own: bool) -> dict[str, Any]:
         "learning_rate": s["learning_rate"], "anneal_lr": s["learning_rate_schedule"] == "linear",
         "gamma": s["gamma"], "gae_lambda": s["gae_lambda"], "update_epochs": s["n_epochs"],
         "bptt_horizon": s["rollout_steps"], "minibatch_size": s["batch_size"], "clip_coef": s["clip_range"],
-        "vf_coef": 2.0 * s["vf_coef"],  # its value loss is half the squared error
+        "vf_coef": 2.0 * s["vf_coef"],  # because its value loss is half the squared error
         "vf_clip_coef": 1e9, "max_grad_norm": s["max_grad_norm"], "ent_coef": s["ent_coef"],
         "prio_alpha": 0.0, "prio_beta0": 1.0,
     }  # fmt: skip
@@ -93,7 +93,7 @@ def main() -> None:
     in_processes: dict[str, Any] = {
         "backend": pufferlib.vector.Multiprocessing,
         "num_workers": s.get("processes"),
-        "overwork": True,  # more processes than cores, which wait for their environments
+        "overwork": True,  # allow more processes than cores, because they wait for their environments
     }
     how = in_processes if run.how == "processes" else {"backend": pufferlib.vector.Serial}
     envs = pufferlib.vector.make(make, env_kwargs={"env": s["env"]}, num_envs=copies, seed=s["seed"], **how)

@@ -1,7 +1,7 @@
-"""RLlib's PPO: two env runners with half of the copies each, and a learner in the driver.
+"""RLlib's PPO: two env runners with half of the env copies each, and a learner in the driver.
 
-Settings that it does not have: a falling clip range (it stays 0.2), and Adam's epsilon of 1e-5. It adds rows at the end of
-episodes, so a minibatch may hold a few more rows than requested.
+RLlib lacks these settings: a decreasing clip range (it stays 0.2), and an epsilon of 1e-5 for Adam. It adds rows at the end
+of episodes, so a minibatch may contain a few more rows than requested.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Sample Factory's APPO: `--how serial` in one process, `async` two workers and a learner, `own` its documented settings.
+"""Sample Factory's APPO. `--how`: `serial` in one process, `async` with two workers and a learner, or `own` settings.
 
-Settings that it does not have: a falling clip range (it stays 0.2, from 1 / 1.2 to 1.2), and the true last value of a
-truncated episode. With `async` and `own`, weights may be several updates old. Then its learner is a separate process, which
-reports the updates.
+`own` uses the settings in its documentation. Sample Factory lacks these settings: a decreasing clip range (it stays 0.2,
+which clips ratios to 1 / 1.2 … 1.2), and the true last value of a truncated episode. With `async` and `own`, the learner is
+a separate process, which reports the updates, and weights may be several updates old.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class ReportingLearner:
             ReportingLearner.run = PeerRun(json.loads(os.environ[ARGV]))
         if not ReportingLearner.ended and ReportingLearner.run.update(learner.env_steps, lambda obs: _greedy(learner, obs)):
             ReportingLearner.ended = True
-            learner.env_steps += int(learner.cfg.train_for_env_steps)  # so that all of its processes end
+            learner.env_steps += int(learner.cfg.train_for_env_steps)  # so that all of Sample Factory's processes end
         return stats
 
 
@@ -60,12 +60,12 @@ Learner.train = ReportingLearner.train_and_report  # at import, so that it appli
 
 
 def make(name: str, cfg: Any = None, env_config: Any = None, render_mode: Any = None) -> Any:
-    """One copy."""
+    """Make one env copy."""
     return gymnasium.make(name) if render_mode is None else gymnasium.make(name, render_mode=render_mode)
 
 
 def arguments(s: dict[str, Any], how: str) -> list[str]:
-    """The settings by Sample Factory's names."""
+    """The settings as flags of Sample Factory."""
     workers = s.get("processes", WORKERS)
     common = {
         "env": s["env"], "algo": "APPO", "experiment": "benchmark", "train_dir": Path.cwd(), "seed": s["seed"],

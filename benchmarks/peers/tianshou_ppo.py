@@ -1,6 +1,6 @@
 """Tianshou's PPO with its DummyVectorEnv, which is faster for CartPole than its subprocesses (`--how subproc`).
 
-Adam's epsilon is 1e-5, as for all peers. This file sets the falling clip range; Tianshou's scheduler sets the learning rate.
+Adam's epsilon is 1e-5, as for all peers. This file sets the decreasing clip range and learning rate before each update.
 """
 
 from __future__ import annotations

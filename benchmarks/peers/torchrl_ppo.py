@@ -1,7 +1,7 @@
-"""TorchRL's PPO: its collector with two processes of serial copies (`--how sync` or `async`), its GAE and its clipped loss.
+"""TorchRL's PPO: its collector with two processes of serial env copies (`--how sync` or `async`), its GAE and clipped loss.
 
-`async`, which is faster, returns the data of the first process that is ready. A batch then comes from one process, is twice
-as long, and may be one version old.
+`async`, which is faster, returns the data of the first process that is ready. A batch is then from a single process, is
+twice as long, and may be one version old.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ PROCESSES = 2
 
 
 class Make:
-    """Makes the copies of one process. It is a class, because it is sent to that process."""
+    """Makes the env copies of one process. It is a class, so that it can be pickled and sent to that process."""
 
     def __init__(self, env: str, copies: int) -> None:
         self.env = env

@@ -647,7 +647,7 @@ def ignores_a_late_reply(learner: Learner) -> Script[None]:
 
 
 def forgets_the_session_before(learner: Learner) -> Script[None]:
-    """Send Rejoin while the client collects. It must send nothing more of the old session, and forget its weights."""
+    """Send Rejoin during a rollout. The client must send nothing more of the old session, and forget its weights."""
     session = yield from collecting_at_length(learner)
     yield from session.begin(session.permit(0), session.permit(1))
     again = yield from collecting(learner, net=LONG_NET)
@@ -660,7 +660,7 @@ def forgets_the_session_before(learner: Learner) -> Script[None]:
 
 
 def collects_over_a_new_connection(learner: Learner) -> Script[None]:
-    """Cut the connection while the client collects, and ask for the ticket again."""
+    """Cut the connection during a rollout, and ask for the ticket again."""
     session = yield from collecting_at_length(learner)
     permit = session.permit()
     yield from session.begin(permit)
@@ -817,7 +817,7 @@ def _evaluate(session: Collecting, order: Evaluate) -> Script[Evaluated]:
 
 
 def drains_while_it_collects(learner: Learner) -> Script[None]:
-    """Send Drain while the client collects for one ticket and another ticket waits. Heartbeats must continue."""
+    """Send Drain while the client collects the rollout of one ticket and another ticket waits. Heartbeats must continue."""
     session = yield from collecting_at_length(learner, 3 * LONG_S)
     permits = [session.permit(), session.permit()]
     yield from session.begin(*permits)
@@ -846,7 +846,7 @@ def drains_while_it_collects(learner: Learner) -> Script[None]:
 
 
 def _draining(learner: Learner) -> Script[Collecting]:
-    """Begin a session, and send Drain while the client collects."""
+    """Begin a session, and send Drain during a rollout."""
     session = yield from collecting_at_length(learner)
     yield from session.begin(session.permit())
     learner.send(Drain("the run is over"))
