@@ -50,7 +50,7 @@ from millrace.workers.collect.collector import Collector
 from millrace.workers.conversation.held import Assignment
 
 PROCESSES = 2
-STEPS = 128  # T
+STEPS = 128  # T, the number of steps in a rollout
 CARTPOLE = EnvSpec("CartPole-v1")
 FRAMES = EnvSpec("benchmarks.frames:Frames-v0")
 PONG = EnvSpec("millrace.extras.envs:millrace/Atari-v0")  # names the module, because the bare loop uses gymnasium.make

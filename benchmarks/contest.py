@@ -63,7 +63,7 @@ def measure(contest: Contest, rounds: int) -> dict[str, object]:
     for turn in range(-3, rounds):
         for name in names[:: 1 if turn % 2 else -1]:
             taken = contest.runs[name]()
-            if turn >= 0:  # the earlier ones are warm-up
+            if turn >= 0:  # earlier turns are warm-up
                 times[name].append(taken * 1e3)
 
     def ratio(other: str) -> float:

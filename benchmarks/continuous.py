@@ -44,7 +44,7 @@ COMMON: dict[str, Any] = {
 ROWS = 256
 OBSERVATION = 3
 ACTION = 1
-WARM_UP_STEPS = 600  # env steps
+WARM_UP_STEPS = 600  # number of env steps that aren't counted
 SOLVED = -200.0
 LONGEST = 20_000
 

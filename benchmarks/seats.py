@@ -70,7 +70,7 @@ class Team(ParallelEnv[str, Any, Any]):  # type: ignore[misc]
 
 
 class Task(NamedTuple):
-    """The env copies to step."""
+    """The env copies to step, and the processes that step them."""
 
     title: str
     copies: int

@@ -63,7 +63,10 @@ def canned(run: RunSpec) -> Rollout:
 
 
 def table(folder: Path, workers: int, mode: Any = "r") -> Arrivals:
-    """When weights arrived, monotonic seconds, [version, worker]; 0: never. A sparse file that all processes map."""
+    """The table of arrivals [version, worker]: when weights arrived, by the monotonic clock in seconds; 0 if they didn't.
+
+    It is a sparse file that all processes map.
+    """
     return np.memmap(folder / "arrivals", np.float64, mode, shape=(VERSIONS, workers))
 
 

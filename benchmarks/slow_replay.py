@@ -22,7 +22,7 @@ from benchmarks.programs import Contender, run
 from benchmarks.writing import write
 
 WORKERS = 8
-WARM_UP_STEPS = 640  # env steps
+WARM_UP_STEPS = 640  # number of env steps that aren't counted
 SETTINGS: dict[str, Any] = {
     "algo": "sac", "envs": WORKERS, "rollout_steps": 8, "batch_size": 256, "learning_rate": 1e-3, "learning_starts": 128,
     "replay_size": 50_000, "updates_per_step": 1.0, "eval_every": 0, "eval_episodes": 1,

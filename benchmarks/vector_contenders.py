@@ -31,7 +31,7 @@ ASYNC = "gymnasium Async"
 
 
 class Task(NamedTuple):
-    """The env copies to step."""
+    """The env copies to step, and the processes that step them."""
 
     title: str
     env: str

@@ -91,7 +91,7 @@ def minutes_table(rows: Sequence[Row]) -> str:
 
 
 def rates_table(rows: Sequence[Row]) -> str:
-    """The table of the same programs' env steps/s."""
+    """The table of these programs' env steps/s."""
     head = ("env steps/s", *(f"steps of {step_text(step_s)}" for step_s in STEP_TIMES_S))
     return table(
         head,

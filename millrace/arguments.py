@@ -60,7 +60,7 @@ def checked(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Re
         try:
             given = signature.bind(*args, **keywords)
         except TypeError:
-            return function(*args, **keywords)  # raises the error with the function's name
+            return function(*args, **keywords)  # raises Python's own TypeError, which names the function
         for name, value in given.arguments.items():
             match signature.parameters[name].kind:
                 case inspect.Parameter.VAR_KEYWORD:
@@ -148,7 +148,7 @@ def fits(value: Any, hint: Any) -> bool:
 
 
 def words(hint: Any) -> str:
-    """An annotation in words."""
+    """An annotation in the words of an error line, such as `a list of text`."""
     origin = get_origin(hint)
     parts = get_args(hint)
     if origin in (Union, UnionType):

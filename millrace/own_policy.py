@@ -69,7 +69,7 @@ class OwnPolicy:
 
     @property
     def name(self) -> str:
-        """Its name in errors."""
+        """The policy's name in errors."""
         return (
             self.factory if isinstance(self.factory, str) else getattr(self.factory, "__name__", type(self.factory).__name__)
         )

@@ -49,7 +49,7 @@ WriteDataset = Callable[[RecordFlags, ShowPlayed, Given], RecordedDataset]
 
 
 class ShownKeywords(TypedDict, total=False):
-    """Keywords of the two functions that aren't flags of the commands."""
+    """Keywords of `Run.evaluate` and `Run.record` that aren't flags of the commands."""
 
     env: EnvLike | None
     wrappers: Sequence[WrapperLike] | None

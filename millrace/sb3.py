@@ -125,7 +125,8 @@ class Sb3VecEnv(VecEnv):
         """Start a step of every env copy with its element of `actions`, an array or a list."""
         if self._nested_actions:
             leaves = zip(*map(self._flatten, actions), strict=True)
-            actions = self._unflatten([np.asarray(leaf) for leaf in leaves])  # as gymnasium batches: an array for each leaf
+            # gymnasium's form of a batch: an array for each leaf
+            actions = self._unflatten([np.asarray(leaf) for leaf in leaves])
         self.env.step_async(actions)
 
     def step_wait(self) -> Any:

@@ -23,7 +23,7 @@ from sample_factory.train import run_rl
 from benchmarks.peers.peer_run import PeerRun
 
 WORKERS = 2
-ARGV = "BENCHMARKED"  # an environment variable, because its child processes are started with other arguments
+ARGV = "BENCHMARKED"  # environment variable for the arguments, because child processes are started with other ones
 
 
 class ReportingLearner:

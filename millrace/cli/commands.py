@@ -77,7 +77,7 @@ def run_command(name: str, argv: list[str]) -> int:
 
 
 def run_installed(name: str, command: Command, argv: list[str]) -> int:
-    """Run a command of another package. Returns the exit code. Raises `UsageError` for any mistake of that package."""
+    """Run a command of another package. Returns the exit code. Raises `UsageError` if anything in that package fails."""
     what = f"command {name} {command.about}"
     function = own_callable(command.runs, what, "mine:run")
     try:

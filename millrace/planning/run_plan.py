@@ -24,7 +24,7 @@ from millrace.protocol.env_spec import Scalar
 WIDTH = 110  # columns of the plan as text
 LEARNER_IS_THE_LIMIT = 0.8
 INDENTED = (0, 0, 0, 2)
-BLOCK = (0, 0, 1, 2)  # with an empty line below
+BLOCK = (0, 0, 1, 2)  # indented, with an empty line below
 
 
 class ExpectedSpeed(msgspec.Struct, frozen=True, kw_only=True):

@@ -60,7 +60,7 @@ from millrace.protocol.wire.plain_values import pack
 from millrace.protocol.wire.weight_dtypes import to_wire_dtype
 
 STEPS = 32  # T, the steps of a rollout in most checks
-TIMED_STEPS = 200  # T of a rollout that measures how fast the client is
+TIMED_STEPS = 200  # T of the rollouts that measure how fast the client is
 TIMED_ROLLOUTS = 3
 LONG_S = 1.0  # duration of a long rollout
 LONGEST_STEPS = 50_000  # largest T of a long rollout

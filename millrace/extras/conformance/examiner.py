@@ -41,10 +41,10 @@ class CheckResult:
 
 
 class Examiner:
-    """The state of the whole test."""
+    """The state of the whole test: the check in progress, and the results so far."""
 
     def __init__(self, checks: Sequence[Check], settings: Settings, now: float, limit_s: float) -> None:
-        """`limit_s`: the whole test ends after this many seconds; checks that have not ended by then have failed."""
+        """`limit_s`: the whole test ends after this many seconds. Checks that haven't ended by then count as failed."""
         self.learner = Learner(settings)
         self.results: list[CheckResult] = []
         self._checks = list(checks)

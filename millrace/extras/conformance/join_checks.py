@@ -112,7 +112,7 @@ def says_hello(learner: Learner) -> Script[None]:
     token = learner.settings.token
     peer = (
         learner.peer.rpartition(b"\0")[0] if token else learner.peer
-    )  # behind a routing id, the learner's socket puts the key
+    )  # without the key that the learner's socket appends to the routing id
     if peer.partition(b"\0")[0] != hello.worker.encode():
         raise Broken(Rule.HELLO, f"the routing id {hello.worker!r}, the worker's name", f"{peer!r}")
     if peer != (expected := routing_id(hello.worker, token)):
@@ -236,7 +236,7 @@ def begins(learner: Learner, run: RunSpec | StepSpec) -> Script[None]:
     waited = learner.watch.welcome
     yield from _replies(learner, 1)
     learner.begin(run)
-    for message in (waited, learner.watch.welcome):  # late copies
+    for message in (waited, learner.watch.welcome):  # send late copies of both
         learner.send(message)
     for _ in range(2):
         heartbeat = yield from heartbeats(learner, 1, Rule.BEGINS)

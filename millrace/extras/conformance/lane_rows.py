@@ -75,10 +75,10 @@ class LaneRows:
                 expected.append((float(self._return[n]), int(self._length[n])))
                 self._return[n] = 0.0
                 self._length[n] = 0
-        if run.seats:  # rewards outside of rows count too
+        if run.seats:  # take the returns from facts, because rewards outside of valid rows also count
             returns = (sum(episode.facts[-len(run.seats) :]) for episode in rollout.episodes)
             expected = [(total, length) for total, (_, length) in zip(returns, expected, strict=True)]
-        got = [(episode.reward, episode.length) for episode in rollout.episodes]  # `validate` has counted them
+        got = [(episode.reward, episode.length) for episode in rollout.episodes]  # `validate` has counted the episodes
         if not _same(expected, got) and _same(sorted(expected), sorted(got)):
             lengths = [length for _, length in expected]
             raise Broken(

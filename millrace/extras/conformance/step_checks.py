@@ -502,7 +502,7 @@ def lists_its_tickets(learner: Learner) -> Script[None]:
 def releases_a_lane(learner: Learner) -> Script[None]:
     """Release a lane, as if it went to another worker, and give it back later."""
     steps = yield from stepping(learner, 0, 1)
-    learner.send(steps.step(0))  # it may be answered or not
+    learner.send(steps.step(0))  # the client may or may not answer it
     learner.send(Release(learner.session, (LaneIncarnation(0, 0),)))
     learner.answers_heartbeats = False  # a reply would close the lane too
     yield from _has_no_copies(steps, Rule.RELEASE)

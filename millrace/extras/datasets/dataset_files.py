@@ -83,7 +83,7 @@ class DatasetFiles:
         self._parts = observation_leaves(self._action_space)
         self.rows = metadata.total_steps
         self.episodes = metadata.total_episodes
-        """number of steps, and of episodes"""
+        """the numbers of steps (`rows`) and of episodes"""
         self._has_jpeg = metadata.jpeg_encoding
         self._check_counts()
 
@@ -126,7 +126,7 @@ class DatasetFiles:
         )
 
     def _read_leaf(self, stored: Any, rows: int, leaf: Leaf, space: gymnasium.Space[Any]) -> Array:
-        """The array [rows, *leaf] of an observation."""
+        """Read the array [rows, *leaf] of one leaf of the observations."""
         from minari.dataset.minari_storage import is_image_space
 
         if self._has_jpeg and is_image_space(space):

@@ -112,7 +112,7 @@ class _RememberingFile(io.RawIOBase):
         return len(view)
 
     def truncate(self, size: int | None = None) -> int:
-        """Cut or extend the file."""
+        """Cut or extend the file to `size`, by default to the current position."""
         length = self._at if size is None else size
         self._tried(lambda: os.ftruncate(self._descriptor, length))
         return length

@@ -25,7 +25,7 @@ class RecordedEpisode:
 
     obs: tuple[Array, ...]  # [L+1, *leaf] for each leaf of the observation
     action: tuple[Array, ...]  # [L, *part] for each part of the action, as the environment took it
-    reward: Array  # [L] raw
+    reward: Array  # [L] raw rewards
     terminated: Bools  # [L]
     truncated: Bools  # [L]
     seed: int | None = None
@@ -128,7 +128,7 @@ class EpisodeAssembler:
         valid = rollout.valid[:, n]
         ended = rollout.terminated[:, n] | rollout.truncated[:, n]
         for t in np.flatnonzero(ended | ~valid).tolist():
-            if not valid[t]:  # the next row begins an episode; after the first row, only if that row had to reset the copy
+            if not valid[t]:  # the next row begins an episode; if t is 0, `running` already says whether it does
                 lane.running[n] = [] if t else lane.running[n]
                 start = t + 1
                 continue

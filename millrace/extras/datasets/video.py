@@ -70,7 +70,7 @@ def record_videos(
         subfolder(run, FOLDER)
         with tempfile.TemporaryDirectory(dir=folder, prefix=".new-") as new:
             while len(results) < episodes:
-                at_once = max(AT_ONCE, len(player.teams))  # the episodes of a plan are divided among the teams
+                at_once = max(AT_ONCE, len(player.teams))  # a plan divides its episodes among the teams
                 count = min(at_once, episodes - len(results))
                 for one in episodes_played.play(count, longest, frames=True):
                     video = Path(new, f"{prefix}seed-{seed}-episode-{len(results)}.mp4")
@@ -95,7 +95,7 @@ def _write(path: Path, frames: list[Array], frames_per_s: float) -> None:
     moviepy's own clips have a length in seconds, and by rounding lose the last frame.
     """
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # from packages that moviepy uses
+        warnings.simplefilter("ignore")  # they come from packages that moviepy uses
         from moviepy.video.io.ffmpeg_writer import FFMPEG_VideoWriter
     height, width, _ = frames[0].shape
     with FFMPEG_VideoWriter(str(path), (width, height), frames_per_s) as writer:

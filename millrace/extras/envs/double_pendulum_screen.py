@@ -31,7 +31,7 @@ class Screen:
         width, height = SCREEN
         self._scale = 2 * min(
             width / (2 * track_m + 0.8), 0.6 * height / (2 * link_m)
-        )  # pixels of the large picture for each meter
+        )  # pixels per meter in the large picture
         self._canvas = self._pygame.Surface((2 * width, 2 * height))
         self._window = self._clock = None
         if window:

@@ -33,7 +33,8 @@ def read_flags(
     for flag in rest:
         if flag.partition("=")[0].removeprefix("--").replace("_", "-") in set_by_launcher:
             raise UsageError(f"launch {launcher}: {flag} is set by the launcher; leave it out")
-    read_config("learner", [flags.env, "--bind", "tcp://0.0.0.0:5555", *rest])  # without --resume
+    # This raises for wrong flags. It leaves out --resume, which the launcher sets.
+    read_config("learner", [flags.env, "--bind", "tcp://0.0.0.0:5555", *rest])
     return flags, rest
 
 

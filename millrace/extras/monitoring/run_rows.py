@@ -129,7 +129,7 @@ def run_name(progress: Progress) -> str:
 
 
 def tool(name: str) -> Any:
-    """The module of this tool. Raises `UsageError`, in one line, if it is not installed."""
+    """Import the module of a tool. Raises `UsageError`, with a one-line message, if it isn't installed."""
     try:
         return importlib.import_module(name)
     except ModuleNotFoundError as error:

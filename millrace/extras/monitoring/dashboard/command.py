@@ -1,4 +1,4 @@
-"""`millrace dashboard`: runs in a browser."""
+"""`millrace dashboard`: shows runs in a browser."""
 
 from __future__ import annotations
 

@@ -55,7 +55,7 @@ COLUMNS = {"Worker": "", "Process": "late", "Doing": "", "Lanes": "", "Steps/s":
            "Heard": "number", "Memory": "number"}  # fmt: skip
 """The columns of the table of workers, with their classes in the style sheet"""
 MOST_SMOOTHED = 100
-MOST_LINES = 10  # most lines of evaluations
+MOST_LINES = 10  # largest number of evaluations in the table
 MIB = 2**20
 
 

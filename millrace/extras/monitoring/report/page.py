@@ -28,7 +28,7 @@ def write_page(runs: Sequence[Path], out: Path) -> Path:
     if out.is_dir():
         raise UsageError(f"{out} is a folder; expected the file to write, as in: --out report.html")
     text = page(runs)
-    write_file(out, lambda file: file.write(text.encode(errors="replace")))  # a name of a file may not be UTF-8
+    write_file(out, lambda file: file.write(text.encode(errors="replace")))  # file names may not be UTF-8
     return out
 
 
