@@ -86,7 +86,8 @@ def _played(path: Path, config: Config, found: Evaluation | None, which: Which) 
 
 def command(config: Config, leave_out: Sequence[str] = ()) -> str:
     """The shortest command line that repeats this run, with S as its seed. `leave_out`: settings to leave out."""
-    leave_out = (*leave_out, *NOT_IN_COMMANDS, *(() if config.max_lag else ("workers",)))  # no effect with max_lag 0
+    # With max_lag 0, the number of workers has no effect on the results.
+    leave_out = (*leave_out, *NOT_IN_COMMANDS, *(() if config.max_lag else ("workers",)))
     words = ["millrace", "train", config.env, "--seed", "S"]
     if config.algo != "ppo":
         words += ["--algo", config.algo]

@@ -27,7 +27,7 @@ VERSION = re.compile(r"""^(?:__version__|version) *= *["'](\d+\.\d+[\d.]*)""", r
 
 
 class PackageTooOld(ImportError):
-    """A package is older than millrace can work with."""
+    """An installed package is too old for millrace."""
 
 
 def check_versions() -> None:

@@ -33,7 +33,7 @@ class InheritedByWorkers:
         return InheritedDescriptors(self.memory_fd, self.to_workers[worker].read_fd, self.to_learner.write_fd)
 
     def close(self) -> None:
-        """Close all file descriptors. The memory itself is freed when its last view is."""
+        """Close all file descriptors. The memory itself is freed once its last view is gone."""
         os.close(self.memory_fd)
         for pipe in (*self.to_workers.values(), self.to_learner):
             pipe.close()

@@ -1,4 +1,4 @@
-"""The pages of the dashboard: from a request to HTML. It reads everything through `KnownRuns` and `Lookout`.
+"""Makes the pages of the dashboard: turns a request into HTML. It reads everything through `KnownRuns` and `Lookout`.
 
 /TOKEN/                         all runs
 /TOKEN/run/KEY?metric=…         one run
