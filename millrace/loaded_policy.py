@@ -165,7 +165,7 @@ class LoadedPolicy:
         return self._state
 
     def _checked_mask(self, mask: npt.ArrayLike, n: int) -> Bools:
-        """The mask as an array [1, n, choices]. Raises `UsageError` if it has a wrong shape or dtype, or allows no action."""
+        """The mask as an array [1, n, choices]. Raises `UsageError` if it has a wrong shape or dtype or allows no action."""
         action = self.spec.action
         size = action.choices
         try:
