@@ -154,7 +154,7 @@ KINDS: Mapping[str, Cause] = {
     f"simulator: SIGSTOP for {HANGS_S:.0f} s": _to(Run.simulators, signal.SIGSTOP, HANGS_S),
 }
 WEIGHTS = {"worker: SIGKILL": 3, "learner: SIGKILL": 2, "simulator: SIGKILL": 2}
-"""relative frequency of a kind; other kinds have 1"""
+"""relative frequency with which a kind is sampled; other kinds have 1"""
 
 
 def drawn(count: int, steps: int, victims: list[str], generator: random.Random) -> list[Fault]:

@@ -1,7 +1,7 @@
 """Returns that millrace's runs have reached (scores.json), and returns that others have published (published_scores.toml).
 
-The repository doesn't keep run folders, but only the numbers in them that tables need. `python -m benchmarks.results RUN
-...` adds runs.
+The repository doesn't contain run folders, but only the numbers that the tables need from them. To add runs:
+`python -m benchmarks.results RUN ...`
 """
 
 from __future__ import annotations

@@ -32,7 +32,7 @@ WORDS: dict[Any, str] = {
     dict: "a dict",
 }
 UNSET = type("Unset", (), {"__repr__": lambda unset: "..."})()
-"""Shown by `help` in place of the default of a setting"""
+"""Shown by `help` as the default of a setting, because that may depend on other settings"""
 _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
 

@@ -212,7 +212,7 @@ class RolloutService:
         self.policy: PolicyParameters = PolicyParameters(self.run.policy)
         """Names, shapes and offsets of the parameters in the flat vector, and initial values."""
         self.seats: tuple[str, ...] = self.run.seats
-        """The names of the agents of each env copy, in the order of their columns; empty for an environment of one agent."""
+        """The names of the agents of each env copy, in the order of their columns; empty for a gymnasium environment."""
         self.observation_space: gymnasium.Space[Any] = described.observation_space
         """The space of a single env copy, or of a single agent."""
         self.action_space: gymnasium.Space[Any] = described.action_space
@@ -383,7 +383,7 @@ class RolloutService:
             return self._hub.snapshot().ledger.counts()
 
     def lags(self) -> dict[str, int]:
-        """Number of rollouts in the batches so far, by lag (how many versions newer the newest weights were).
+        """Number of rollouts in the batches so far, by their lag: the age of their weights, in versions.
 
         >>> import millrace
         >>> with millrace.RolloutService("CartPole-v1", workers=1, envs=2, lanes=1, rollout_steps=8) as service:

@@ -279,7 +279,7 @@ def open_vector_env_pool(settings: VectorEnvSettings, resources: ExitStack) -> V
 
 
 def call_timeouts_of(timeout_s: float) -> CallTimeouts:
-    """How long a call of the environment may take before the worker's supervisor kills the worker.
+    """How long a call of the environment may take before the worker's supervisor ends the worker.
 
     This is longer than `timeout_s`, after which the learner treats the worker as lost, and kills it if it is local. So it
     only matters for a worker elsewhere, and while the learner isn't waiting.

@@ -65,7 +65,7 @@ class WorkerPool(Protocol):
         ...
 
     def stop(self, within_s: float) -> None:
-        """Ask all local workers and threads to leave, and kill those that still run after `within_s`."""
+        """Ask all local workers and threads to leave, and end those that still run after `within_s`."""
         ...
 
 
