@@ -65,9 +65,10 @@ def products_s(algo: str, width: int, repeats: int = 200) -> float:
 
     hidden = seconds(width, width, ROWS)
     first = seconds(width, OBSERVATION + ACTION, ROWS)
-    # Number of passes through one network. Targets: 1 actor and 2 critics. Critics: 2 forward, 2 backward by weights and 2
-    # by inputs. SAC's actor: 1 forward, 2 critics forward and 2 backward by inputs, and the actor backward by both. TD3
-    # updates its actor only in every second step, with one critic.
+    # A pass is either forward, backward for the weights or backward for the inputs, through one network. The targets need 3
+    # forward passes (the actor and 2 critics). The critics' loss needs all three kinds of 2 critics. The actor's loss in SAC
+    # needs a forward pass of the actor, 2 forward passes of the critics, 2 backward passes for the critics' inputs, and 2
+    # backward passes of the actor. In TD3 it is computed in every second step, with one critic.
     passes = 3 + 2 + 4 + (1 + 2 + 2 + 2 if algo == "sac" else (1 + 1 + 1 + 2) / 2)
     return passes * (hidden + first)
 

@@ -33,7 +33,7 @@ class Tree:
         self._due_s = 0.0
 
     def measure(self, pid: int) -> None:
-        """Measure the memory, unless the last measurement was too short a time ago."""
+        """Measure the memory, unless less than `INTERVAL_S` has passed since the last measurement."""
         if time.monotonic() < self._due_s:
             return
         try:

@@ -40,7 +40,7 @@ CURVE = "curve.jsonl"
 MODEL = "model.zip"
 REPLAY = "replay.pkl"
 OTHER_EPISODES = 1_000_000
-"""the seed of the evaluations"""
+"""the seed of the evaluations, so that they play other episodes than training"""
 EVALUATIONS_OF_A_CHECKPOINT = 5
 
 
@@ -98,7 +98,7 @@ def restore(algo: str, env: VecEnv, seed: int, device: str, folder: Path) -> Bas
     model: BaseAlgorithm = KINDS[algo].load(folder / MODEL, env=env, device=device)
     if isinstance(model, OffPolicyAlgorithm) and (folder / REPLAY).exists():  # a finished run has no replay buffer
         model.load_replay_buffer(folder / REPLAY)
-    model.set_random_seed(seed + model.num_timesteps)  # not the random numbers from the beginning again
+    model.set_random_seed(seed + model.num_timesteps)  # so that the first random numbers aren't repeated
     first, *points = (folder / CURVE).read_text().splitlines()
     kept = [point for point in points if json.loads(point)["env_steps"] <= model.num_timesteps]
     (folder / CURVE).write_text("\n".join([first, *kept]) + "\n")

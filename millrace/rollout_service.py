@@ -407,7 +407,7 @@ class RolloutService:
             return sorted(self._hub.snapshot().roles)
 
     def close(self, reason: str = "the learner has ended") -> None:
-        """Ask the workers to leave, and release all resources. A second call does nothing. `reason`: told to the workers.
+        """Ask the workers to leave, and release all resources. A second call does nothing. `reason`: sent to the workers.
 
         >>> import millrace
         >>> service = millrace.RolloutService("CartPole-v1", workers=1, envs=2, lanes=1)

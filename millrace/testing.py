@@ -26,8 +26,8 @@ class AlgorithmMistakes(MillraceError, AssertionError):
 def check_algorithm(algorithm: type, *, learns: bool = True, **settings: Any) -> None:
     """Check that a class keeps the rules of `millrace.algorithms.Algorithm`. This takes some seconds, in this process.
 
-    The class learns from batches of a toy environment, with 2 lanes of 4 env copies and `rollout_steps` steps, but at most
-    64. The checks are that
+    The class learns from batches of a toy environment, with 2 lanes of 4 env copies and rollouts of `rollout_steps` steps
+    (at most 64). The checks are that
 
     - `Config`, the methods, and the shapes and dtypes of weights and metrics follow the rules;
     - `update` calls `pulse`, changes no array of the batch, and learns nothing from rows that are not valid;

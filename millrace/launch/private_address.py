@@ -13,7 +13,8 @@ from contextlib import ExitStack
 
 from millrace.protocol.errors import UsageError, safe_repr
 
-LONGEST_FOLDER = 80  # bytes in the path of the folder for temporary files; the path of a socket file has at most 107
+# If the path of the folder for temporary files has more bytes, /tmp is used: the path of a socket file has at most 107.
+LONGEST_FOLDER = 80
 
 
 def private_address(transport: str, stack: ExitStack) -> str:

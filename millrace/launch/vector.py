@@ -210,7 +210,7 @@ class VectorEnvPool:
         return self._settings.local_workers
 
     def start(self, crew: Crew, before: LobbySettings) -> AbstractContextManager[Lobby]:
-        """Start the number of workers in the settings, with the log files and cores of `crew`. Call it once.
+        """Start as many workers as the settings say, with the log files and cores of `crew`. Call it once.
 
         Returns a context manager: the lobby of these workers.
         """

@@ -61,7 +61,7 @@ class WorkerPool(Protocol):
         ...
 
     def report(self, status: Callable[[float], Status]) -> None:
-        """From now on, answer `millrace status` with the run's status. `status` takes the time and returns it."""
+        """From now on, answer `millrace status` with what `status` returns. `status` is called with the current time."""
         ...
 
     def stop(self, within_s: float) -> None:
@@ -144,7 +144,7 @@ class _LocalProcesses(WorkerProcesses):
     """The processes or threads of a crew."""
 
     def __init__(self, crew: Crew, start: Callable[[str], Running]) -> None:
-        """Starts all of them. `start` starts the worker of a given name."""
+        """Start all workers of the crew. `start` starts the worker of a given name."""
         self.expected = crew.count
         self.most_copies = copies_per_machine() if crew.count else 0
         self._crew = crew

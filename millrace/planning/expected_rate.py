@@ -43,7 +43,7 @@ class Sizes(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Situation(msgspec.Struct, frozen=True, kw_only=True):
-    """The measurements, and the machines on which the run will be."""
+    """The measurements, and the machines on which the run will take place."""
 
     measured: Measurements
     overheads: Overheads

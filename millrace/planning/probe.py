@@ -64,7 +64,7 @@ class ProbedEnv(NamedTuple):
         return EnvSpec.of(self.env).id
 
     def in_wrapper(self, wrapper: str) -> EnvSpec:
-        """The environment in a further wrapper."""
+        """The environment with one more wrapper around it, the outermost one."""
         return EnvSpec.of(self.env, dict(self.kwargs), (*self.wrappers, wrapper))
 
 
@@ -261,7 +261,7 @@ def _digest(arrays: Sequence[Array]) -> int:
 
 
 def _repeats(traces: Sequence[Sequence[int]]) -> bool | None:
-    """Whether all copies returned the same, as far as they were stepped; None if fewer than two were."""
+    """Whether all copies returned the same in all steps that they have in common; None if fewer than two were stepped."""
     traces = [trace for trace in traces if trace]
     if len(traces) < 2:
         return None
@@ -290,7 +290,10 @@ def _measured_alone(env: ProbedEnv, session: _SteppedCopies) -> Measurements:
 
 
 def _with_all(measured: Measurements, sessions: Sequence[_SteppedCopies]) -> Measurements:
-    """Add the measurements that need all sessions. If possible, first resets aren't counted, because they may be slower."""
+    """Add the measurements that need all sessions.
+
+    The first reset of a copy may be slower than the later ones, so it isn't counted unless no copy was reset twice.
+    """
     times = [each for session in sessions for each in session.times]
     later = [each.resets[1:] for each in times if len(each.resets) > 1]
     resets = np.concatenate(later or [each.resets for each in times])

@@ -24,7 +24,7 @@ from millrace.protocol.env_spec import Scalar
 WIDTH = 110  # columns of the plan as text
 LEARNER_IS_THE_LIMIT = 0.8
 INDENTED = (0, 0, 0, 2)
-BLOCK = (0, 0, 1, 2)  # indented, with an empty line below
+BLOCK = (0, 0, 1, 2)  # padding (top, right, bottom, left) of a block, which is indented and followed by an empty line
 
 
 class ExpectedSpeed(msgspec.Struct, frozen=True, kw_only=True):

@@ -34,11 +34,11 @@ LEARNING_RATE = 1e-3  # updates often use a lower rate, so that they change litt
 
 
 def clone(algorithm: Algorithm, episodes: Iterable[Batch], pulse: Callable[[], None]) -> dict[str, float]:
-    """Clone these episodes for `clone_epochs`, without the gradient steps that were made before.
+    """Clone these episodes for `clone_epochs`. Gradient steps that were made before, in a resumed run, aren't repeated.
 
     `episodes`: each one is a batch of one column. `pulse`, which may save the state, is called after each gradient step.
-    Returns metrics over all steps of the episodes: `clone/loss`, and how close the most probable actions are, as
-    `clone/accuracy` (choices and bits), `clone/mean_absolute_error` (numbers), or both.
+    Returns metrics over all steps of the episodes: `clone/loss`, and how close the policy's most probable actions are to
+    the demonstrated ones, as `clone/accuracy` (choices and bits), `clone/mean_absolute_error` (numbers), or both.
 
     Raises `UsageError` if the algorithm derives from neither `ActorCritic` nor `Continuous`, and `RunError`, before the
     gradient step, if a loss or a gradient isn't finite.

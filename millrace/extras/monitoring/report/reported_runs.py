@@ -35,7 +35,7 @@ MAY_DIFFER_IN_A_GROUP = frozenset({
     "transport", "bind", "advertise", "keys", "insecure",
     # how failures are handled
     "worker_timeout_s", "no_workers_timeout_s", "start_timeout_s", "step_timeout_s", "grace_s", "max_env_failures",
-    # what is written, and to which place
+    # what is saved or shown, and where
     "run_dir", "checkpoint_every_s", "keep_checkpoints", "record", "info_keys", "metrics_bind", "dashboard",
 })  # fmt: skip
 """Settings that don't affect what is learned from an env step, so runs of a group may differ in them"""
