@@ -50,7 +50,10 @@ class Program(NamedTuple):
         return COPIES * (resolve(env).algorithm.rollout_steps if self.system == OURS else THEIR_PPO_STEPS)
 
     def warm_up_steps(self, env: str) -> int:
-        """Env steps that a rate leaves out: PPO's first update; for other algorithms, until it made some gradient steps."""
+        """Number of env steps at the beginning that a rate leaves out.
+
+        In PPO these are the steps of the first update. Other algorithms have made some gradient steps after them.
+        """
         return self.steps_of_an_update(env) if self.algo == "ppo" else WARM_UP_STEPS
 
 

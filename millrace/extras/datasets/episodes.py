@@ -61,7 +61,7 @@ class _LaneState:
     running: list[list[_Fragment] | None] = field(default_factory=list)
     """[N] the unfinished episode of each env copy; None, until its end, if its beginning is missing"""
     last_obs: tuple[Array, ...] = ()  # the last observations of the newest rollout, [N, *leaf] each
-    ended: Bools = field(default_factory=lambda: np.zeros(0, bool))  # [N] whether the newest rollout's last row ended an episode
+    ended: Bools = field(default_factory=lambda: np.zeros(0, bool))  # [N] whether that rollout ended with an episode
 
     @property
     def waiting(self) -> int:

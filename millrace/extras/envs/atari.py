@@ -26,8 +26,8 @@ FRAMES = 4
 SKIP = 4
 SIDE = 84
 MAX_FRAMES = 108_000  # time limit of a game in emulator frames: half an hour of play
-NOOP = 0  # number of this action
-FIRE = 1  # number of this action
+NOOP = 0  # the action that does nothing
+FIRE = 1  # the action that presses the button, in games that have it
 JOYSTICK_FIRE = np.array([0, 0, 1], np.float32)  # FIRE in a game with continuous actions: radius, angle, fire
 
 
