@@ -1,4 +1,7 @@
-"""Learns: the loop, the coordinator of workers, the algorithms. Open train.py first. Never imports millrace.workers."""
+"""The learner: the training loop, the coordinator of the workers and the algorithms. Read train.py first.
 
-if __name__ != "millrace.learner":  # otherwise each module and class would exist twice
+This package never imports millrace.workers.
+"""
+
+if __name__ != "millrace.learner":  # under a second name, each module and class would exist twice
     raise ImportError(f"import millrace.learner instead of {__name__}", name=__name__)

@@ -1,4 +1,4 @@
-"""The learning algorithms. No sockets, no files.
+"""The learning algorithms. They use no sockets and no files.
 
 Each algorithm is one class in one file. Its settings are one record in `millrace.learner.config.hyperparameters`.
 `ALGORITHMS` and `HYPERPARAMETERS` in `millrace.learner.config` list them by name. Importing this module does not import
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from pkgutil import resolve_name
 
-import millrace.protocol.machine.waiting_threads  # noqa: F401  # before torch: whoever imports an algorithm imports this file first
+import millrace.protocol.machine.waiting_threads  # noqa: F401  # must precede torch; importing any algorithm runs this
 from millrace.learner.algorithms.algorithm import Algorithm
 from millrace.learner.config.algorithm_names import ALGORITHMS, is_own, own_class
 
@@ -17,7 +17,7 @@ __all__ = ["ALGORITHMS", "Algorithm", "algorithm_class"]
 
 
 def algorithm_class(name: str) -> type[Algorithm]:
-    """The class of this algorithm, imported now: one in `ALGORITHMS`, or your own.
+    """Import and return the class of this algorithm: one in `ALGORITHMS`, or your own.
 
     Your own class has the methods of `Algorithm` and need not derive from it. Raises KeyError for any other name, and
     `UsageError` if your class cannot be found or lacks a method.

@@ -1,8 +1,8 @@
 """The base of PPO, A2C, IMPALA, REINFORCE and your own actor-critics: everything about an update except the loss.
 
 An update raises before it takes a gradient step whose loss, logged numbers or gradient are not finite. The training loop
-checks the weights after the update, and undoes the whole update if they are not finite. With one torch thread on a CPU the
-same batches give the same bits, also after `load_state_dict`. No sockets, no files, no clock.
+checks the weights after the update, and undoes the whole update if they are not finite. With one torch thread on a CPU, the
+same batches give the same bits, even after `load_state_dict`. This file uses no sockets, no files and no clock.
 """
 
 from __future__ import annotations
@@ -42,28 +42,29 @@ from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
 
 Pulse = Callable[[], None]
 
-MAX_LOG_STD = 80.0  # e⁸⁰ times the largest noise of numpy, which is below 14, is finite in float32
+MAX_LOG_STD = 80.0  # e⁸⁰ times the largest normal sample that numpy can draw, which is below 14, is finite in float32
 
 
 class Estimates(NamedTuple):
-    """Targets and advantages of a batch, computed before the losses. Arrays are [T, ΣN]."""
+    """Targets and advantages of a batch, computed before the losses. Arrays are [T, ΣN] unless noted."""
 
     advantage: Floats
     target: Floats  # the critic is trained to predict these
     values: Floats  # [T+1, ΣN] the values from which advantages and targets were computed
-    used: Bools  # True for the rows to learn from; all of these are valid
-    metrics: UpdateMetrics  # without the prefix "train/"
+    used: Bools  # True for the rows to learn from, which must all be valid
+    metrics: UpdateMetrics  # metrics of the estimate, named without the prefix "train/"
 
 
 class ActorCritic(GradientDescent):
     """An actor and a critic, and the update that trains them: epochs of gradient steps on minibatches of a batch.
 
     A subclass defines `loss`, with ordinary torch operations, unless its loss is the policy gradient with a squared value
-    loss. Advantages are generalized advantage estimates (GAE); for others it defines `estimate`. Other state that an update
-    changes belongs into `other_state` and `load_other_state`.
+    loss. Advantages are generalized advantage estimates (GAE); a subclass that needs others defines `estimate`. If an update
+    changes other state, save and load it in `other_state` and `load_other_state`.
 
-    `Config` is the record of the settings, and `self.config` holds their values: those of `ActorCriticConfig`, unless the
-    subclass overrides the methods that use them (`n_epochs`, `minibatch_count`, `standardizes_advantages`, `estimate`).
+    `Config` is the class of the settings, and `self.config` holds their values. It must have the settings of
+    `ActorCriticConfig`, unless the subclass overrides the methods that use them (`n_epochs`, `minibatch_count`,
+    `standardizes_advantages`, `estimate`).
     """
 
     Config: ClassVar[type[AlgorithmConfig]] = ActorCriticConfig  # see `Algorithm`
@@ -94,13 +95,13 @@ class ActorCritic(GradientDescent):
     # ---------------------------------------------------------------- what an algorithm defines
 
     def estimate(self, batch: Batch, observations: Observations, reward: Floats, pulse: Pulse) -> Estimates:
-        """Generalized advantage estimates A, and the targets A + V. `reward` [T, ΣN]: scaled if the settings say so."""
+        """Generalized advantage estimates A, and the targets A + V. `reward` [T, ΣN] is scaled if the settings say so."""
         values = self.values(observations, pulse)
         advantage = gae(reward, values, EpisodeEnds.of(batch), self.config.gamma, self.config.gae_lambda)
         return Estimates(advantage, advantage + values[:-1], values, batch.valid, {})
 
     def loss(self, rows: LossInput) -> tuple[Tensor, Mapping[str, Tensor | float]]:
-        """The loss of a minibatch, a 0-dimensional tensor, and numbers to log by name. All rows are valid.
+        """The loss of a minibatch, as a 0-dimensional tensor, and the numbers to log, by name. All rows are valid.
 
         L = −E[A log π(a)] + vf_coef E[(V − target)²] − ent_coef E[H(π)]
         """
@@ -131,7 +132,7 @@ class ActorCritic(GradientDescent):
         return math.ceil(rows / batch_size)
 
     def standardizes_advantages(self) -> bool:
-        """Whether the advantages of each minibatch get mean 0 and standard deviation 1. After cloning they don't.
+        """Whether to scale the advantages of each minibatch to mean 0 and standard deviation 1; never after cloning.
 
         If a policy acts well from the start, its advantages are little more than the critic's small errors. Scaled to a
         standard deviation of 1, they would change the policy as much as advantages that tell good actions from bad ones.
@@ -148,10 +149,10 @@ class ActorCritic(GradientDescent):
     def update(self, batch: Batch, pulse: Pulse) -> UpdateMetrics:
         """Learn from a batch, calling `pulse` between minibatches. Returns metrics with the names of Stable-Baselines3.
 
-        Raises `RunError`, before the step, if a loss, a logged number or the norm of a gradient is not finite; also if the
-        new weights would give actions that are not finite.
+        Raises `RunError` before a step whose loss, logged numbers or gradient norm are not finite, and after the last step
+        if the new weights could give actions that are not finite.
         """
-        if not batch.valid.any():  # all seats wait
+        if not batch.valid.any():  # all seats waited for their turns, so there is nothing to learn from
             self.env_steps += batch.env_steps
             return {}
         self.set_schedules()
@@ -178,12 +179,12 @@ class ActorCritic(GradientDescent):
         return self.metrics(epochs, estimates)
 
     def step(self, *minibatch: Minibatch) -> tuple[UpdateMetrics, bool]:
-        """One gradient step on a minibatch. Returns the metrics, and True if they end the update (then no step was taken).
+        """Take one gradient step on a minibatch. Returns the metrics, and whether they end the update without this step.
 
-        `minibatch`: the parts of it that this process learns from: all its rows in one part, unless the run has shards.
+        `minibatch` holds the parts that this process learns from: all rows in one part, unless the run has shards.
 
-        Scales the gradient by min(1, max_grad_norm / norm), and steps torch's optimizer. Raises `RunError` before that if
-        the loss, the logged numbers or the gradient's norm are not finite.
+        Scales the gradient by min(1, max_grad_norm / norm), and steps torch's optimizer. Raises `RunError` before the step
+        if the loss, the logged numbers or the gradient's norm are not finite.
         """
         metrics = self.gradient(minibatch)
         clip_norm(self.net.flat, metrics["grad_norm"], self.config.max_grad_norm)
@@ -193,7 +194,7 @@ class ActorCritic(GradientDescent):
         return metrics, ends
 
     def gradient(self, minibatch: Sequence[Minibatch]) -> UpdateMetrics:
-        """Write the gradient of the loss of a minibatch. Returns the loss, the logged numbers and the gradient's norm."""
+        """Compute a minibatch's gradient into `net.flat.grad`. Returns the loss, logged numbers and the gradient's norm."""
         (rows,) = minibatch
         loss, numbers = self.checked_loss(rows)
         return self.differentiate(loss, self.optimizers["optimizer"], {**numbers, "loss": loss})
@@ -203,10 +204,10 @@ class ActorCritic(GradientDescent):
         return _checked(self.loss(self.evaluate(rows)), type(self).__name__)
 
     def evaluate(self, minibatch: Minibatch) -> LossInput:
-        """The rows of a minibatch with the network's outputs: a forward pass, and the action distribution on top.
+        """The rows of a minibatch with the network's outputs for them, by a forward pass and the action distribution.
 
-        The logits of actions that are not allowed become -1e30. A Box has a normal distribution that is not clipped. A small
-        network on the CPU computes the same in numpy (`kernels/trained_networks.py`).
+        The logits of actions that are not allowed become -1e30. Actions of a Box have a normal distribution that is not
+        clipped. A small network on the CPU computes the same in numpy (`kernels/trained_networks.py`).
         """
         action = minibatch.action
         outputs = self.net.evaluate(minibatch.features, minibatch.images, minibatch.recurrent, action, minibatch.mask)
@@ -216,7 +217,7 @@ class ActorCritic(GradientDescent):
         return LossInput(action, minibatch.log_prob, advantage, raw, minibatch.target, *outputs)
 
     def count_update(self, batch: Batch, epochs: int) -> None:
-        """Count an update of `epochs` epochs with this batch: steps and versions. Its observation statistics take effect."""
+        """Count an update of `epochs` epochs: its env steps, and a new version. Observation statistics take effect now."""
         self.env_steps += batch.env_steps
         self.version += 1
         # Workers acted under the statistics that were published before this batch. The losses must normalize observations
@@ -225,7 +226,7 @@ class ActorCritic(GradientDescent):
         self.statistics = self.normalizer.buffers()
 
     def metrics(self, epochs: Sequence[Sequence[UpdateMetrics]], estimates: Sequence[Estimates]) -> UpdateMetrics:
-        """The metrics of an update: means over its gradient steps and estimates, and the state of the schedules."""
+        """The metrics of an update: means over its gradient steps and over its estimates, and the values of schedules."""
         metrics = self.means(step for epoch in epochs for step in epoch)
         metrics["train/learning_rate"] = self.learning_rate
         metrics["train/n_updates"] = float(self.version)
@@ -237,11 +238,11 @@ class ActorCritic(GradientDescent):
     # ---------------------------------------------------------------- the network's outputs for a batch
 
     def rows(self, batch: Batch) -> UpdateRows:
-        """The rows of a batch, as the update uses them."""
+        """The rows of a batch, in the form in which the update uses them."""
         return WholeBatch(batch, self.observations(batch))
 
     def observations(self, batch: Batch) -> ColumnObservations:
-        """The observations, normalized as the workers' policy saw them."""
+        """The observations of a batch, normalized as they were for the workers' policy."""
         x, images = self.normalizer.inputs(batch.obs, self.statistics)
         recurrent = None
         if self.policy.core is not None:
@@ -270,9 +271,9 @@ class ActorCritic(GradientDescent):
 
 
 def _recurrent_input(batch: Batch, tensor: Callable[[Array], Tensor]) -> RecurrentInput:
-    """The recurrent states before all T+1 steps.
+    """The recurrent states with which the rollouts began, and the steps before which they are reset or left unchanged.
 
-    An episode begins after a step that resets; rows in which a seat waits leave its state unchanged.
+    An episode begins after a step that resets. A row in which a seat waits leaves the state of that seat unchanged.
     """
     begins = ~batch.valid
     first = np.zeros_like(batch.valid[:1])
@@ -285,7 +286,7 @@ def _recurrent_input(batch: Batch, tensor: Callable[[Array], Tensor]) -> Recurre
 
 
 def _checked(returned: Any, algorithm: str) -> tuple[Tensor, Mapping[str, Tensor | float]]:
-    """What `loss` returned. Raises `UsageError` for anything but a loss and numbers."""
+    """The value that `loss` returned. Raises `UsageError` unless it is a pair of a loss and numbers to log."""
     match returned:
         case (Tensor() as loss, Mapping() as numbers) if loss.dim() == 0 and loss.requires_grad:
             return loss, numbers
@@ -296,7 +297,7 @@ def _checked(returned: Any, algorithm: str) -> tuple[Tensor, Mapping[str, Tensor
 
 
 def _check_spread_of_actions(net: ActorCriticNetwork, version: int) -> None:
-    """Raise `RunError` before Box actions overflow: otherwise one worker after the other would be refused for them."""
+    """Raise `RunError` before Box actions overflow. Otherwise, the learner would refuse one worker after another."""
     log_std = net.parameters.get("actor.log_std")
     if log_std is not None and (largest := log_std.detach().max().item()) > MAX_LOG_STD:
         raise RunError(

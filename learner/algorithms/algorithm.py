@@ -26,22 +26,22 @@ class Start(NamedTuple):
     """What a new run takes over from an earlier run, whose policy has the same `PolicySpec`."""
 
     state: dict[str, Any]
-    """The `state_dict` of the earlier run's algorithm. If only its policy is known: `parameters`, and perhaps the
-    statistics, `observations`.
+    """The `state_dict` of the earlier run's algorithm. If only the policy of that run is known, it holds just `parameters`,
+    and perhaps the observation statistics, `observations`.
     """
     acting: int
-    """P: the first P of the `parameters` compute actions."""
+    """The number P of acting parameters: the first P of the `parameters` compute actions."""
     critic: bool = False
-    """Take all weights, not only those that compute actions."""
+    """Whether to take over all weights, not only those that compute actions."""
     optimizer: bool = False
-    """Take the moments of the optimizers, too."""
+    """Whether to take over the moments of the optimizers, too."""
 
     def into(self, fresh: dict[str, Any], weights: Iterable[str], optimizers: Iterable[str]) -> dict[str, Any]:
-        """The state of a new algorithm, in which the parts that are taken over replace its own; the rest starts anew.
+        """The state `fresh` of a new algorithm, with the parts that are taken over from the earlier run put in their place.
 
-        `weights` and `optimizers`: their names in the state. The first P of `parameters` and `target` compute actions; if
-        the new algorithm has only these, the saved one must have only these, too. Raises `ValueError` if a tensor has
-        another shape or dtype than in the new algorithm.
+        `weights` and `optimizers` are the names of the tensors and the optimizers in the state. The first P of `parameters`
+        and `target` compute actions; if the new algorithm has only these, the saved one must have only these, too. Raises
+        `ValueError` if a tensor's shape or dtype differs from that in the new algorithm.
         """
         state = self.state
         taken = dict[str, Any]()
@@ -70,14 +70,14 @@ class Algorithm(ABC):
     """
 
     Config: ClassVar[type[AlgorithmConfig]] = AlgorithmConfig
-    """The record of the settings. Its fields are flags, TOML keys and keyword arguments of a run."""
+    """The record of the settings. Its fields become flags, TOML keys and keyword arguments of a run."""
 
     whole_episodes: ClassVar[bool] = False
-    """True if the algorithm learns only from whole episodes: a run whose rollouts are too short for one is refused."""
+    """True if the algorithm learns only from whole episodes. Then a run whose rollouts are shorter is refused."""
 
     @staticmethod
     def policy_spec(config: Any, observation: tuple[Leaf, ...], action: ActionSpec) -> PolicySpec:
-        """The policy to train: an actor and a critic with the layers of the settings, for any supported space.
+        """The policy to train. By default, an actor and a critic with the layers that the settings give, for any space.
 
         Raises `UsageError`, with a one-line message, if the algorithm cannot use these spaces.
         """
@@ -93,25 +93,26 @@ class Algorithm(ABC):
     def __init__(self, config: Any, policy: PolicySpec, *, total_steps: int, seed: int, device: str = "cpu") -> None:
         """Make the weights of version 0.
 
-        `config` is a record of `Config`. `total_steps`: env steps of the run, for schedules. `seed`: all random numbers must
-        derive from it. `device`: "cpu" or "cuda". Raises `UsageError` if this machine cannot do what the settings ask for.
+        `config` is an instance of `Config`. `total_steps` is the number of env steps of the run, for schedules. All random
+        numbers must derive from `seed`. `device` is "cpu" or "cuda". Raises `UsageError` if this machine cannot do what the
+        settings ask for.
         """
 
     @abstractmethod
     def update(self, batch: Batch, pulse: Callable[[], None]) -> dict[str, float]:
         """Learn from a batch and return metrics by name, such as "train/loss".
 
-        Calls `pulse` between gradient steps, so that the learner can answer its workers meanwhile; don't catch what `pulse`
-        raises. Uses only rows where `batch.valid`, and changes no array of the batch. Raises `RunError` when a loss or a
-        gradient is not finite, before it reaches the weights (`check_finite`).
+        Calls `pulse` between gradient steps, so that the learner can answer its workers meanwhile; let any exception that
+        `pulse` raises pass. Uses only rows where `batch.valid` is True, and changes no array of the batch. If a loss or a
+        gradient is not finite, raises `RunError` before it reaches the weights (see `check_finite`).
         """
 
     @abstractmethod
     def weights(self) -> tuple[Floats, Floats]:
-        """Copies of the acting parameters [P] and of the policy's buffers, both float32, as workers get them."""
+        """Copies of the acting parameters [P] and of the policy's buffers, both float32, to be sent to the workers."""
 
     def is_finite(self) -> bool:
-        """Whether all weights, also those that don't compute actions, and the policy's buffers are finite.
+        """Whether all weights, including those that don't compute actions, and the policy's buffers are finite.
 
         Called after each update.
         """
@@ -123,42 +124,42 @@ class Algorithm(ABC):
 
     @abstractmethod
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from a `state_dict`: the next update is the one that would have followed it, bit for bit."""
+        """Continue from a `state_dict`: the next update equals, bit for bit, the one that would have followed it."""
 
     def start_from(self, start: Start) -> None:
-        """Take the policy of an earlier run (`--from`), its statistics, and what else `start` says.
+        """Take over the policy of an earlier run (`--from`), its statistics, and whatever else `start` names.
 
         Called once, on a new algorithm, before `add_prior`; a resumed run does not call it. By default raises `UsageError`.
         """
         raise UsageError(f"{type(self).__name__} does not start from another run: it has no method start_from")
 
     def add_prior(self, prior: PriorData) -> None:
-        """Take the rows of a dataset (`--prior`).
+        """Accept the rows of a dataset (`--prior`) to learn from.
 
         Called once, before the first update and before `load_state_dict`. By default raises `UsageError`.
         """
         raise UsageError(f"prior: {type(self).__name__} does not learn from prior data: it has no method add_prior")
 
     def learn_from_prior(self, pulse: Callable[[], None]) -> None:
-        """Make the gradient steps on prior data that precede the first rollouts, except those already made. Default: none.
+        """Take the gradient steps on prior data that precede the first rollouts, except those already taken.
 
-        Calls `pulse` between gradient steps, and raises `RunError`, as `update` does.
+        By default there are none. Like `update`, it calls `pulse` between gradient steps and may raise `RunError`.
         """
         return
 
     def remember(self) -> None:
-        """Remember this state, for `roll_back`. Called before each update, so it must be quick."""
+        """Remember the current state, for `roll_back`. Called before each update, so it must be quick."""
         self._remembered = copy.deepcopy(self.state_dict())
 
     def roll_back(self) -> None:
-        """Return to the state that was remembered last. The update may have stopped at any point."""
+        """Return to the state that was remembered last. Must work even if the update stopped halfway."""
         self.load_state_dict(copy.deepcopy(self._remembered))
 
 
 def numbers(metrics: Any, who: str) -> dict[str, float]:
     """The metrics of an update as floats, by name. Scalars of numpy and torch become floats, too.
 
-    `who`: the class of the algorithm. Raises `UsageError` for anything but a dict of numbers by name.
+    `who` is the name of the algorithm's class. Raises `UsageError` for anything but a dict of numbers by name.
     """
     if not isinstance(metrics, Mapping):
         raise UsageError(f"{who}.update: expected a dict of metrics, got {type(metrics).__name__}; return {{}} for none")
@@ -173,7 +174,7 @@ def numbers(metrics: Any, who: str) -> dict[str, float]:
 
 
 def wrong_weights(weights: Any, policy: PolicySpec) -> Iterator[str]:
-    """What is wrong with the form of an algorithm's weights: one line for each array that doesn't fit the policy."""
+    """Yield what is wrong with an algorithm's weights: one line for each array whose form doesn't fit the policy."""
     if not isinstance(weights, tuple) or len(weights) != 2:
         yield f"weights: expected a pair of arrays, got {type(weights).__name__}"
         return
@@ -186,7 +187,7 @@ def wrong_weights(weights: Any, policy: PolicySpec) -> Iterator[str]:
 
 
 def acting_weights(algorithm: Algorithm, policy: PolicySpec) -> tuple[Floats, Floats]:
-    """The parameters and buffers with which workers act. Raises `UsageError` if no worker could act with them."""
+    """The parameters and buffers with which workers act. Raises `UsageError` if they don't fit the policy."""
     weights = algorithm.weights()
     if why := next(wrong_weights(weights, policy), None):
         who = type(algorithm).__name__

@@ -1,7 +1,7 @@
 """CrossQ (Bhatt et al. 2024): SAC with batch normalization in actor and critics, and without target networks.
 
-The newest critics also value the next observations. That is stable because observations and next observations pass the
-critics together, and are normalized alike. `NormalizedSAC` has what XQC shares.
+The newest critics also evaluate the next observations. That is stable because observations and next observations pass the
+critics together, and are normalized alike. `NormalizedSAC` has the parts that CrossQ and XQC share.
 """
 
 from __future__ import annotations
@@ -43,9 +43,10 @@ class CrossQ(NormalizedSAC):
         )
 
     def critic_loss(self, rows: Transitions) -> CriticLoss:
-        """½ Σ E[w (Q(s, a) − y)²] over both critics, y = Σ γⁱ r + γᵏ (min Q(s′, a′) − α log π(a′|s′)), in one pass of Q.
+        """½ Σ E[w (Q(s, a) − y)²] over both critics, where y = Σ γⁱ r + γᵏ (min Q(s′, a′) − α log π(a′|s′)).
 
-        y is a constant; the statistics of the minibatch, to which s′ contributes, are not.
+        One pass computes both values of Q. The gradient treats y as a constant, but not the statistics of the minibatch, to
+        which s′ contributes.
         """
         self.net.renormalizes = self.gradient_steps >= self.config.renormalize_after
         joint = self.joint(rows)

@@ -1,7 +1,8 @@
-"""DQN (Mnih et al. 2015), with double, dueling, n-step and prioritized variants. Settings: `config/hyperparameters.py`.
+"""DQN (Mnih et al. 2015), with double, dueling, n-step and prioritized variants.
 
-An update adds a batch to the replay buffer and makes a fixed number of gradient steps, so how often a transition is used is
-a setting and does not depend on speed. ε falls with the number of env steps used and is published with the weights.
+An update adds a batch to the replay buffer and takes a fixed number of gradient steps, so how often a transition is used is
+a setting and does not depend on speed. ε falls with the number of env steps learned from so far, and is published with the
+weights. The settings are in `learner/config/hyperparameters.py`.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ def exploration_rate(config: QLearningConfig, env_steps: int) -> float:
 
 
 class DQN(OffPolicy):
-    """The Q-network, the target network, their optimizer, and the replay buffer with the prior data."""
+    """The Q-network with its target network and its optimizer, and the replay buffer with the prior data."""
 
     Config: ClassVar[type[QLearningConfig]] = DQNConfig
     net: ActionValueNetwork
@@ -66,22 +67,22 @@ class DQN(OffPolicy):
         self.optimizers = {"optimizer": optimizer}
 
     def network(self, device: str, seed: int) -> ActionValueNetwork:
-        """A network of action values. It is called twice, for the network and its target, which begin alike."""
+        """Make a network of action values. Called twice, for the network and its target, which begin with equal weights."""
         return q_network(self.policy, device, seed)
 
     def steps_due(self) -> int:
-        """The number of gradient steps, which is the same in each update once learning has started."""
+        """The number of gradient steps of this update, which is constant once learning has started."""
         return self.config.gradient_steps if self.env_steps >= self.config.learning_starts else 0
 
     def transitions(self, sample: Sample | SequenceSample) -> Transitions:
-        """See `OffPolicy`; x, next_x and target_x are encoded, so that losses need neither images nor sequences."""
+        """See `OffPolicy`. `x`, `next_x` and `target_x` are already encoded, so losses need neither images nor sequences."""
         rows = super().transitions(sample)
         if not self.policy.has_encoder_layers:
             return rows
         return rows.encoded(self.net.encode)._replace(target_x=rows.encoded_next(self.target.encode))
 
     def update(self, batch: Batch, pulse: Callable[[], None]) -> dict[str, float]:
-        """See `OffPolicy.update`; the metrics also have ε."""
+        """See `OffPolicy.update`. The metrics include ε."""
         metrics = super().update(batch, pulse)
         return {"rollout/exploration_rate": exploration_rate(self.config, self.env_steps)} | metrics
 
@@ -103,7 +104,7 @@ class DQN(OffPolicy):
         return CriticLoss(LOSSES[self.config.loss](error, rows.weight), error, {"q_mean": values.mean()})
 
     def step(self, rows: Transitions) -> tuple[UpdateMetrics, Tensor]:
-        """One gradient step on a minibatch; then the target network is updated."""
+        """Take one gradient step on a minibatch, then update the target network if that is due."""
         critic = self.loss(rows)
         optimizer = self.optimizers["optimizer"]
         metrics = self.differentiate(critic.loss, optimizer, {**critic.numbers, "loss": critic.loss})
@@ -123,7 +124,7 @@ class DQN(OffPolicy):
             clip_norm(self.net.flat, norm, config.max_grad_norm)
 
     def _update_target(self) -> None:
-        """Update the target network after a gradient step."""
+        """Move the target network after every `target_every`-th gradient step."""
         if self.gradient_steps % self.config.target_every == 0:
             self.target.flat.lerp_(self.net.flat, self.config.tau)
 

@@ -1,7 +1,7 @@
-"""The base of the algorithms that train flat tensors by gradient descent: what an update needs, and the state.
+"""The base of the algorithms that train flat tensors by gradient descent: the tools of an update, and the saved state.
 
-Rule: the loss that an algorithm writes in torch is the one that is differentiated. A step is taken only if its loss and its
-gradient are finite; `roll_back` undoes what an update did before it raised.
+Rule: torch differentiates exactly the loss that an algorithm defines. A step is taken only if its loss and its gradient are
+finite; `roll_back` undoes what an update had changed before it raised.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ ADVICE = "a lower learning_rate, or normalize_observations and normalize_rewards
 
 
 class Network(Protocol):
-    """What every network has."""
+    """The attribute that every network has."""
 
     flat: Tensor
     """[P] all parameters"""
 
 
 class GradientDescent(Algorithm):
-    """Flat tensors, an optimizer for each trained one, schedules, and running statistics of observations and returns.
+    """Flat tensors, an optimizer for each one that is trained, schedules, and statistics of observations and returns.
 
     A subclass puts everything that a step changes into `tensors` and `optimizers`, and everything else that the next update
     depends on into `other_state`.
@@ -48,29 +48,30 @@ class GradientDescent(Algorithm):
     """The tensors that steps change in place, by their names in the saved state."""
     net: Network
     optimizers: dict[str, Optimizer]
-    """The optimizers, each of one flat tensor that has a gradient, by their names in the saved state."""
+    """The optimizers, by their names in the saved state. Each steps one flat tensor that has a gradient."""
 
     def __init__(self, config: Any, policy: PolicySpec, *, total_steps: int) -> None:
         self.config = config
         self.policy = policy
-        self.env_steps = 0  # of all batches so far; schedules depend on it
-        self.version = 0  # updates made
+        self.env_steps = 0  # env steps of all batches so far, on which schedules depend
+        self.version = 0  # updates made so far
         self._total_steps = total_steps
-        # The policy's buffers also contain what exploration needs, so the normalizer gets the policy with another head.
+        # With some heads, the policy's buffers also hold exploration settings. The normalizer must not count these, so it
+        # gets the policy with a head that has none.
         self.normalizer = ObservationNormalizer(replace(policy, head="actor_critic"))
         self.statistics: Floats = self.normalizer.buffers()  # float32 means and standard deviations, as published
         self.rewards = RewardScaler(config.gamma)
-        self.pretraining_steps = 0  # gradient steps that somebody else made before the first update, as cloning does
+        self.pretraining_steps = 0  # gradient steps taken before the first update by other code, such as cloning
         self._remembered: dict[str, Any] = {}
 
     # ---------------------------------------------------------------- an update
 
     def remaining(self) -> float:
-        """The fraction of the run that remains before this batch, 1 − env_steps / total_steps; above 0 to the end."""
+        """The fraction of the run that remained before this batch, 1 − env_steps / total_steps, and never below 0."""
         return max(0.0, 1 - self.env_steps / self._total_steps)
 
     def set_schedules(self) -> None:
-        """Set what depends on how much of the run remains. Called at the start of each update."""
+        """Set the values that follow a schedule, such as the learning rate. Called at the start of each update."""
         learning_rate = scheduled(self.config.learning_rate, self.config.learning_rate_schedule, self.remaining())
         for optimizer in self.optimizers.values():
             optimizer.param_groups[0]["lr"] = learning_rate
@@ -82,7 +83,7 @@ class GradientDescent(Algorithm):
         return rate
 
     def inputs(self, leaves: Sequence[Array]) -> tuple[Tensor, tuple[Tensor, ...]]:
-        """Features [B, D] as the networks take them, and images [B, *leaf] uint8, of leaves [B, *leaf]."""
+        """The networks' input for leaves [B, *leaf]: normalized features [B, D], and images [B, *leaf] uint8."""
         x, images = self.normalizer.inputs(leaves, self.statistics)
         return self.tensor(x).to(self.net.flat.dtype), tuple(map(self.tensor, images))
 
@@ -91,28 +92,27 @@ class GradientDescent(Algorithm):
         return torch.from_numpy(array).to(self.net.flat.device)
 
     def count(self, batch: Batch) -> None:
-        """Count a batch for the statistics. Those of observations take effect when `statistics` is set."""
+        """Count a batch in the running statistics. Those of observations take effect only when `statistics` is set."""
         if self.config.normalize_rewards:
             self.rewards.count(batch)
         if self.policy.normalize_observations:
             self.normalizer.update(self.normalizer.raw(batch.obs)[:-1], batch.valid)
 
     def scaled(self, reward: Floats) -> Floats:
-        """Rewards as the critic learns them."""
+        """The rewards that the critic learns from: scaled if the settings say so."""
         return self.rewards.scaled(reward) if self.config.normalize_rewards else reward
 
     def add_prior(self, prior: PriorData) -> None:
-        """Count the rows of a dataset for all statistics."""
+        """Count the rows of a dataset in all running statistics."""
         for batch in prior.batches():
             self.count(batch)
         self.statistics = self.normalizer.buffers()
 
     def differentiate(self, loss: Tensor, optimizer: Optimizer, numbers: Mapping[str, Tensor | float]) -> UpdateMetrics:
-        """Write the gradient of a loss into `grad` of the optimizer's flat tensor, which all its gradients share.
+        """Compute the gradient of a loss into `grad` of the optimizer's flat tensor.
 
-        Sets it to zero first, and calls `loss.backward()`. Returns the numbers, and `grad_norm`, as floats.
-
-        Raises `RunError` if one of them is not finite, and `UsageError` if one isn't a number.
+        Sets `grad` to zero, and calls `loss.backward()`. Returns `numbers` as floats, and the norm of the gradient as
+        `grad_norm`. Raises `RunError` if one of these is not finite, and `UsageError` if one isn't a number.
         """
         (flat,) = optimizer.param_groups[0]["params"]
         gradient = flat.grad
@@ -120,7 +120,7 @@ class GradientDescent(Algorithm):
         gradient.zero_()
         loss.backward()  # type: ignore[no-untyped-call]
         read = [self._logged(name, number, loss) for name, number in numbers.items()]
-        values = torch.stack((*read, gradient.norm())).tolist()  # one transfer from a GPU
+        values = torch.stack((*read, gradient.norm())).tolist()  # stacked, so that a GPU transfers them all at once
         metrics = dict(zip((*numbers, "grad_norm"), values, strict=True))
         check_finite(metrics, self.version, ADVICE)
         return metrics
@@ -151,11 +151,11 @@ class GradientDescent(Algorithm):
     # ---------------------------------------------------------------- the state
 
     def is_finite(self) -> bool:
-        """Whether all weights, also those that don't compute actions, and the observation statistics are finite."""
+        """Whether all weights, including those that don't compute actions, and the observation statistics are finite."""
         return bool(all(tensor.isfinite().all() for tensor in self.tensors.values()) and np.isfinite(self.statistics).all())
 
     def other_state(self) -> dict[str, Any]:
-        """What the next update depends on besides tensors, optimizers and statistics, as plain data, copied."""
+        """A copy, as plain data, of all else that the next update depends on, besides tensors, optimizers and statistics."""
         return {"env_steps": self.env_steps, "version": self.version, "pretraining_steps": self.pretraining_steps}
 
     def load_other_state(self, state: dict[str, Any]) -> None:
@@ -174,7 +174,7 @@ class GradientDescent(Algorithm):
         )
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from a `state_dict`: the next update is the one that would have followed it, bit for bit."""
+        """Continue from a `state_dict`: the next update equals, bit for bit, the one that would have followed it."""
         for name, tensor in self.tensors.items():
             tensor.copy_(state[name])
         for name, optimizer in self.optimizers.items():
@@ -193,7 +193,7 @@ class GradientDescent(Algorithm):
         GradientDescent.load_state_dict(self, start.into(own, self.tensors, self.optimizers))
 
     def remember(self) -> None:
-        """Remember this state, for `roll_back`."""
+        """Remember the current state, for `roll_back`."""
         self._remembered = self.state_dict()
 
     def roll_back(self) -> None:
@@ -202,7 +202,7 @@ class GradientDescent(Algorithm):
 
 
 def check_finite(metrics: Mapping[str, float], update: int, advice: str) -> None:
-    """Raise `RunError` if a metric is not finite; it names the first one. Call this before the step."""
+    """Raise `RunError`, naming the first metric that is not finite, if there is one. Call this before the step."""
     for name, number in metrics.items():
         if not math.isfinite(number):
             raise RunError(
@@ -211,12 +211,12 @@ def check_finite(metrics: Mapping[str, float], update: int, advice: str) -> None
 
 
 def scheduled(first: float, schedule: str, remaining: float) -> float:
-    """The value of a setting when this fraction of the run remains: first · remaining for `linear`, first for `constant`."""
+    """A setting's value when this fraction of the run remains: first · remaining for `linear`, first for `constant`."""
     return first * (remaining if schedule == "linear" else 1)
 
 
 def clip_norm(flat: Tensor, norm: float, largest: float) -> None:
-    """Scale the gradient of a flat tensor, which has this norm, to at most the largest norm."""
+    """Scale down the gradient of a flat tensor, whose norm is `norm`, so that its norm is at most `largest`."""
     if norm > largest:
         assert flat.grad is not None
         flat.grad.mul_(largest / norm)

@@ -1,7 +1,8 @@
-"""IMPALA's learner (Espeholt et al. 2018). Settings: `learner/config/hyperparameters.py`. No sockets, no files, no clock.
+"""IMPALA's learner (Espeholt et al. 2018). Its settings are in `learner/config/hyperparameters.py`.
 
-A batch may have been collected under older weights (`max_lag` above 0). V-trace weights each row by the probability ratio of
-its action under the newest policy and the policy that acted. It is computed in time order, before rows are shuffled.
+A batch may have been collected under older weights (`max_lag` above 0). V-trace weights each row by the ratio of its
+action's probability under the newest policy to that under the policy that acted. It is computed in time order, before rows
+are shuffled. This file uses no sockets, no files and no clock.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from millrace.protocol.rollout import Batch
 
 
 class IMPALA(ActorCritic):
-    """The policy gradient with V-trace, which is computed anew in each epoch."""
+    """The policy gradient with V-trace, which is recomputed in each epoch."""
 
     Config = IMPALAConfig
     config: IMPALAConfig
@@ -32,7 +33,10 @@ class IMPALA(ActorCritic):
         return min(self.config.minibatches, rows)
 
     def estimate(self, batch: Batch, observations: Observations, reward: Floats, pulse: Pulse) -> Estimates:
-        """V-trace advantages and targets under the newest weights; `rho` is the mean ratio clipped at 1; 1 on new rows."""
+        """V-trace advantages and targets under the newest weights.
+
+        The metric `rho` is the mean of the ratios, clipped at 1; it is 1 if the newest weights collected all rows.
+        """
         config, values = self.config, self.values(observations, pulse)
         log_ratio = log_probs(self.net, observations, batch, pulse) - batch.log_prob
         target, advantage = vtrace(

@@ -1,6 +1,6 @@
-"""The losses, in plain torch, and metrics about them. Pure. Each takes tensors [B] and returns one number.
+"""The losses, in plain torch, and their metrics. Each is a pure function that takes tensors [B] and returns one number.
 
-B is the number of rows of a minibatch. All of them are valid: rows are masked where minibatches are selected.
+B is the number of rows of a minibatch. All of them are valid: invalid rows are left out when minibatches are selected.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from millrace.protocol.arrays import Floats
 
 
 def standardized(advantage: Tensor) -> Tensor:
-    """Advantages [B] with mean 0 and standard deviation 1, that of a sample (n − 1). A single row stays as it is."""
+    """Advantages [B] scaled to mean 0 and (sample, n − 1) standard deviation 1. A single row is returned unchanged."""
     if len(advantage) < 2:
         return advantage
     std, mean = torch.std_mean(advantage)
@@ -36,15 +36,15 @@ def policy_gradient(log_prob: Tensor, advantage: Tensor) -> Tensor:
 
 
 def value_loss(value: Tensor, target: Tensor) -> Tensor:
-    """Mean squared error, as in Stable-Baselines3: without the factor ½ that other libraries have."""
+    """The mean squared error, without the factor ½ of other libraries, as in Stable-Baselines3."""
     return (value - target).square().mean()
 
 
 def clipped_value_loss(value: Tensor, target: Tensor, old_value: Tensor, clip_range: float) -> Tensor:
-    """The value loss of OpenAI's PPO: moving further than `clip_range` from `old_value` does not lower it.
+    """The value loss of OpenAI's PPO. Moving a value further than `clip_range` from `old_value` doesn't lower it.
 
-    L = E[max((V − G)², (clip(V, V_old−ε, V_old+ε) − G)²)].  Stable-Baselines3 takes only the second square, which also has
-    no gradient for a value that moved too far in the wrong direction.
+    L = E[max((V − G)², (clip(V, V_old−ε, V_old+ε) − G)²)].  Stable-Baselines3 uses only the second square, which gives no
+    gradient even to a value that moved too far in the wrong direction.
     """
     clipped = old_value + (value - old_value).clamp(-clip_range, clip_range)
     return torch.maximum((value - target).square(), (clipped - target).square()).mean()
@@ -56,13 +56,13 @@ def entropy_loss(entropy: Tensor) -> Tensor:
 
 
 def huber_loss(error: Tensor, weight: Tensor) -> Tensor:
-    """E[w (½ e² where |e| ≤ 1, else |e| − ½)] of errors [B] and weights [B]."""
+    """E[w h(e)] for errors e [B] and weights w [B], where h(e) is ½ e² if |e| ≤ 1, and |e| − ½ otherwise."""
     size = error.abs()
     return (weight * torch.where(size <= 1, 0.5 * error.square(), size - 0.5)).mean()
 
 
 def squared_loss(error: Tensor, weight: Tensor) -> Tensor:
-    """E[w e²] of errors [B] and weights [B]."""
+    """E[w e²] for errors e [B] and weights w [B]."""
     return (weight * error.square()).mean()
 
 
@@ -70,7 +70,10 @@ def squared_loss(error: Tensor, weight: Tensor) -> Tensor:
 
 
 def approx_kl(log_ratio: Tensor) -> Tensor:
-    """KL(π_old ‖ π) estimated by E[(ρ − 1) − log ρ]: unbiased, never negative (Schulman 2020, "Approximating KL")."""
+    """KL(π_old ‖ π), estimated as E[(ρ − 1) − log ρ], which is unbiased and never negative (Schulman 2020).
+
+    The reference is his article "Approximating KL Divergence".
+    """
     log_ratio = log_ratio.detach()
     return (log_ratio.expm1() - log_ratio).mean()
 

@@ -1,10 +1,10 @@
 """Rows of a batch in the form of the network's input, and the selection of minibatches from them.
 
-Rule: rows that are not valid never enter a loss, and in an epoch each of the others enters one. A recurrent core still runs
-over the rows that are not valid, because they are part of its columns.
+Rule: rows that are not valid never enter a loss, and each valid row enters exactly one loss per epoch. A recurrent core
+still runs over the rows that are not valid, because they are part of its columns.
 
-A batch has T rows for each of ΣN env copies (columns). Row numbers count the rows as one flat sequence of T · ΣN rows in
-time order. B is the number of rows of a minibatch, and C the number of its columns if the policy has a recurrent core.
+A batch has T rows for each of ΣN env copies (columns). Row numbers count all T · ΣN rows as one flat sequence in time order.
+B is the number of rows of a minibatch, and C the number of its columns if the policy has a recurrent core.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from millrace.protocol.rollout import Batch
 
 Index = Tensor | slice
 
-CHUNK_ROWS = 1024  # observations that are evaluated together where no gradient is needed: this bounds memory
+CHUNK_ROWS = 1024  # how many observations are evaluated together where no gradient is needed, to bound memory
 
 
 class NetworkInput(NamedTuple):
@@ -45,14 +45,14 @@ class Observations(Protocol):
     def evaluate(self, steps: int, function: Callable[[NetworkInput, Index], Tensor], pulse: Callable[[], None]) -> Floats:
         """Apply `function` to the observations of the first `steps` steps, in chunks and without gradients.
 
-        `function` gets the network input of a chunk, and the numbers of its rows in the batch. It returns one number for
-        each row. Returns [steps, ΣN]. `pulse` is called after each chunk.
+        `function` gets the network input of a chunk and the numbers of its rows in the batch, and returns one number for
+        each row. All results are returned as one array [steps, ΣN]. Calls `pulse` after each chunk.
         """
         ...
 
 
 class ColumnObservations(NamedTuple):
-    """The T+1 observations of ΣN env copies, normalized by the statistics that the workers acted with."""
+    """The T+1 observations of ΣN env copies, normalized by the statistics with which the workers acted."""
 
     shape: tuple[int, ...]  # (T+1, ΣN)
     features: Tensor  # [(T+1) · ΣN, D] float32, normalized
@@ -60,7 +60,7 @@ class ColumnObservations(NamedTuple):
     recurrent: RecurrentInput | None  # for all T+1 steps; None without a core
 
     def network_input(self, steps: int, columns: Index, rows: Index) -> NetworkInput:
-        """The input for `rows`, which must be the first `steps` steps of `columns` if the policy has a core."""
+        """The network input for `rows`. If the policy has a core, these must be the first `steps` steps of `columns`."""
         recurrent = None if self.recurrent is None else self.recurrent.part(steps, columns)
         return NetworkInput(self.features[rows], tuple(image[rows] for image in self.images), recurrent)
 
@@ -74,9 +74,9 @@ class ColumnObservations(NamedTuple):
         return np.asarray(values.cpu().numpy()).reshape(steps, -1)
 
     def _chunks(self, steps: int) -> Iterator[tuple[Index, Index]]:
-        """The columns and rows of each chunk, which has about CHUNK_ROWS rows.
+        """Yield the columns and the rows of each chunk of about CHUNK_ROWS rows.
 
-        A chunk holds consecutive rows; with a recurrent core it holds whole columns.
+        A chunk holds consecutive rows or, with a recurrent core, whole columns.
         """
         columns = self.shape[1]
         if self.recurrent is None:
@@ -92,13 +92,13 @@ class Minibatch(NamedTuple):
 
     features: Tensor  # [B, D] float32, normalized
     images: tuple[Tensor, ...]  # [B, *leaf] uint8 each
-    action: Tensor  # [B, *action] int64, or float32 not clipped
-    log_prob: Tensor  # [B] float32, of the action under the policy that acted
+    action: Tensor  # [B, *action] int64, or float32 that is not clipped to the bounds
+    log_prob: Tensor  # [B] float32 log-probability of the action under the policy that acted
     advantage: Tensor  # [B] float32, not standardized
-    target: Tensor  # [B] float32, target of the value function
-    recurrent: RecurrentInput | None = None  # with a core, features and images are [T · C, …], and it selects B of them
-    mask: Tensor | None = None  # [B, choices] bool, which actions are allowed; None unless the run uses action masks
-    standardized: Tensor | None = None  # [B] advantages, standardized over all parts of a minibatch; None: this is all
+    target: Tensor  # [B] float32 target of the value function
+    recurrent: RecurrentInput | None = None  # with a core, features and images are [T · C, …], and this selects B of them
+    mask: Tensor | None = None  # [B, choices] bool, True for allowed actions; None unless the run uses action masks
+    standardized: Tensor | None = None  # [B] advantages standardized over all parts; None if this is the only part
 
     @staticmethod
     def of(batch: Batch, observations: ColumnObservations, advantage: Floats, target: Floats) -> Minibatch:
@@ -117,7 +117,7 @@ class Minibatch(NamedTuple):
         )
 
     def select(self, rows: Tensor, input_rows: Tensor | None = None, recurrent: RecurrentInput | None = None) -> Minibatch:
-        """A copy of some rows. `input_rows`: the rows of the network's input, if a core needs more rows than these."""
+        """A copy of some rows. `input_rows` are the rows of the network's input, if a core needs more rows than `rows`."""
         input_rows = rows if input_rows is None else input_rows
         return Minibatch(
             self.features.index_select(0, input_rows),
@@ -131,7 +131,7 @@ class Minibatch(NamedTuple):
         )
 
     def select_columns(self, columns: Tensor, used: Tensor) -> Minibatch:
-        """A minibatch of those rows of the given columns where `used` [T, ΣN] is True, in time order.
+        """A minibatch of the rows of these columns where `used` [T, ΣN] is True, in time order.
 
         The recurrent core still runs over all rows of the columns.
         """
@@ -143,39 +143,40 @@ class Minibatch(NamedTuple):
         return self.select(rows[selected], rows, recurrent)
 
     def shuffled(self, used: Bools, count: int, generator: torch.Generator | None) -> Iterator[Minibatch]:
-        """The rows where `used` [T, ΣN] is True, shuffled into `count` minibatches of nearly equal size; each occurs once.
+        """Yield `count` minibatches of nearly equal size, which together hold each row where `used` [T, ΣN] is True once.
 
-        With a core, whole columns stay together, because the core learns from rows that follow each other. Then there are at
-        most as many minibatches as columns. Without a generator, the rows stay in order.
+        Rows are shuffled; without a generator, they stay in order. With a core, whole columns stay together, because the
+        core learns from consecutive rows; then there are at most as many minibatches as columns.
         """
         index = units_in_order(used, generator, whole_columns=self.recurrent is not None)
         if not len(index):
             return
         of_rows = torch.from_numpy(used)
-        if self.recurrent is not None:  # only whole columns need it beside the rows
+        if self.recurrent is not None:  # only `select_columns` needs this mask on the device of the rows
             of_rows = of_rows.to(self.features.device)
         for chosen in index.to(self.features.device).tensor_split(min(count, len(index))):
             yield self.chosen(chosen, of_rows)
 
     def chosen(self, units: Tensor, used: Tensor) -> Minibatch:
-        """A copy of some of the `units_in_order` of the rows where `used` [T, ΣN] is True."""
+        """A copy of some of the rows or columns that `units_in_order` gave. `used` [T, ΣN] is True for the rows to use."""
         return self.select(units) if self.recurrent is None else self.select_columns(units, used)
 
 
 class UpdateRows(Protocol):
-    """The rows of a batch, as an update uses them."""
+    """The rows of a batch, in the form in which an update uses them."""
 
     @property
     def observations(self) -> Observations:
-        """For the estimates."""
+        """The observations for which `estimate` computes values."""
         ...
 
     def epochs(
         self, advantage: Floats, target: Floats, used: Bools, count: int, generator: torch.Generator
     ) -> Iterator[Iterable[Sequence[Minibatch]]]:
-        """The minibatches of each epoch, without end, each in the parts that this process learns from.
+        """Yield epochs without end: the minibatches of each epoch, each as the parts that this process learns from.
 
-        A single minibatch per epoch is made once, with its rows in order. The arrays are [T, ΣN].
+        If an epoch is a single minibatch, it is made once, with its rows in order, and yielded every time. The arrays are
+        [T, ΣN].
         """
         ...
 
@@ -197,9 +198,9 @@ class WholeBatch(NamedTuple):
 def endless_epochs(
     minibatches: Callable[[torch.Generator | None], Iterable[Sequence[Minibatch]]], count: int, generator: torch.Generator
 ) -> Iterator[Iterable[Sequence[Minibatch]]]:
-    """Epochs without end. `minibatches` makes those of one, shuffled by a generator, or without one in order.
+    """Yield epochs without end. `minibatches` makes the minibatches of one epoch, in order if its argument is None.
 
-    A single minibatch per epoch is made once, with its rows in order.
+    If an epoch is a single minibatch, it is made once, with its rows in order, and yielded every time.
     """
     single = tuple(minibatches(None)) if count == 1 else ()
     while True:
@@ -207,13 +208,13 @@ def endless_epochs(
 
 
 class LossInput(NamedTuple):
-    """Input of a loss: B rows of a minibatch, and the network's current outputs for them. Every row is valid.
+    """The input of a loss: B rows of a minibatch, and the network's current outputs for them. Every row is valid.
 
-    All are float32, except discrete actions. Gradients flow through the last three.
+    All tensors are float32, except discrete actions. Gradients flow through the last three.
     """
 
     action: Tensor
-    """[B, *action] the actions taken: int64 counted from 0, or float32 that is not clipped to the action space (Box)"""
+    """[B, *action] the actions taken: int64 counted from 0, or for a Box float32 that is not clipped to its bounds"""
     log_prob: Tensor
     """[B] log-probability of the action under the policy that acted"""
     advantage: Tensor
@@ -231,26 +232,27 @@ class LossInput(NamedTuple):
 
 
 def flat_tensor(array: Array, device: torch.device | str) -> Tensor:
-    """[T, N, …] as [T · N, …] on a device."""
+    """An array [T, N, …] as a tensor [T · N, …] on a device."""
     return torch.from_numpy(array.reshape(array.shape[0] * array.shape[1], *array.shape[2:])).to(device)
 
 
 def units_in_order(used: Bools, generator: torch.Generator | None, *, whole_columns: bool) -> Tensor:
-    """The numbers of the rows where `used` [T, N] is True, shuffled; without a generator in order.
+    """The numbers of the rows where `used` [T, N] is True, shuffled, or in order if there is no generator.
 
-    `whole_columns`: the numbers of the columns with such a row. A column without one would make an empty minibatch.
+    With `whole_columns`, the numbers of the columns that have such a row. Columns without one are left out, because they
+    would make an empty minibatch.
     """
     units = torch.from_numpy(np.flatnonzero(used.any(0) if whole_columns else used))
     return units if generator is None else units[torch.randperm(len(units), generator=generator)]
 
 
 def rows_of_columns(steps: int, columns: int, chosen: Tensor) -> Tensor:
-    """The numbers of all rows of the chosen columns, in time order. There are `steps` × `columns` rows."""
+    """The numbers of all rows of the chosen columns, in time order, in a batch of `steps` × `columns` rows."""
     return (torch.arange(steps, device=chosen.device)[:, None] * columns + chosen).flatten()
 
 
 def log_probs(net: ActorCriticNetwork, observations: Observations, batch: Batch, pulse: Callable[[], None]) -> Floats:
-    """Log π(action) [T, ΣN] with the weights of `net`."""
+    """Log-probabilities [T, ΣN] of the actions of a batch, with the current weights of `net`."""
     device = net.flat.device
     action = flat_tensor(batch.action, device)
     mask = None if batch.mask is None else flat_tensor(batch.mask[:-1], device)

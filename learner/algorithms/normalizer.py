@@ -1,6 +1,7 @@
-"""`RolloutService.normalizer`: running mean and standard deviation of observations, and of the discounted return.
+"""`RolloutService.normalizer`: the running mean and standard deviation of observations and of the discounted return.
 
-The built-in trainer uses the same classes, updated from the same rows. Torch is imported at the first use.
+The built-in trainer uses the same classes, and updates them from the same rows. `RolloutService` imports this file, and with
+it torch, when the normalizer is first used.
 """
 
 from __future__ import annotations
@@ -23,9 +24,9 @@ from millrace.protocol.specs import PolicySpec
 class Normalizer:
     """Running mean and standard deviation of each feature of the observations, and of the discounted return.
 
-    They are over all batches counted so far, except rows that only reset. D is the number of features: the
-    entries of all arrays of the observation side by side, with a one-hot vector for a discrete value. Images aren't features
-    and stay as they are. Numbers are kept in float64 and given out as float32.
+    They cover all batches counted so far, except rows that only reset. D is the number of features: the entries of all
+    arrays of the observation side by side, with a one-hot vector for each discrete value. Images aren't features and aren't
+    normalized. The statistics are kept in float64 and returned as float32.
 
     >>> import millrace
     >>> policy = millrace.MLP(normalize_observations=True)
@@ -41,11 +42,11 @@ class Normalizer:
     >>> isinstance(service.normalizer, millrace.Normalizer)
     True
 
-    `service.save` keeps them, and a restored service continues from them.
+    `service.save` saves the statistics, and a restored service continues from them.
     """
 
     def __init__(self, policy: PolicySpec) -> None:
-        """For the observations of this policy, even if it doesn't normalize them itself."""
+        """Make a normalizer for the observations of this policy, even if the policy doesn't normalize them itself."""
         self._policy = msgspec.structs.replace(
             policy, normalize_observations=True, own=None, encoder=None, head="actor_critic"
         )
@@ -55,16 +56,16 @@ class Normalizer:
 
     @property
     def mean(self) -> Floats:
-        """[D] float32, of each feature of the observation. Features of discrete values have 0; images have no features."""
+        """[D] float32 mean of each feature of the observation; 0 for features of discrete values."""
         return self.buffers()[: self._size]
 
     @property
     def std(self) -> Floats:
-        """[D] float32 standard deviation about `mean`; 1 where a feature never varied or is of a discrete value."""
+        """[D] float32 standard deviation about `mean`; 1 if a feature never varied or belongs to a discrete value."""
         return self.buffers()[self._size :]
 
     def buffers(self) -> Floats:
-        """`mean`, then `std`, in one array [2 D]: what `publish` takes for a policy that normalizes observations."""
+        """`mean`, then `std`, in one array [2 D] float32: the buffers to `publish` for a policy that normalizes."""
         return self._observations.buffers()
 
     def update(self, batch: Batch) -> None:
@@ -74,9 +75,9 @@ class Normalizer:
     def normalized(self, batch: Batch) -> Floats:
         """The features [T+1, N, D] float32 of a batch: (x − mean) / std, clipped to ±10.
 
-        Before `update` these are the features that the policy saw, if it normalizes and `max_lag` is 0. The observation's
-        arrays are flattened and concatenated; discrete values are one-hot vectors, and bytes of a Box from 0 to 255 are
-        first divided by 255.
+        If you call this before `update`, these are the features that the policy saw, provided that it normalizes and that
+        `max_lag` is 0. The observation's arrays are flattened and concatenated; discrete values become one-hot vectors, and
+        the bytes of a Box from 0 to 255 are first divided by 255.
         """
         return normalize(self._features(batch), self.mean, self.std)
 
@@ -98,7 +99,7 @@ class Normalizer:
         return features(self._policy, [obs[path] for path in paths] if paths[0] else [obs])
 
     def state(self) -> dict[str, Any]:
-        """Plain data to continue from, without the running returns, because a restored service has new env copies."""
+        """Plain data for `restore`, without the running returns, because a restored service has new env copies."""
         kept: dict[str, Any] = {"observations": _plain(self._observations.state_dict())}
         if self._rewards is not None:
             gamma, scaler = self._rewards
@@ -106,7 +107,7 @@ class Normalizer:
         return kept
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Continue from a `state`. Raises an error of any type if it has another form or is not finite."""
+        """Continue from the result of `state`. Raises an exception of any type if it is malformed or not finite."""
         self._observations.load_state_dict(_tensors(state["observations"]))
         if "gamma" in state:
             scaler = RewardScaler(state["gamma"])

@@ -1,8 +1,9 @@
-"""PPO (Schulman et al. 2017). Its settings: `learner/config/hyperparameters.py`. No sockets, no files, no clock; seeded.
+"""PPO (Schulman et al. 2017). Its settings are in `learner/config/hyperparameters.py`.
 
 An update uses each valid row of a batch once in each of `n_epochs` epochs, in minibatches of at most `batch_size` rows. With
-a recurrent core a minibatch is whole columns of the batch, and may have more. The update is `ActorCritic.update`; here are
-its loss, the schedule of its clip range and its early stop.
+a recurrent core a minibatch consists of whole columns of the batch, and may have more rows. The update itself is
+`ActorCritic.update`; this file adds the loss, the schedule of the clip range and the early stop. It uses no sockets, no
+files and no clock, and all randomness comes from the seed.
 """
 
 from __future__ import annotations
@@ -32,8 +33,8 @@ class PPO(ActorCritic):
 
     def __init__(self, config: PPOConfig, policy: PolicySpec, *, total_steps: int, seed: int, device: str = "cpu") -> None:
         super().__init__(config, policy, total_steps=total_steps, seed=seed, device=device)
-        self.clip_range = config.clip_range  # by the schedule, in this update
-        self.epochs = 0  # epochs made so far: what Stable-Baselines3 calls n_updates
+        self.clip_range = config.clip_range  # the value in this update, which follows the schedule
+        self.epochs = 0  # epochs made so far, which Stable-Baselines3 calls n_updates
         self._kl_limit = math.inf if config.target_kl is None else 1.5 * config.target_kl
 
     def set_schedules(self) -> None:
@@ -55,8 +56,8 @@ class PPO(ActorCritic):
     def loss(self, rows: LossInput) -> tuple[Tensor, Mapping[str, Tensor | float]]:
         """L = −E[min(ρ A, clip(ρ, 1−ε, 1+ε) A)] + vf_coef · E[(V − G)²] − ent_coef · E[H(π)],  ρ = π(a) / π_old(a).
 
-        Schulman et al. 2017, equations 7 and 9. The value loss is clipped if `clip_range_vf` is set; V_old is then G − A, so
-        another `estimate` must keep G = A + V.
+        See Schulman et al. 2017, equations 7 and 9. If `clip_range_vf` is set, the value loss is clipped, with V_old
+        computed as G − A; so if you override `estimate`, keep G = A + V.
         """
         config = self.config
         log_ratio = rows.log_prob_now - rows.log_prob
@@ -76,13 +77,13 @@ class PPO(ActorCritic):
         }
 
     def metrics(self, epochs: Sequence[Sequence[UpdateMetrics]], estimates: Sequence[Estimates]) -> UpdateMetrics:
-        """Those of `ActorCritic`, the last loss, the KL divergence of the last epoch, the clip range and the epochs so far.
+        """The metrics of `ActorCritic`, the last loss, the last epoch's KL divergence, the clip range and the epochs so far.
 
-        A subclass with a loss of its own logs what it likes: what it does not log is not among them.
+        If a subclass has its own loss, the KL divergence is included only if that loss logs it.
         """
         metrics = super().metrics(epochs, estimates)
         metrics |= {"train/n_updates": float(self.epochs), "train/clip_range": self.clip_range}
-        if epochs[-1]:  # `estimate` may use no row
+        if epochs[-1]:  # empty if `estimate` left no row to use
             metrics["train/loss"] = epochs[-1][-1]["loss"]
         if divergences := [step["approx_kl"] for step in epochs[-1] if "approx_kl" in step]:
             metrics["train/approx_kl"] = float(np.mean(divergences))

@@ -1,4 +1,4 @@
-"""The interface of the data that an algorithm can learn from besides the rollouts of its run (`--prior`)."""
+"""The interface of prior data: a dataset (`--prior`) that an algorithm learns from besides the rollouts of its run."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from millrace.protocol.rollout import Batch
 
 
 class PriorData(Protocol):
-    """Whole episodes, in an order that stays the same.
+    """A dataset of whole episodes, in a fixed order.
 
     >>> import numpy as np
     >>> from millrace.algorithms import PriorData

@@ -1,10 +1,10 @@
-"""Rainbow (Hessel et al. 2018): DQN that learns the distribution of returns, by quantiles (QR-DQN, Dabney et al. 2018).
+"""Rainbow (Hessel et al. 2018): DQN that learns the quantiles of the return (QR-DQN, Dabney et al. 2018).
 
-Its other parts are settings of DQN: double, dueling, n-step returns and prioritized replay. Noisy networks are left out:
-workers would have to draw noise for each weight. They explore by ε.
+Its other parts are settings of DQN: double, dueling, n-step returns and prioritized replay. Noisy networks are left out,
+because workers would have to draw noise for each weight; workers explore with ε instead.
 
-Rule: with batch normalization, observations and next observations pass in one minibatch. They come from different
-distributions; in separate minibatches they would be normalized by different means (Bhatt et al. 2024).
+Rule: with batch normalization, observations and next observations pass the network in one minibatch. They come from
+different distributions; in separate minibatches they would be normalized by different means (Bhatt et al. 2024).
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
 
 
 class Rainbow(DQN):
-    """Two networks of quantiles, their optimizer, and the replay buffer with the prior data."""
+    """A network of quantiles with its target network and its optimizer, and the replay buffer with the prior data."""
 
     Config = RainbowConfig
     net: QuantileQNetwork
@@ -46,7 +46,7 @@ class Rainbow(DQN):
 
     @classmethod
     def policy_spec(cls, config: QLearningConfig, observation: tuple[Leaf, ...], action: ActionSpec) -> PolicySpec:
-        """See `DQN`. Raises `UsageError` for a policy with memory."""
+        """See `DQN`. Also raises `UsageError` for a policy with memory."""
         if config.core is not None:
             raise UsageError(f"rainbow: core: expected none, got {config.core}; take --algo dqn for a policy with memory")
         return super().policy_spec(config, observation, action)
@@ -73,7 +73,7 @@ class Rainbow(DQN):
         return CriticLoss(loss, values - targets.mean(-1), {"q_mean": values.mean()})
 
     def start_from(self, start: Start) -> None:
-        """See `Algorithm.start_from`. Raises `UsageError` if only action values are known: they are means of quantiles."""
+        """See `Algorithm.start_from`. Raises `UsageError` if only action values are known, without their quantiles."""
         if "statistics" not in start.state:
             raise UsageError(
                 "start_from: expected a run of rainbow with a checkpoint, got action values without the quantiles whose "
@@ -84,11 +84,11 @@ class Rainbow(DQN):
 
 
 def joint(rows: Transitions) -> tuple[Tensor, list[Tensor]]:
-    """Features [2 B, D] and images [2 B, *leaf] of the observations, then of the next ones."""
+    """Features [2 B, D] and images [2 B, *leaf] of the observations, then of the next observations."""
     images = [torch.cat(both) for both in zip(rows.images, rows.next_images, strict=True)]
     return torch.cat((rows.x, rows.next_x)), images
 
 
 def of_actions(quantiles: Tensor, action: Tensor) -> Tensor:
-    """The quantiles [B, N] of one action in each row [B], from those [B, N, n] of all actions."""
+    """The quantiles [B, N] of one action per row, from the quantiles [B, N, n] of all actions. `action` is [B] int64."""
     return quantiles.take_along_dim(action[:, None, None], -1)[..., 0]

@@ -1,8 +1,8 @@
-"""REINFORCE (Williams 1992). Its settings: `learner/config/hyperparameters.py`. No sockets, no files, no clock.
+"""REINFORCE (Williams 1992). Its settings are in `learner/config/hyperparameters.py`.
 
-An update is one gradient step on the rows whose episode ends within the rollout, because the rewards that follow them are
-all known. Other rows are dropped and counted. The return of a truncated episode continues with the baseline's value of its
-final observation; without a baseline it ends there.
+An update is one gradient step on the rows whose episode ends within the rollout, because all the rewards that follow them
+are known. Other rows are dropped, and their number is logged. The return of a truncated episode includes the baseline's
+value of its final observation; without a baseline it ends there. This file uses no sockets, no files and no clock.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class REINFORCE(ActorCritic):
         return self.config.vf_coef if self.config.baseline else 0.0
 
     def standardizes_advantages(self) -> bool:
-        """See `ActorCritic`. The one minibatch is the whole batch."""
+        """See `ActorCritic`. The only minibatch is the whole batch."""
         return self.config.normalize_returns
 
     def estimate(self, batch: Batch, observations: Observations, reward: Floats, pulse: Pulse) -> Estimates:

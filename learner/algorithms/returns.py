@@ -1,11 +1,12 @@
-"""Returns and advantages. Pure: arrays [T, N] in, arrays [T, N] out; T steps of N env copies.
+"""Returns and advantages, as pure functions of arrays [T, N]: T steps of N env copies.
 
-The replay buffer of single rows has its own n-step returns: it follows rows from slot to slot (`replay/replay_buffer.py`).
+The replay buffer of single rows has its own n-step returns, because it follows rows from slot to slot
+(`replay/replay_buffer.py`).
 
 Every function follows the row format (`millrace.protocol.rollout`): row t bootstraps from `values[t+1]`, the value of
 `obs[t+1]`, which is the true final observation of a truncated episode. No function adds rewards or values across the end of
-an episode. A row that is not valid gives zero and does not affect other rows, whatever it contains: what is carried passes
-through it.
+an episode. A row that is not valid gives zero and does not affect other rows, whatever it contains: the value carried from
+later rows to earlier ones, or from earlier to later, passes through it unchanged.
 """
 
 from __future__ import annotations
@@ -20,13 +21,13 @@ from millrace.protocol.rollout import Batch
 
 
 class EpisodeEnds(NamedTuple):
-    """Where episodes end in a batch, and which of its rows are steps of an episode. [T, N] each."""
+    """Where episodes end in a batch, and which of its rows are steps of an episode, as arrays [T, N]."""
 
     terminated: Bools
     truncated: Bools
     valid: Bools
     with_seats: bool = False
-    """Whether a row that is not valid may stand between two rows of an episode. Else it always follows an end."""
+    """Whether a row that is not valid may stand between two rows of an episode. If not, it follows an episode's end."""
 
     @classmethod
     def of(cls, batch: Batch) -> EpisodeEnds:
@@ -44,19 +45,19 @@ class EpisodeEnds(NamedTuple):
 
 
 def gae(reward: Floats, values: Floats, ends: EpisodeEnds, gamma: float, gae_lambda: float) -> Floats:
-    """Generalized advantage estimates [T, N] float32 (Schulman et al. 2016); reward [T, N], values [T+1, N].
+    """Generalized advantage estimates [T, N] float32 (Schulman et al. 2016), from reward [T, N] and values [T+1, N].
 
         δₜ = rₜ + γ V(sₜ₊₁) [not terminated] − V(sₜ)
         Aₜ = δₜ + γλ Aₜ₊₁ [neither terminated nor truncated]
 
-    The targets of V are A + values[:-1]. Where an episode is truncated, V(sₜ₊₁) is that of its final observation.
+    The targets of V are A + values[:-1]. Where an episode is truncated, V(sₜ₊₁) is the value of its final observation.
     """
     T, N = reward.shape
     assert values.shape == (T + 1, N), f"values: expected {(T + 1, N)}, got {values.shape}"
     bootstrap = np.where(ends.terminated, np.float32(0), values[1:])
     advantage = np.where(ends.valid, reward + np.float32(gamma) * bootstrap - values[:-1], np.float32(0))
     carried = (ends.valid & ~ends.ended) * np.float32(gamma * gae_lambda)
-    following = advantage[-1]  # of the next valid row; 0 if there is none
+    following = advantage[-1]  # the advantage of the next valid row; 0 if there is none
     for t in range(T - 2, -1, -1):
         advantage[t] += carried[t] * following
         following = np.where(ends.valid[t], advantage[t], following) if ends.with_seats else advantage[t]
@@ -73,7 +74,7 @@ def vtrace(
     rho_bar: float = 1.0,
     c_bar: float = 1.0,
 ) -> tuple[Floats, Floats]:
-    """V-trace targets vs and policy-gradient advantages, [T, N] float32 each (Espeholt et al. 2018, eq. 1 and section 4.2).
+    """V-trace targets vs and policy-gradient advantages A, [T, N] float32 (Espeholt et al. 2018, eq. 1 and section 4.2).
 
         ρₜ = min(ρ̄, π(aₜ) / μ(aₜ)),  cₜ = λ min(c̄, π(aₜ) / μ(aₜ));  `log_ratio` [T, N] is log π(aₜ) − log μ(aₜ)
         δₜ = ρₜ (rₜ + γ V(sₜ₊₁) [not terminated] − V(sₜ))
@@ -86,7 +87,7 @@ def vtrace(
     assert values.shape == (T + 1, N), f"values: expected {(T + 1, N)}, got {values.shape}"
     zero, discount, mix = np.float32(0), np.float32(gamma), np.float32(vtrace_lambda)
     log_ratio = np.where(ends.valid, log_ratio, zero)
-    rho = np.exp(np.minimum(log_ratio, np.float32(math.log(rho_bar))))  # clipped first: exp cannot overflow
+    rho = np.exp(np.minimum(log_ratio, np.float32(math.log(rho_bar))))  # clipped before exp, which cannot overflow then
     c = np.exp(np.minimum(log_ratio, np.float32(math.log(c_bar))))
     bootstrap = np.where(ends.terminated, zero, values[1:])
     delta = np.where(ends.valid, rho * (reward + discount * bootstrap - values[:-1]), zero)
@@ -94,7 +95,7 @@ def vtrace(
     goes_on[-1] = False
     ahead = np.zeros_like(delta)  # vs − V of the next row, where the episode goes on in this rollout
     vs_minus_v = delta.copy()
-    following = vs_minus_v[-1]  # that of the next valid row
+    following = vs_minus_v[-1]  # vs − V of the next valid row
     for t in range(T - 2, -1, -1):
         ahead[t] = np.where(goes_on[t], following, zero)
         vs_minus_v[t] += discount * mix * c[t] * ahead[t]
@@ -104,21 +105,27 @@ def vtrace(
 
 
 class NStepReturns(NamedTuple):
-    """The k steps of each valid row [T, N]: n, or fewer where its episode or the rollout ends. Other rows mean nothing."""
+    """The returns of the next k steps of each row, as arrays [T, N].
+
+    k is n, or less if the episode or the rollout ends sooner. Rows that are not valid hold meaningless numbers.
+    """
 
     reward: Doubles
     """Σ γⁱ r over the k steps"""
     discount: Doubles
-    """γᵏ; 0 where the task terminated"""
+    """γᵏ; 0 where the episode terminated"""
     last: Ints
-    """the step of the observation that they lead to, at most T; where the task terminated, that of the last row: none of
-    what stands behind it has a meaning"""
+    """The step of the observation that follows the k steps, at most T. Where the episode terminated, the step of the last
+    row instead, because nothing is learned from the observation after it."""
 
 
 def n_step_returns(reward: Floats, ends: EpisodeEnds, gamma: float, n_step: int) -> NStepReturns:
-    """The discounted sums of up to n rewards [T, N] of an episode, of the valid rows that follow each other."""
+    """The discounted sum of up to n rewards from each row on, over consecutive valid rows of its episode.
+
+    `reward` is [T, N].
+    """
     T, N = reward.shape
-    following = np.full((T, N), T)  # [T, N] the next valid row of the same episode; T if there is none
+    following = np.full((T, N), T)  # [T, N] the step of the next valid row of the same episode; T if there is none
     next_valid = np.full(N, T)
     for t in range(T - 1, -1, -1):
         following[t] = np.where(ends.ended[t], T, next_valid)
@@ -137,17 +144,17 @@ def n_step_returns(reward: Floats, ends: EpisodeEnds, gamma: float, n_step: int)
 
 
 def complete(ends: EpisodeEnds) -> Bools:
-    """[T, N] True for valid rows whose episode ends within the rollout, so that all rewards that follow are known."""
+    """[T, N] True for valid rows whose episode ends within the rollout, so that all later rewards of it are known."""
     return np.asarray(np.logical_or.accumulate((ends.ended & ends.valid)[::-1])[::-1] & ends.valid)
 
 
 def discounted_return(reward: Floats, ends: EpisodeEnds, gamma: float, start: Doubles) -> tuple[Doubles, Doubles]:
-    """The discounted sum of the *past* rewards of this episode, which reward scaling measures.
+    """The discounted sum of the *past* rewards of each row's episode, by whose spread rewards are scaled.
 
         Gₜ = rₜ + γ Gₜ₋₁ [the same episode]
 
-    `start` [N] is G of the row before the first, 0 where an episode begins. Returns G [T, N] float64 (0 where the row is
-    not valid) and the `start` [N] of the next rollout of these copies.
+    `start` [N] is the G of the row before the first, 0 where an episode begins. Returns G [T, N] float64 (0 where the row is
+    not valid), and the `start` [N] for the next rollout of these copies.
     """
     returns = np.zeros(reward.shape)
     last, ended = start, ends.ended

@@ -1,12 +1,13 @@
-"""Running mean and variance of observation features and of the discounted return: float64 in numpy, tensors in the state.
+"""Running mean and variance of observation features and of the discounted return.
 
-Only valid rows count. Only the learner updates the statistics; workers act with the float32 buffers that it publishes.
+They are computed in float64 with numpy, and saved as tensors. Only valid rows count. Only the learner updates the
+statistics; workers act with the float32 buffers that it publishes.
 
-Rule: no single observation may hide the others. A value more than `FAR` standard deviations from the mean (a far value)
-counts as `CLIP` standard deviations from it, which is what the policy sees. So if a sensor fails in less than one row in a
-hundred, the standard deviation changes little. If the scale of a feature grows for good, its many far values soon set a new
-one. Other values count as they are, bit for bit. Which of the first rows are far is known only once there are enough: until
-then they are kept.
+Rule: no single observation may spoil the scale of the others. A value more than `FAR` standard deviations from the mean (a
+far value) counts as if it were `CLIP` standard deviations away, which is what the policy sees. So if a sensor fails in less
+than one row in a hundred, the standard deviation changes little. If the scale of a feature grows for good, its many far
+values quickly set a new scale. Other values are counted unchanged. Which of the first rows are far is known only after
+`FEW` rows; until then all rows are kept.
 """
 
 from __future__ import annotations
@@ -27,18 +28,18 @@ from millrace.protocol.policy.normalize import CLIP, normalize
 from millrace.protocol.rollout import Batch
 from millrace.protocol.specs import PolicySpec
 
-TINY = 1e-12  # a smaller standard deviation is rounding: the value did not vary
-FAR = 100.0  # standard deviations
-FEW = 100  # number of rows from which on the scale is known
-ROUNDING_32 = 1e-6  # of float32, as a fraction of the mean
-ROUNDING_64 = 1e-12  # of float64
+TINY = 1e-12  # a smaller standard deviation is only rounding: the value did not vary
+FAR = 100.0  # distance from the mean, in standard deviations, beyond which a value is far
+FEW = 100  # number of rows after which the scale counts as known
+ROUNDING_32 = 1e-6  # rounding error of float32, as a fraction of the mean
+ROUNDING_64 = 1e-12  # rounding error of float64, as a fraction of the mean
 
 
 class RunningMoments:
     """Mean and variance [*shape] of all rows so far, updated batch by batch (Chan, Golub and LeVeque 1979)."""
 
     def __init__(self, shape: tuple[int, ...] = (), rounding: float | Doubles = ROUNDING_32) -> None:
-        """`rounding` [*shape]: the relative rounding error of the values' dtype."""
+        """`rounding`, a number or [*shape], is the relative rounding error of the values' dtype."""
         self.count = 0
         self._rounding = rounding
         self.mean: Doubles = np.zeros(shape)
@@ -59,7 +60,7 @@ class RunningMoments:
     def std(self) -> Doubles:
         """Standard deviation [*shape] of the population; 1 where the value never varied by more than rounding.
 
-        If the mean is so large that its rounding may exceed 1, this rounding is returned in place of 1.
+        If the mean is so large that its rounding error may exceed 1, that error is returned in place of 1.
         """
         variance = self._squares / max(self.count, 1)
         rounding = self._rounding * abs(self.mean)
@@ -77,7 +78,7 @@ class RunningMoments:
 
 
 class ObservationNormalizer:
-    """Means and standard deviations of the features of Box observations. One-hot and binary features are not normalized."""
+    """Means and standard deviations of the features of Box observations. One-hot and binary features aren't normalized."""
 
     def __init__(self, spec: PolicySpec) -> None:
         self._acting = feature_size(spec)
@@ -87,16 +88,16 @@ class ObservationNormalizer:
         self._box_features = np.array([leaf.kind == "box" for leaf in leaves], bool)
         self._is_wide = np.array([leaf.is_wide for leaf in leaves], bool)
         self._moments = self._no_moments()
-        self._first: Doubles = np.empty((0, len(leaves)))  # [K, D] the rows counted so far, while they are few
+        self._first: Doubles = np.empty((0, len(leaves)))  # [K, D] the first rows, kept while there are fewer than `FEW`
         assert not self._enabled or buffer_size(spec) == 2 * len(leaves)
 
     def _no_moments(self) -> RunningMoments:
         return RunningMoments((len(self._is_wide),), np.where(self._is_wide, ROUNDING_64, ROUNDING_32))
 
     def inputs(self, leaves: Sequence[Array], published: Floats) -> tuple[Array, list[Array]]:
-        """Features [..., D] of leaves [..., *leaf], as a network takes them, and the images among the leaves.
+        """The network's input for leaves [..., *leaf]: features [..., D], and the images among the leaves.
 
-        `published`: the `buffers` that workers act with, which may be older than the newest statistics.
+        `published` are the `buffers` with which workers act, which may be older than the newest statistics.
         """
         raw = self.raw(leaves)
         x = normalize(raw, *np.split(published, 2)) if self._enabled else raw
@@ -124,7 +125,10 @@ class ObservationNormalizer:
             self._update_with_first(rows)
 
     def _update_with_first(self, rows: Floats | Doubles) -> None:
-        """Count the rows [B, D] with which there are enough rows. The smallest 99 of 100 values so far set the scale."""
+        """Count the rows [B, D] that bring the total to `FEW` or more.
+
+        The 99 % of the values so far that are nearest to the median set the scale.
+        """
         so_far = np.concatenate([self._first, rows]) if len(self._first) else rows
         center = np.median(so_far, 0)
         spread = np.quantile(abs(so_far - center), 0.99, axis=0, method="lower")
@@ -139,9 +143,9 @@ class ObservationNormalizer:
     def buffers(self) -> Floats:
         """D means, then D standard deviations, float32, as published; empty if the policy does not normalize.
 
-        A feature with a large mean, such as a time in seconds, may vary by less than the rounding of its mean. Its standard
-        deviation is taken about the rounded mean, so that normalized values have a mean square of 1 and are not at the
-        bounds.
+        A feature with a large mean, such as a time in seconds, may vary by less than the rounding error of its mean in
+        float32. Its standard deviation is computed about the rounded mean, so that normalized values have a mean square of 1
+        and are not clipped.
         """
         if not self._enabled:
             return np.empty(0, np.float32)
@@ -166,7 +170,7 @@ class ObservationNormalizer:
 
 
 def _bounded(rows: Floats | Doubles, center: Floats | Doubles, spread: Floats | Doubles) -> Floats | Doubles:
-    """The rows [B, D], with values that are far from the center [D] replaced; the same array if none is."""
+    """The rows [B, D], with values that are far from the center [D] replaced; the same array if no value is far."""
     distance = rows - center.astype(rows.dtype)
     if (np.einsum("bd,bd->d", distance, distance) <= (FAR * spread) ** 2).all():
         return rows  # most batches: the sum of all squares is smaller than the square of one far value
@@ -175,7 +179,7 @@ def _bounded(rows: Floats | Doubles, center: Floats | Doubles, spread: Floats | 
 
 
 class RewardScaler:
-    """Divides rewards by the running standard deviation of the discounted return (Engstrom et al. 2020); no shift.
+    """Divides rewards by the running standard deviation of the discounted return, without a shift (Engstrom et al. 2020).
 
     The return of each env copy continues from one rollout of its lane to the next. It starts at 0 with each episode and
     whenever a lane gets new env copies.
@@ -184,8 +188,8 @@ class RewardScaler:
     def __init__(self, gamma: float) -> None:
         self._gamma = gamma
         self._moments = RunningMoments()
-        self._largest = 0.0  # size of a discounted return so far
-        self._returns: dict[int, Doubles] = {}  # lane -> [columns]
+        self._largest = 0.0  # the largest size of a discounted return so far
+        self._returns: dict[int, Doubles] = {}  # by lane, the running return [columns] of each env copy
 
     def count_and_scale(self, batch: Batch) -> Floats:
         """Count the batch, then return its scaled rewards [T, ΣN], clipped to ±10."""
@@ -193,12 +197,12 @@ class RewardScaler:
         return self.scaled(batch.reward)
 
     def scaled(self, reward: Floats) -> Floats:
-        """These rewards, scaled and clipped to ±10 as VecNormalize of Stable-Baselines3 does, float32."""
+        """These rewards, scaled and clipped to ±10 as by Stable-Baselines3's VecNormalize, float32."""
         clipped: Floats = np.clip(reward / self.std, -CLIP, CLIP).astype(np.float32)
         return clipped
 
     def bounded(self, reward: Floats, bound: float) -> Floats:
-        """These rewards divided so that no discounted return so far exceeds the bound, and at least by `std`, float32."""
+        """These rewards, float32, divided by `std`, or by more if a discounted return so far would exceed the bound."""
         divided: Floats = (reward / max(self.std, self._largest / bound)).astype(np.float32)
         return divided
 
@@ -210,11 +214,11 @@ class RewardScaler:
     def count(self, batch: Batch) -> None:
         """Count the rewards of a batch."""
         ends = EpisodeEnds.of(batch)
-        for at in range(0, len(batch.lane), batch.columns_per_rollout):  # rollouts of a lane are in the order of collection
+        for at in range(0, len(batch.lane), batch.columns_per_rollout):  # rollouts of a lane are in order of collection
             columns = slice(at, at + batch.columns_per_rollout)
             lane = int(batch.lane[at])
             fresh = batch.fresh[columns]
-            known = 0.0 if fresh.all() else self._returns.get(lane, 0.0)  # of a fresh lane, perhaps of another size
+            known = 0.0 if fresh.all() else self._returns.get(lane, 0.0)  # the old array may not fit a fresh lane's size
             start = np.where(fresh, 0.0, known)
             returns, self._returns[lane] = discounted_return(
                 batch.reward[:, columns], ends.columns(columns), self._gamma, start
@@ -234,5 +238,5 @@ class RewardScaler:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from a `state_dict`."""
         self._moments.load_state_dict(state["moments"])
-        self._largest = float(state.get("largest", 0))  # states of version 0.2.0 have none
+        self._largest = float(state.get("largest", 0))  # states saved by version 0.2.0 lack this
         self._returns = {int(lane): returns.numpy().copy() for lane, returns in state["returns"].items()}

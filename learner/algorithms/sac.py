@@ -1,7 +1,7 @@
-"""SAC (Haarnoja et al. 2018): a squashed Gaussian, two critics, automatic temperature. `Continuous` has what TD3 shares.
+"""SAC (Haarnoja et al. 2018): a squashed Gaussian policy, two critics, and an automatic temperature.
 
-A gradient step is one of the critics, then one of the actor, then one of the temperature; then the target critics move. The
-update is `OffPolicy.update`, which calls `step` for each gradient step that is due.
+A call of `step` takes a gradient step of the critics, then one of the actor, then one of the temperature; then the target
+critics move. `OffPolicy.update` calls `step` for each step that is due. `Continuous` has the parts that SAC and TD3 share.
 """
 
 from __future__ import annotations
@@ -44,12 +44,12 @@ class SAC(Continuous):
 
     @property
     def batch_normalization(self) -> str:
-        """Where the actor has it: the parameters of one kind of actor mean something else in another."""
+        """Where the actor has batch normalization. Actors that differ in this cannot use each other's parameters."""
         return "none"
 
     @property
     def temperature(self) -> float:
-        """α: `ent_coef` in the settings and the metrics, as in Stable-Baselines3."""
+        """The temperature α, named `ent_coef` in the settings and the metrics, as in Stable-Baselines3."""
         return math.exp(self.log_temperature.item())
 
     def sample(self, x: Tensor) -> tuple[Tensor, Tensor]:
@@ -73,7 +73,7 @@ class SAC(Continuous):
     def actor_loss(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """E[α log π(ã|s) − min Q(s, ã)],  ã ~ π(s), for features [B, D]. Also returns log π(ã|s) [B]."""
         action, log_prob = self.sample(x)
-        value = self.net.values(x, action, constant=True).amin(0)  # a gradient for the actor alone
+        value = self.net.values(x, action, constant=True).amin(0)  # constant critics: only the actor gets a gradient
         return (self.temperature * log_prob - value).mean(), log_prob.detach()
 
     def temperature_loss(self, log_temperature: Tensor, log_prob: Tensor) -> Tensor:
@@ -81,9 +81,9 @@ class SAC(Continuous):
         return -(log_temperature * (log_prob + self.target_entropy)).mean()
 
     def start_from(self, start: Start) -> None:
-        """See `Algorithm.start_from`. A temperature that the earlier run did not learn is learned from its initial value.
+        """See `Algorithm.start_from`. If the earlier run did not learn its temperature, this run starts from its own.
 
-        Raises `UsageError` if the actor of the earlier run is of another kind.
+        Raises `UsageError` if the earlier run's actor has another kind of batch normalization.
         """
         expected, got = self.batch_normalization, start.state.get("batch_normalization", "none")
         if expected != got:
@@ -95,7 +95,7 @@ class SAC(Continuous):
         super().start_from(start._replace(state=anew | start.state))
 
     def step(self, rows: Transitions) -> tuple[UpdateMetrics, Tensor]:
-        """One gradient step of the critics, the actor and the temperature; then the target critics move."""
+        """Take one gradient step of the critics, the actor and the temperature; then move the target critics."""
         critic = self.critic_loss(rows)
         measured = {"ent_coef": self.temperature} | self.descend("critic", critic.loss, critic.numbers)
 

@@ -1,7 +1,7 @@
-"""TD3 (Fujimoto et al. 2018): a deterministic actor, two critics, smoothed targets. `Continuous` has what SAC shares.
+"""TD3 (Fujimoto et al. 2018): a deterministic actor, two critics, and smoothed targets.
 
-The actor makes one gradient step for every `policy_delay` steps of the critics; the target networks move at the same time.
-The update is `OffPolicy.update`, which calls `step` for each gradient step that is due.
+The actor takes one gradient step for every `policy_delay` steps of the critics; the target networks move at the same time.
+`OffPolicy.update` calls `step` for each step that is due. `Continuous` has the parts that SAC and TD3 share.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class TD3(Continuous):
         return TD3.bounded_policy_spec(config, observation, action, head="deterministic")
 
     def exploration(self) -> list[float]:
-        """The scale of the noise that workers add."""
+        """The scale of the noise that workers add to actions."""
         return [self.config.exploration_noise]
 
     @torch.no_grad()
@@ -50,11 +50,11 @@ class TD3(Continuous):
 
     def actor_loss(self, x: Tensor) -> Tensor:
         """−E[Q₀(s, μ(s))], for features [B, D]."""
-        value = self.net.values(x, self.net.actor_params(x).tanh(), constant=True, critics=1)  # [1, B], no gradient for Q
+        value = self.net.values(x, self.net.actor_params(x).tanh(), constant=True, critics=1)  # [1, B]; Q gets no gradient
         return -value.mean()
 
     def step(self, rows: Transitions) -> tuple[UpdateMetrics, Tensor]:
-        """One gradient step of the critics, and perhaps one of the actor and the targets."""
+        """Take one gradient step of the critics; if it is their turn, also step the actor and move the targets."""
         critic = self.critic_loss(rows)
         measured = self.descend("critic", critic.loss, critic.numbers)
         self.gradient_steps += 1

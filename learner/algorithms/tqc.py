@@ -1,7 +1,7 @@
-"""TQC (Kuznetsov et al. 2020): SAC whose critics learn quantiles of the return, and whose targets leave out the top ones.
+"""TQC (Kuznetsov et al. 2020): SAC whose critics learn quantiles of the return, and whose targets leave out the highest.
 
-SAC takes the lower of two values, so that the actor doesn't exploit their errors. TQC pools the quantiles of all critics and
-drops the highest ones, which allows finer steps.
+SAC takes the lower of two critics' values, so that the actor doesn't exploit their errors. TQC pools the quantiles of all
+critics and drops the highest ones, so you can set in finer steps how pessimistic the targets are.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class TQC(SAC):
 
     @staticmethod
     def policy_spec(config: Any, observation: tuple[Leaf, ...], action: ActionSpec) -> PolicySpec:
-        """A squashed Gaussian. Raises `UsageError` unless the action is a bounded Box."""
+        """A squashed Gaussian. Raises `UsageError` unless the action is a bounded Box and a quantile is left in targets."""
         if config.dropped_quantiles >= config.quantiles:
             raise UsageError(
                 f"dropped_quantiles: expected fewer than quantiles, {config.quantiles}, got {config.dropped_quantiles}"
@@ -62,7 +62,7 @@ class TQC(SAC):
         return rows.reward[:, None] + rows.discount[:, None] * (z - self.temperature * log_prob[:, None])
 
     def critic_loss(self, rows: Transitions) -> CriticLoss:
-        """E[w · quantile Huber loss], mean over the critics."""
+        """E[w · quantile Huber loss], averaged over the critics."""
         quantiles = self.net.outputs(rows.x, rows.action)  # [K, B, O]
         targets = self.targets(rows)
         loss = (rows.weight * quantile_huber(quantiles, targets)).mean()

@@ -2,7 +2,8 @@
 
 It has three parts: batch normalization before each activation; weights of norm 1, so that an optimizer step turns them by an
 angle that doesn't shrink as weights grow; and critics that learn the probabilities of returns by cross-entropy, whose
-gradient is bounded. Rewards are scaled so that returns lie within the categories. `NormalizedSAC` has what CrossQ shares.
+gradient is bounded. Rewards are scaled so that returns lie within the categories. `NormalizedSAC` has the parts that XQC and
+CrossQ share.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from millrace.protocol.arrays import Floats
 from millrace.protocol.specs import PolicySpec
 
 INITIAL_TEMPERATURE = 0.01
-"""in units of scaled rewards"""
+"""The initial temperature, in units of scaled rewards."""
 
 
 class XQC(NormalizedSAC):
@@ -54,16 +55,16 @@ class XQC(NormalizedSAC):
         return ActorWithCritics(self.policy, *self.shapes(), self.categories.mean, device, self.seed)
 
     def scaled(self, reward: Floats) -> Floats:
-        """See `GradientDescent`: scaled so that no discounted return so far exceeds `return_bound`."""
+        """See `GradientDescent`. Rewards are scaled so that no discounted return so far exceeds `return_bound`."""
         if not self.config.normalize_rewards:
             return reward
         return self.rewards.bounded(reward, self.config.return_bound)
 
     def target_distribution(self, rows: Transitions, next_logits: Tensor, next_log_prob: Tensor) -> Tensor:
-        """The probabilities [B, O] of Σ γⁱ r + γᵏ (Z′ − α log π(a′|s′)) on the categories, without a gradient.
+        """The distribution [B, O] over categories of Σ γⁱ r + γᵏ (Z′ − α log π(a′|s′)), without a gradient.
 
-        Z′ has the distribution of the target critic with the lower expected return of s′ and a′. `next_logits` [2, B, O] are
-        the logits of both target critics.
+        Z′ has the distribution that one target critic predicts for s′ and a′: the critic with the lower expected return.
+        `next_logits` [2, B, O] are the logits of both target critics.
         """
         pessimist = self.categories.mean(next_logits).argmin(0)
         probabilities = next_logits[pessimist, torch.arange(len(pessimist), device=pessimist.device)].softmax(-1)
@@ -80,7 +81,7 @@ class XQC(NormalizedSAC):
         return CriticLoss(loss, error, {"q_mean": values.mean(), "scaled_reward": rows.reward.mean()})
 
     def critic_loss(self, rows: Transitions) -> CriticLoss:
-        """See `cross_entropy` and `target_distribution`: critics and targets each see s, a and s′, a′ in one minibatch."""
+        """See `cross_entropy` and `target_distribution`. Critics and targets each see s, a and s′, a′ in one minibatch."""
         joint = self.joint(rows)
         size = len(rows.x)
         with torch.no_grad():

@@ -1,1 +1,1 @@
-"""Settings of a run: from defaults, presets, files and flags to one record."""
+"""The settings of a run, merged from defaults, presets, files and flags into one record."""

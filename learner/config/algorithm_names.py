@@ -1,8 +1,8 @@
-"""The algorithm that a run names: a built-in one by its short name, or your own as `module:Class`.
+"""The names of algorithms: a short name for a built-in one, and `module:Class` for your own.
 
-Rules: your module is imported when the settings of its algorithm are first needed. If the class lacks something, one line
-says so then, before a worker or a run folder is made. A class that you pass in Python and that can't be imported (because it
-is defined in a notebook or a function) is found in this process only.
+Rules: your module is imported when the settings of its algorithm are first needed. If the class lacks something, a one-line
+error says so then, before a worker is started or a run folder is made. A class that you pass in Python and that can't be
+imported (because it is defined in a notebook or a function) is found in this process only.
 """
 
 from __future__ import annotations
@@ -36,21 +36,21 @@ ALGORITHMS = {
     "crossq": "millrace.learner.algorithms.crossq:CrossQ",
     "xqc": "millrace.learner.algorithms.xqc:XQC",
 }
-"""`module:Class` of each built-in algorithm, imported when it is used"""
+"""The `module:Class` of each built-in algorithm, which is imported when it is used."""
 
 NEEDED = (
     "__init__", "policy_spec", "update", "weights", "is_finite", "state_dict", "load_state_dict", "remember", "roll_back",
 )  # fmt: skip
-"""The methods of an algorithm, as `millrace.learner.algorithms.Algorithm` describes them"""
+"""The methods that every algorithm needs; `millrace.learner.algorithms.Algorithm` describes them."""
 
 FOR_PRIOR = ("add_prior", "learn_from_prior")
-"""The methods that an algorithm needs in addition in a run with prior data"""
+"""The methods that an algorithm needs in addition in a run with prior data."""
 
 NOT_SETTINGS = {"config", "preset", "resume", "log_json", "debug", "progress"}
-"""Flags and arguments of `millrace train` and `millrace.train` that are not settings"""
+"""Flags and arguments of `millrace train` and `millrace.train` that are not settings."""
 
 _given: dict[str, type] = {}
-"""The classes that were passed in Python and can't be imported, by name. The newest one of a name counts."""
+"""The classes that were passed in Python and can't be imported, by name. If several had the same name, the newest."""
 
 
 def is_own(algo: str) -> bool:
@@ -59,7 +59,7 @@ def is_own(algo: str) -> bool:
 
 
 def settings_record(algo: str) -> type[AlgorithmConfig]:
-    """The record of this algorithm's settings. Raises `UsageError`, in one line, if there is no such algorithm."""
+    """The class of an algorithm's settings. Raises `UsageError`, with a one-line message, if there is no such algorithm."""
     if algo in HYPERPARAMETERS:
         return HYPERPARAMETERS[algo]
     if not is_own(algo):
@@ -70,12 +70,12 @@ def settings_record(algo: str) -> type[AlgorithmConfig]:
 
 
 def own_class(name: str) -> Any:
-    """The user-defined class of this name. Imports its module. Raises `UsageError` if it isn't there, or lacks something."""
+    """The user-defined class of this name. Imports its module. Raises `UsageError` if it isn't found or lacks something."""
     return _checked(name, _given[name] if name in _given else _found(name))
 
 
 def name_of(algorithm: type) -> str:
-    """The name of a class, for `Config.algo`. This process finds the class by it, and so do others if they can import it.
+    """The name of a class, for `Config.algo`. By it, this process finds the class, and so do others that can import it.
 
     Raises `UsageError` if the class lacks something.
     """
@@ -88,7 +88,7 @@ def name_of(algorithm: type) -> str:
     spec = getattr(main, "__spec__", None)
     in_main = module == "__main__" and attribute(main, qualname) is algorithm
     name = (
-        f"{spec.name if spec is not None and in_main else module}:{qualname}"  # `python -m mine`: others import it as mine
+        f"{spec.name if spec is not None and in_main else module}:{qualname}"  # after `python -m mine`, others import mine
     )
     _given.pop(name, None)
     if module == "__main__" or attribute(sys.modules.get(module), qualname) is not algorithm or not importable(module):
@@ -98,7 +98,7 @@ def name_of(algorithm: type) -> str:
 
 
 def moved(before: str, now: str) -> bool:
-    """Whether a run of the algorithm `before` may continue as one of `now`: the same class, which can be imported now."""
+    """Whether a run of the algorithm `before` may continue with `now`: the same class, moved to where it can be imported."""
     module, _, qualname = before.partition(":")
     return (module == "__main__" or "<locals>" in qualname) and is_own(now) and last_part(before) == last_part(now)
 
@@ -133,7 +133,7 @@ def _found(name: str) -> object:
 
 
 def _checked(name: str, named: object) -> Any:
-    """The class, if it has what the learner needs. Raises `UsageError` that names what is missing or wrong."""
+    """The class `named`, if the learner can use it. Otherwise raises `UsageError` that names what is missing or wrong."""
     if not isinstance(named, type):
         raise UsageError(f"algo {name}: expected a class, got {type(named).__name__}")
     if why := _what_is_wrong(named):
@@ -143,7 +143,7 @@ def _checked(name: str, named: object) -> Any:
 
 @cache
 def _what_is_wrong(algorithm: type) -> str:
-    """One line about what an algorithm lacks; empty if it can be used."""
+    """One line that says what is missing or wrong in an algorithm; empty if it can be used."""
     unwritten: frozenset[str] = getattr(algorithm, "__abstractmethods__", frozenset())
     missing = [name for name in NEEDED if name in unwritten or getattr(algorithm, name, None) in (None, object.__init__)]
     if not hasattr(algorithm, "whole_episodes"):

@@ -1,4 +1,4 @@
-"""The command line of `millrace train` and `millrace learner`: all settings of a run, and where their defaults come from."""
+"""The command line of `millrace train` and `millrace learner`: flags for all settings, and for the source of defaults."""
 
 from __future__ import annotations
 
@@ -56,9 +56,9 @@ GROUPS = {
         "log_json",
     ),
 }  # fmt: skip
-"""The settings of each group, by its title. `BASIC` and the settings of the algorithm precede them."""
+"""The settings of each group of the help, by its title. `BASIC` and the settings of the algorithm precede the groups."""
 LAYERS = ("config", "preset", "resume", "log_json")
-"""Flags that aren't settings: they say where settings come from, or how logs look."""
+"""Flags that aren't settings. They say where settings come from, or how logs look."""
 DESCRIPTIONS = {
     "train": "Train a policy on this machine. Flags override --config and presets.",
     "learner": "Listen at --bind and train with the workers that connect. Flags override --config and presets.",
@@ -89,7 +89,7 @@ def read_config(command: str, argv: list[str]) -> tuple[Config, Path | None]:
 
 
 def _read_flags(command: str, argv: list[str], typed: list[Typed], lower: LowerLayers) -> Config:
-    """The settings: the flags on top of the other layers. The algorithm that these layers name decides which flags exist."""
+    """The settings from the flags on top of the lower layers. The algorithm that these layers name adds its own flags."""
     own = fields_of(settings_record(lower.algo))
     fields = fields_of(RunFlags) | own
     given = given_values(fields, typed, command, partial(in_place_of, known=fields, flag=True))

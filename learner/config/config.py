@@ -1,9 +1,9 @@
 """All settings of a run, in one record. The texts under the fields are the help of the command line. Pure.
 
 This file has the settings of learning. The base, `RolloutConfig` (learner/config/rollout_config.py), has the settings of
-collecting rollouts: the environment, workers, env copies, lanes, timeouts and the transport. How the settings of a run are
-put together from presets, files and flags: learner/config/layers.py. The groups that `--help` shows: `GROUPS` in
-learner/config/command_line.py.
+collecting rollouts: the environment, workers, env copies, lanes, timeouts and the transport. learner/config/layers.py merges
+the settings of a run from presets, files and flags. `GROUPS` in learner/config/command_line.py lists the groups that
+`--help` shows.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from millrace.learner.config.resume_rules import Fixed, Free
 from millrace.learner.config.rollout_config import RolloutConfig
 from millrace.protocol.bounds import MAX_SEEDS, Count, Natural
 
-TABLES = ("env_kwargs", "eval_env_kwargs")  # settings that are tables: layers are merged key by key
+TABLES = ("env_kwargs", "eval_env_kwargs")  # settings that are tables, which layers merge key by key
 PRESETS = Path(__file__).with_name("presets.toml")
 
 

@@ -1,6 +1,6 @@
-"""Warnings, before a run starts, about what will take much time. Pure: settings and shapes in, a line out.
+"""Warnings, before a run starts, about settings that will take much time. Pure functions of settings and shapes.
 
-Rule: a line gives the cost and how to reduce it. It is empty if the cost is usual.
+Rule: a warning is one line that gives the cost and how to reduce it. It is empty if the cost is not unusual.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from millrace.protocol.envs.description import DescribedEnv, class_name
 from millrace.protocol.policy.arithmetic import multiply_adds
 from millrace.protocol.specs import PolicySpec
 
-MANY_MULTIPLY_ADDS = 1 << 24  # of one observation; Atari's four frames of 84 x 84 take half of it
-PASSES = 3  # a backward pass costs twice as much as the forward pass
+MANY_MULTIPLY_ADDS = 1 << 24  # per observation; Atari's four frames of 84 x 84 take half as many
+PASSES = 3  # cost of a forward and a backward pass, in forward passes: a backward pass costs two
 
 
 def minibatch_rows(config: Config) -> int:
-    """Number of rows of a minibatch: all rows of an update if no setting divides them into minibatches."""
+    """The number of rows in a minibatch: all rows of an update, if no setting divides them into minibatches."""
     batch_size = getattr(config.algorithm, "batch_size", None)
     if isinstance(batch_size, int):
         return batch_size
@@ -29,7 +29,7 @@ def minibatch_rows(config: Config) -> int:
 
 
 def large_observations(config: Config, policy: PolicySpec) -> str:
-    """What a minibatch costs, if an observation is large."""
+    """A warning about the cost of a minibatch, if observations are large; otherwise empty."""
     if (of_one := multiply_adds(policy)) < MANY_MULTIPLY_ADDS:
         return ""
     numbers = sum(math.prod(leaf.shape) for leaf in policy.observation)
@@ -47,7 +47,7 @@ def large_observations(config: Config, policy: PolicySpec) -> str:
 
 
 def endless_evaluations(config: Config, evaluation: DescribedEnv) -> str:
-    """How long an evaluation during training may take, if nothing limits the episodes of its environment."""
+    """A warning about how long an evaluation may take, if nothing limits the episodes of its environment."""
     limited = evaluation.max_episode_steps is not None or class_name(TimeLimit) in evaluation.wrappers
     if limited or not (config.eval_every or config.eval_episodes):
         return ""

@@ -1,4 +1,4 @@
-"""How large an evaluation is, by settings and numbers. Pure."""
+"""How many episodes and env steps an evaluation has. Pure."""
 
 from __future__ import annotations
 
@@ -6,17 +6,17 @@ from typing import NamedTuple
 
 from millrace.learner.config.config import Config
 
-MOST_EPISODES = 100  # of an evaluation whose number of episodes is not set
+MOST_EPISODES = 100  # the most episodes of an evaluation, unless the settings give a number
 FEWEST_EPISODES = 10
-LONGEST_EPISODE = 10  # times the mean episode length of training: there episodes are cut if there is no time limit
+LONGEST_EPISODE = 10  # without a time limit, episodes are cut at this many times the mean length of training episodes
 
 
 class EvaluationSize(NamedTuple):
-    """How large one evaluation is."""
+    """The size of one evaluation."""
 
     episodes: int
     max_steps: int
-    """largest number of env steps, of all episodes together"""
+    """the largest number of env steps, summed over all episodes"""
 
 
 def evaluation_size(config: Config) -> EvaluationSize:
@@ -29,9 +29,10 @@ def final_evaluation_size(
 ) -> EvaluationSize:
     """The size of the evaluation after training.
 
-    `env_steps`: number of env steps of the training. `episode_length`: mean length of its last episodes, in env steps; None
-    if none has ended. `time_limit`: number of env steps after which the environment truncates an episode of an evaluation,
-    if it does. The size depends on these counts, and not on seconds, so that the result of a run is always the same.
+    `env_steps` is the number of env steps of the training. `episode_length` is the mean length of its last episodes, in env
+    steps, or None if none has ended. `time_limit` is the number of env steps after which the environment truncates an
+    evaluation episode, or None if it doesn't. The size depends on these counts, and not on seconds, so that a repeated run
+    gives the same result.
     """
     if config.eval_episodes is not None or config.eval_every:
         return evaluation_size(config)
@@ -43,5 +44,5 @@ def final_evaluation_size(
     episodes = min(max(int(budget / max(length, 1.0)), FEWEST_EPISODES), MOST_EPISODES)
     if time_limit is not None:
         return EvaluationSize(episodes, most)
-    # An episode of a greedy policy may never end, even if those of training did.
+    # An episode of the greedy policy may never end, even if all training episodes did.
     return EvaluationSize(episodes, min(most, max(budget, int(LONGEST_EPISODE * episodes * length))))

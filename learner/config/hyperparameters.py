@@ -1,7 +1,7 @@
 """The settings (hyperparameters) of each algorithm. The texts under the fields are the help of the command line.
 
-Plain data, separate from the algorithms, so that reading a command line needs no torch. Your own algorithm has its record in
-its attribute `Config` (learner/config/algorithm_names.py).
+They are plain data, separate from the algorithms, so that reading a command line needs no torch. Your own algorithm names
+its record in its attribute `Config` (learner/config/algorithm_names.py).
 """
 
 from __future__ import annotations
@@ -422,6 +422,6 @@ HYPERPARAMETERS: dict[str, type[AlgorithmConfig]] = {
 
 
 def algorithms_with(name: str) -> str:
-    """`; it is one of ALGORITHMS alone` if these algorithms have a setting of this name, else an empty string."""
+    """The end of an error that names the algorithms with a setting of this name; empty if there are none."""
     owners = [algo for algo, record in HYPERPARAMETERS.items() if name in record.__struct_fields__]
     return f"; it is one of {', '.join(owners)} alone" if owners else ""

@@ -1,9 +1,9 @@
 """The layers that a run's settings come from, merged into one record. Pure except for reading TOML files.
 
-From the weakest to the strongest: the defaults of the records, the preset of (algorithm, environment), a named preset, a
-TOML file, flags or keyword arguments. A setting has one name everywhere: the field `learning_rate` is the TOML key
-`learning_rate` and the flag `--learning-rate`. The settings of the algorithm are in a TOML table named after it, such as
-[ppo].
+The layers are, from the weakest to the strongest: the defaults of the records, the preset of (algorithm, environment), a
+named preset, a TOML file, and flags or keyword arguments. A setting has one name everywhere: the field `learning_rate` is
+the TOML key `learning_rate` and the flag `--learning-rate`. The settings of the algorithm are in a TOML table named after
+it, such as [ppo].
 
 Rule: a layer is a dictionary that knows its source. Layers are merged as dictionaries and converted to a record once, so
 that each value is checked once, and an error names the layer that the value comes from.
@@ -38,7 +38,7 @@ class SettingsLayer(NamedTuple):
     """Settings from one source: those of the run and of its algorithm side by side."""
 
     where: str
-    """how an error begins: a file, `preset NAME`, `train`; empty for flags, which their names show"""
+    """how an error begins: a file, `preset NAME` or `train`; empty for flags, which are recognized by their names"""
     settings: Mapping[str, Any]
 
     def origin(self, field: FlagField) -> str:
@@ -54,7 +54,7 @@ NOTHING = SettingsLayer("", {})
 
 
 class LowerLayers(NamedTuple):
-    """The layers below flags and keyword arguments, as they were read, and the algorithm that all layers together name."""
+    """The layers below flags and keyword arguments, as they were read, and the algorithm that results from all layers."""
 
     algo: str
     preset: str
@@ -63,19 +63,22 @@ class LowerLayers(NamedTuple):
     resume: Path | None
 
     def below(self, given: SettingsLayer) -> list[SettingsLayer]:
-        """The layers below the given one, which may name the environment. Raises `UsageError`."""
+        """The layers below `given`, the flags or keyword arguments, which may name the environment.
+
+        Raises `UsageError` if a resumed run has another environment, or if there is no such preset.
+        """
         env = str(given.settings.get("env", ""))
         if self.resume is not None and env and not moved(str(self.file.settings.get("env")), env):
             found = self.file.settings.get("env")
             raise UsageError(f"run {self.resume} is of {found}, not of {env}; resume it without naming an environment")
         env = env or str(self.file.settings.get("env", self.named.settings.get("env", "")))
         layers = [self._of_environment(env), self.named]
-        if self.file.settings.keys() >= ALL_BUT_TABLES:  # those of a whole run: its tables are whole, too
+        if self.file.settings.keys() >= ALL_BUT_TABLES:  # the file holds a whole run, so its tables are complete, too
             layers = [layer.without_tables() for layer in layers]
         return [*layers, self.file]
 
     def _of_environment(self, env: str) -> SettingsLayer:
-        """The preset of this algorithm and environment, or of the environment that --preset names."""
+        """The preset of this algorithm for this environment, or for the environment that --preset names."""
         if self.preset == "none":
             return NOTHING
         presets = environment_presets(self.algo)
@@ -94,9 +97,9 @@ def resolve(
 
     Raises `UsageError`, with a one-line message, if a setting or a file is not valid.
 
-    `file`: a TOML file of settings. `resume`: a run folder; its config.toml replaces file and preset. `preset`: "auto" (the
-    environment's preset, if there is one), "none", the environment whose preset to take, or the name of a whole run. `algo`
-    may be a class (`algorithm_names.name_of`).
+    `file` is a TOML file of settings. `resume` is a run folder, whose config.toml replaces file and preset. `preset` is
+    "auto" (the environment's preset, if there is one), "none", the environment whose preset to use, or the name of a whole
+    run. `algo` may be a class (`algorithm_names.name_of`).
     """
     if isinstance(algo := keywords.get("algo", ""), type):
         keywords["algo"] = name_of(algo)
@@ -109,24 +112,27 @@ def resolve(
 
 
 def config_from_toml(text: str, where: str = "config.toml") -> Config:
-    """The settings that `Config.to_toml` wrote, over the defaults (no preset). Raises `UsageError`.
+    """Read settings that `Config.to_toml` wrote. Missing ones get their defaults; no preset is used.
 
-    `where`: the file's name for error messages.
+    `where` is the file's name for error messages. Raises `UsageError` if the text or a setting is not valid.
     """
     return settings_of_run(_file_alone(parse_toml(text, where), where), NOTHING)
 
 
 def config_of_run(run: Path, algo: str | None = None) -> Config:
-    """The settings of a run folder, from its config.toml. Raises `UsageError`.
+    """The settings of a run folder, from its config.toml. Raises `UsageError` if they are not valid.
 
-    `algo`: the current name of its algorithm, if it may have changed (`algorithm_names.moved`).
+    `algo` is the current name of its algorithm, if it may have changed (`algorithm_names.moved`).
     """
     table = with_algorithm(read_config(run), algo)
     return settings_of_run(_file_alone(table, str(run / CONFIG_FILE)), NOTHING)
 
 
 def read_lower_layers(algo: str | None, *, file: Path | None, resume: Path | None, preset: str) -> LowerLayers:
-    """Read the named preset and the file. `algo`: the algorithm that was given, if any. Raises `UsageError`."""
+    """Read the named preset and the file. `algo` is the algorithm that flags or keyword arguments name, if they do.
+
+    Raises `UsageError` if the arguments exclude each other, or if a file cannot be read.
+    """
     if resume is not None:
         if file is not None:
             raise UsageError(f"a config file ({file}) or a run to resume ({resume}): expected one, got both")
@@ -148,13 +154,13 @@ def read_lower_layers(algo: str | None, *, file: Path | None, resume: Path | Non
 
 
 def _file_alone(table: dict[str, Any], where: str) -> LowerLayers:
-    """A file over the defaults, without a preset."""
+    """The layers of a file on top of the defaults, without a preset."""
     algo = _algorithm_of_file(table, where)
     return LowerLayers(algo, "none", NOTHING, _layer_of_file(table, algo, where), None)
 
 
 def settings_of_run(lower: LowerLayers, given: SettingsLayer) -> Config:
-    """The settings of a run. Raises `UsageError`."""
+    """The settings of a run: `given` on top of the lower layers. Raises `UsageError` if they are not valid together."""
     below = lower.below(given)
     config = merged(lower.algo, [*below, given])
     try:
@@ -167,9 +173,10 @@ def settings_of_run(lower: LowerLayers, given: SettingsLayer) -> Config:
 
 
 def merged(algo: str, layers: Sequence[SettingsLayer]) -> Config:
-    """The record of these layers, from the weakest to the strongest. Each setting is checked by itself. Raises `UsageError`.
+    """Merge these layers, from the weakest to the strongest, into one record.
 
-    `env_kwargs` and `eval_env_kwargs` are merged entry by entry.
+    Each setting is checked by itself; raises `UsageError` for the first that is unknown or not valid. `env_kwargs` and
+    `eval_env_kwargs` are merged entry by entry.
     """
     record = settings_record(algo)
     fields = fields_of(Config) | fields_of(record)
@@ -187,7 +194,7 @@ def merged(algo: str, layers: Sequence[SettingsLayer]) -> Config:
                 check_table(plain, origins[name])
                 plain = {**values.get(name, {}), **plain}
             values[name] = plain
-    values["algo"] = algo  # a layer may have named another one, which a stronger one replaced
+    values["algo"] = algo  # a layer may name another algorithm than the one that counts
     of_algorithm = {name: values.pop(name) for name in record.__struct_fields__ if name in values}
     algorithm = convert(of_algorithm, record, origins)
     config = convert(values, Config, origins)
@@ -206,7 +213,7 @@ def _plain(field: FlagField, value: Any) -> Any:
 
 
 def _algorithm_of_file(table: Mapping[str, Any], where: str) -> str:
-    """The algorithm that a file names. Raises `UsageError`."""
+    """The algorithm that a file names, or ppo. Raises `UsageError` if there is no such algorithm."""
     algo = str(table.get("algo", "ppo"))
     try:
         settings_record(algo)
@@ -216,7 +223,7 @@ def _algorithm_of_file(table: Mapping[str, Any], where: str) -> str:
 
 
 def _is_wrong_alone(algo: str, layers: Sequence[SettingsLayer], why: UsageError) -> bool:
-    """Whether the lower layers alone, without the given settings, cause this error."""
+    """Whether these lower layers alone, without the flags or keyword arguments, cause the same error."""
     try:
         validate(merged(algo, layers))
     except UsageError as error:
@@ -227,7 +234,7 @@ def _is_wrong_alone(algo: str, layers: Sequence[SettingsLayer], why: UsageError)
 def _layer_of_file(table: dict[str, Any], algo: str, where: str) -> SettingsLayer:
     """The settings of a TOML file for this algorithm.
 
-    Tables of other algorithms are left out: one file can hold those of several.
+    Tables of other algorithms are left out, because one file may hold the tables of several.
     """
     of_run = {name: value for name, value in table.items() if name not in HYPERPARAMETERS and not is_own(name)}
     of_algorithm = table.get(algo, {})

@@ -1,7 +1,7 @@
-"""How many worker processes a run starts on this machine, and whether its lanes keep them busy. Pure, except for its cores.
+"""How many worker processes a run starts on this machine, and whether its lanes keep them busy.
 
-Rule: results don't depend on the number of workers, so it may be chosen for the machine. A number of lanes would change
-results, so a better one is only named.
+Rule: results don't depend on the number of workers, so it may be chosen to suit the machine. They do depend on the number of
+lanes, so a better number of lanes is only suggested. Pure, except for counting this machine's cores.
 """
 
 from __future__ import annotations
@@ -11,10 +11,10 @@ from millrace.protocol.machine.cpu_cores import usable_cores
 
 
 def local_workers(config: RolloutConfig, cores: int | None = None) -> int:
-    """The number of worker processes. Unless the settings name one, as many as cores, lanes permitting.
+    """The number of worker processes. Unless the settings give it, one for each core, but at most one for each lane.
 
-    Fewer if these are as fast: with 4 lanes, 3 workers are as fast as 2, because one of them steps two lanes. `cores`: None
-    for those that this process may use.
+    It is lower if fewer workers are as fast: with 4 lanes, 2 workers are as fast as 3, one of which would step two lanes.
+    `cores` is the number of cores; None means all that this process may use.
     """
     if config.workers is not None:
         return config.workers
@@ -23,12 +23,12 @@ def local_workers(config: RolloutConfig, cores: int | None = None) -> int:
 
 
 def _as_fast(lanes: int, workers: int) -> int:
-    """The least number of workers that has no more lanes for each of them than so many have."""
+    """The least number of workers at which none steps more lanes than with `workers` workers."""
     return -(-lanes // -(-lanes // workers))
 
 
 def chosen_workers(config: RolloutConfig, cores: int) -> str:
-    """A clause for the user about a number of workers that was chosen; empty if the settings name one."""
+    """A clause that tells the user how many workers were chosen, and why; empty if the settings give the number."""
     if config.workers is not None:
         return ""
     workers = local_workers(config, cores)
@@ -43,7 +43,7 @@ def chosen_workers(config: RolloutConfig, cores: int) -> str:
 
 
 def uneven_lanes(config: RolloutConfig) -> str:
-    """A line for the user if the number of workers that the settings name doesn't divide the lanes; else empty."""
+    """A line for the user if the number of workers in the settings doesn't divide the number of lanes; otherwise empty."""
     workers = config.workers
     if workers is None or config.lanes % workers == 0:
         return ""
@@ -65,6 +65,6 @@ def uneven_lanes(config: RolloutConfig) -> str:
 
 
 def _envs(config: RolloutConfig, lanes: int) -> str:
-    """The flag that goes with so many lanes, if the number of env copies isn't a multiple."""
+    """The `--envs` flag to use with this many lanes, if the number of env copies isn't a multiple of them; else empty."""
     envs = -(-config.envs // lanes) * lanes
     return f" --envs {envs}" if envs != config.envs else ""

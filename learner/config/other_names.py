@@ -1,6 +1,6 @@
-"""The names of other libraries that users most often type here, and our names for them. Pure.
+"""Names of settings in other libraries that users often type here, and the names that millrace uses. Pure.
 
-Rule: each takes the same values as our setting. docs/how-to/moving_from.md has the other names.
+Rule: a setting is listed here only if its values mean the same in millrace. docs/how-to/moving_from.md has other names.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ OUR_NAME = {
 
 
 def in_place_of(name: str, known: Collection[str], *, flag: bool = False) -> str:
-    """The end of an error about a name that isn't a setting of this run: what to write instead; empty if that isn't known.
+    """The end of an error about an unknown setting `name`: which name to use instead; empty if that isn't known.
 
-    `known`: the settings of this run. `flag`: the name was given as a flag, not as a keyword argument.
+    `known` are the settings of this run. `flag` says that the name was given as a flag, not as a keyword argument.
     """
     if name not in OUR_NAME:
         return algorithms_with(name)

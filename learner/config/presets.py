@@ -1,4 +1,4 @@
-"""Presets: settings that are known to work, by algorithm and environment, and whole runs by name (presets.toml)."""
+"""Presets (presets.toml): settings that are known to work for an algorithm and an environment, and named whole runs."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ if TYPE_CHECKING:
     from millrace.learner.config.config import Config
 
 PRESETS = Path(__file__).with_name("presets.toml")
-NAMED = "named"  # the table of presets.toml that holds whole runs
+NAMED = "named"  # the table of presets.toml that holds the whole runs
 
 
 class Preset(NamedTuple):
     """A whole run by name: environment, algorithm and settings."""
 
     about: str
-    """one line for `millrace presets`"""
+    """the line that `millrace presets` shows"""
     settings: dict[str, Any]
 
 
@@ -46,22 +46,22 @@ def algorithms_and_environments() -> list[tuple[str, str]]:
 
 
 def environment_name(env: str, env_kwargs: Mapping[str, Any], algo: str) -> str:
-    """The environment's id, with the keyword arguments that its preset does not set: `millrace/Atari-v0 game Pong`."""
+    """The environment's id and the keyword arguments that differ from its preset, such as `millrace/Atari-v0 game Pong`."""
     preset: dict[str, Any] = environment_presets(algo).get(env, {}).get("env_kwargs", {})
     return " ".join([env, *map(shlex.quote, added(env_kwargs, preset))])
 
 
 def added(table: Mapping[str, object], default: Mapping[str, object]) -> list[str]:
-    """Names and values of the table's entries that its default doesn't have, as the words of a flag."""
+    """The entries of a table that differ from its default: names and values in turn, as the words of a flag."""
     return [word for key, value in table.items() if default.get(key) != value for word in (key, written(value))]
 
 
 def origin(config: Config) -> str:
     """Where the settings of a new run come from, as one line for the user.
 
-    The preset counts as used if a setting has its value and this isn't the default. Without a preset, the line names the
-    settings of the algorithm that differ from the defaults: they were given, or come from a file or the preset of another
-    environment.
+    The preset counts as used if some setting has the preset's value and this differs from the default. Without a preset, the
+    line names the settings of the algorithm that differ from the defaults; these were given by the user, or come from a file
+    or from the preset of another environment.
     """
     preset = environment_presets(config.algo).get(config.env)
     mine = _settings(config)
@@ -78,7 +78,7 @@ def origin(config: Config) -> str:
 
 
 def _agrees(mine: Any, preset: Any) -> bool:
-    """Whether a setting has the preset's value; a table, whether it has all of the preset's entries."""
+    """Whether a setting has the preset's value. A table agrees if it has all of the preset's entries."""
     return mine | preset == mine if isinstance(preset, dict) else bool(mine == preset)
 
 

@@ -1,8 +1,8 @@
 """Whether a resumed run may change a setting: each field is declared free, adaptable or fixed. Pure.
 
-Rule: a setting is fixed if another value would give the saved weights or the saved state another meaning. `Config` and the
-records of hyperparameters declare each field as `Free[...]`, `Adaptable[...]` or `Fixed[...]`. A resumed run keeps the
-settings in its config.toml, except those that you give; another value of a fixed one is refused.
+Rule: a setting is fixed if another value would change the meaning of the saved weights or of the saved state. `Config` and
+the records of hyperparameters declare each field as `Free[...]`, `Adaptable[...]` or `Fixed[...]`. A resumed run keeps the
+settings in its config.toml, except those that you change; changing a fixed setting is refused.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import msgspec
 
 
 class OnResume(Enum):
-    """What a resumed run does with another value of a setting. A member's value is its meaning, for the documentation."""
+    """What a resumed run does if a setting gets another value. The value of each member is its text in the documentation."""
 
     FREE = "Another value takes effect at once."
     ADAPTABLE = "Another value takes effect at once. Lanes whose number of env copies changes begin new episodes."
@@ -31,7 +31,7 @@ Fixed = Annotated[Setting, OnResume.FIXED]
 
 
 class Change(NamedTuple):
-    """A setting that is given with a value that differs from the run's."""
+    """A setting that was given another value than the run has."""
 
     name: str
     on_resume: OnResume
@@ -42,20 +42,20 @@ class Change(NamedTuple):
 
 @cache
 def declared(record: type[msgspec.Struct], *, by_type: bool = False) -> dict[str, OnResume]:
-    """What a resumed run does with each setting of a record, in the order of its fields.
+    """What a resumed run does if each setting of a record changes, in the order of its fields.
 
-    `by_type`: a field of a user-defined record need not declare it. Then a float is free, because it is usually a
-    coefficient, and anything else is fixed, because the shape of the weights or of the saved state may depend on it. A field
-    that overrides a field of a base class keeps that field's declaration.
+    With `by_type`, for user-defined records, a field need not be declared. An undeclared float is free, because it is
+    usually a coefficient; any other field is fixed, because the shape of the weights or of the saved state may depend on
+    it. A field that overrides a field of a base class keeps that field's declaration.
 
-    Raises TypeError for a field that does not declare it exactly once, and NameError for a type that cannot be found.
+    Raises TypeError for a field with no declaration or with several, and NameError for a type that cannot be found.
     """
     hints = get_type_hints(record, include_extras=True)
     return {name: _declaration(record, name, hints[name], by_type) for name in record.__struct_fields__}
 
 
 def changes(run: msgspec.Struct, given: msgspec.Struct) -> Iterator[Change]:
-    """The settings that differ, in the order of the fields. Both records are of one type."""
+    """Yield the settings that differ, in the order of the fields. Both records must have the same type."""
     for name, on_resume in declared(type(run), by_type=True).items():
         before = getattr(run, name)
         now = getattr(given, name)
@@ -64,7 +64,7 @@ def changes(run: msgspec.Struct, given: msgspec.Struct) -> Iterator[Change]:
 
 
 def refusal(changed: list[Change]) -> str:
-    """The fixed ones of these settings and their values, as text in one line; empty if there are none."""
+    """One line of text with the changed settings that are fixed, and their values; empty if there are none."""
     fixed = [change for change in changed if change.on_resume is OnResume.FIXED]
     return "; ".join(
         f"{one.name}: expected {_shown(one.run)} as in its config.toml, got {_shown(one.given)}" for one in fixed
@@ -85,7 +85,7 @@ def _declaration(record: type[msgspec.Struct], name: str, hint: Any, by_type: bo
 
 
 def _is_float(hint: Any) -> bool:
-    """Whether a type is float, or float or None, perhaps with bounds."""
+    """Whether a type is `float` or `float | None`, with or without bounds."""
     hint = get_args(hint)[0] if get_origin(hint) is Annotated else hint
     options = [option for option in get_args(hint) if option is not NoneType]
     return hint is float or (bool(options) and all(map(_is_float, options)))

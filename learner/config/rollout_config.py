@@ -1,4 +1,4 @@
-"""The settings of collecting rollouts: which environment, how many env copies, which workers, when to give up. Pure.
+"""The settings of collecting rollouts, such as the environment, the env copies, the workers and the timeouts. Pure.
 
 A training run has these settings and those of `Config`. A `RolloutService` for your own training loop has only these.
 """
@@ -172,7 +172,7 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     """
 
     def all_wrappers(self, given: Sequence[WrapperLike] | None = None) -> list[WrapperLike]:
-        """The wrappers of every env copy: `wrappers`, or the given ones instead, and those that other settings need."""
+        """The wrappers of every env copy: `given`, or `wrappers` if it is None, and then those that other settings need."""
         return [
             *(self.wrappers if given is None else given),
             *([SEAT_ID] if self.seat_id else []),
@@ -180,17 +180,17 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
         ]
 
     def call_timeouts(self) -> CallTimeouts:
-        """How long a call of an env copy may take."""
+        """How long one call of an env copy may take."""
         return CallTimeouts(self.start_timeout_s, self.step_timeout_s)
 
     def most_repeated_steps(self) -> int:
-        """The longest episode that is replayed, in steps; -1: none is."""
+        """The length, in steps, of the longest episode that is replayed; -1 if none is."""
         return self.replay_limit if self.lost_lanes == "continue" else -1
 
     def stall_timeout_s(self) -> float:
-        """The run ends if no env step, reset or construction has ended for this long, which is longer than each may take."""
+        """The run ends if no env step, reset or construction finishes for this many seconds, which no single one may take."""
         return max(STALL_TIMEOUT_S, self.call_timeouts().longest_s())
 
     def heartbeat_s(self) -> float:
-        """Seconds between two heartbeats of a worker: often enough that it doesn't count as silent if some are late."""
+        """Seconds between two heartbeats of a worker: so few that it doesn't count as silent if some arrive late."""
         return min(HEARTBEAT_S, self.worker_timeout_s / 5)

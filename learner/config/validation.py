@@ -1,4 +1,4 @@
-"""Checks of settings that types can't make. Each error is one line: setting, what was expected, what was given. Pure."""
+"""Checks of settings that types can't express. Each error is one line: the setting, what was expected, what was given."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from millrace.protocol.envs.wrappers import wrapper_name
 from millrace.protocol.errors import UsageError, safe_repr
 from millrace.protocol.own_module import is_name
 
-MOST_TICKETS = 1 << 15  # outstanding ones: one worker may get them all, in one message
-LARGEST_SEED = 2**64 - 1  # that PyTorch accepts
+MOST_TICKETS = 1 << 15  # the most outstanding tickets, because one worker may get them all in one message
+LARGEST_SEED = 2**64 - 1  # the largest seed that PyTorch accepts
 
 
 def validate(config: Config) -> None:
@@ -50,7 +50,7 @@ def validate(config: Config) -> None:
 def check_table(value: object, origin: str) -> None:
     """Raise `UsageError` unless this is a table of arguments that a message can carry.
 
-    `origin`: how an error refers to it.
+    `origin` is how an error refers to the setting.
     """
     if not isinstance(value, Mapping):
         raise UsageError(f"{origin}: expected table, got {value!r:.60}")
@@ -58,8 +58,11 @@ def check_table(value: object, origin: str) -> None:
 
 
 def check_text(name: str, value: object, origin: str) -> None:
-    """Raise `UsageError` for a text that files and messages can't hold: a command line may contain any bytes."""
-    if name == "run_dir":  # the check of the folder says what to do
+    """Raise `UsageError` for text that isn't valid UTF-8, which files and messages can't hold.
+
+    A command line may contain any bytes. `origin` is how an error refers to the setting.
+    """
+    if name == "run_dir":  # left to the check of the folder, whose error says what to do
         return
     for text in value if isinstance(value, tuple | list) else (value,):
         if isinstance(text, str) and any("\ud800" <= character <= "\udfff" for character in text):
@@ -69,7 +72,7 @@ def check_text(name: str, value: object, origin: str) -> None:
 def check_numbers(record: msgspec.Struct, origins: Mapping[str, str]) -> None:
     """Raise `UsageError` for NaN, and for a whole number that is too large for a message.
 
-    `origins`: how an error refers to a given setting.
+    `origins` says how an error refers to each setting that was given.
     """
     for name, value in msgspec.structs.asdict(record).items():
         most = LARGEST_SEED if name == "seed" else LARGEST
@@ -81,8 +84,12 @@ def check_numbers(record: msgspec.Struct, origins: Mapping[str, str]) -> None:
 
 
 def check_copies(config: Config, limit: str, most: int) -> None:
-    """Raise `UsageError` if `most` env copies (0: any number) are too few for the run. `limit`: what sets this number."""
-    # Each worker that evaluates keeps its copies. There is one, or the eval_workers and one that evaluates if they are lost.
+    """Raise `UsageError` if `most` env copies (0 for any number) are too few for the run.
+
+    `limit` names the setting or the variable that gives the number.
+    """
+    # Each worker that evaluates keeps its env copies. There is one such worker, or there are the eval_workers and one more
+    # worker, which evaluates if those are lost.
     evaluate = min(config.eval_copies, evaluation_size(config).episodes) * (config.eval_workers + 1)
     if 0 < most < config.envs + evaluate:
         raise UsageError(
@@ -94,7 +101,7 @@ def check_copies(config: Config, limit: str, most: int) -> None:
 def workers_to_wait_for(config: RolloutConfig, local: int | None) -> int:
     """How many workers must have joined before collection starts. Raises `UsageError` if that many can't join.
 
-    `local`: number of workers that this machine starts, if no other worker can join; None: workers are started elsewhere.
+    `local` is the number of workers that this machine starts, if no others can join; None if workers start elsewhere.
     """
     if local is None:
         return config.min_workers or 1
@@ -107,7 +114,7 @@ def workers_to_wait_for(config: RolloutConfig, local: int | None) -> int:
 
 
 def unused_setting(config: Config) -> str:
-    """A line for the user if a setting of evaluations during training has no effect, because there are none; else empty."""
+    """A line for the user if a setting needs evaluations during training, and there are none; otherwise empty."""
     if config.eval_every:
         return ""
     if config.eval_workers:
@@ -118,7 +125,7 @@ def unused_setting(config: Config) -> str:
 
 
 def convert_rollout_settings(settings: dict[str, Any], where: str) -> RolloutConfig:
-    """The record of these settings, checked. Raises `UsageError`. `where` begins the message."""
+    """The record of these settings. Raises `UsageError`, whose message begins with `where`, if they are not valid."""
     origins = {name: f"{where}: {name}" for name in settings}
     for name, value in settings.items():
         check_text(name, value, origins[name])
@@ -177,7 +184,7 @@ def check_rollout_settings(config: RolloutConfig) -> None:
 
 
 def _check_env_arguments(config: Config) -> None:
-    """Raise `UsageError` for a number that policy.json, which names the environment with its arguments, cannot hold."""
+    """Raise `UsageError` for an infinite number or NaN among the environment's arguments, which policy.json can't hold."""
     for table in TABLES:
         for name, value in getattr(config, table).items():
             if isinstance(value, float) and not math.isfinite(value):

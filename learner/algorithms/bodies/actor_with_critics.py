@@ -1,8 +1,8 @@
-"""An actor and K critics as `StackedMLPs`: what `ActorAndCritics` is to SAC, for critics of any form, and its encoder.
+"""An encoder, an actor and K critics as `StackedMLPs`. It stands in for SAC's `ActorAndCritics`, with critics of any form.
 
 Rule: where a gradient is recorded (`torch.is_grad_enabled`), the actor is being trained, so it normalizes by the statistics
-of its minibatch. Under `torch.no_grad`, and wherever critics stay constant, running statistics count. So SAC's losses hold
-for it as they are written.
+of its minibatch. Under `torch.no_grad`, and wherever critics stay constant, running statistics are used. So SAC's losses can
+use this network without a change.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from millrace.protocol.specs import PolicySpec
 
 
 class ActorWithCritics:
-    """A squashed Gaussian actor, and K critics of features and actions, whose outputs represent values."""
+    """A squashed Gaussian actor, and K critics that map features and actions to outputs that represent values."""
 
     def __init__(
         self,
@@ -37,8 +37,8 @@ class ActorWithCritics:
         device: str,
         seed: int,
     ) -> None:
-        """`values_of`: outputs of critics [K, B, O] -> values [K, B]. The initial parameters depend on `seed`."""
-        keep_freed_memory()  # a pass takes and frees arrays of half a megabyte again and again
+        """`values_of` maps outputs of the critics [K, B, O] to values [K, B]. The initial parameters depend on `seed`."""
+        keep_freed_memory()  # each pass allocates and frees arrays of half a megabyte
         generator = torch.Generator().manual_seed(torch_seed(seed, Purpose.WEIGHTS))
         fields, _ = encoder_layout(policy)
         parts = [initial(actor, generator), initial_fields(fields, generator), initial(critics, generator)]
@@ -47,9 +47,9 @@ class ActorWithCritics:
         """[A + E + C] float32: all parameters, those of the actor first, then the encoder's"""
         self.flat_grad = torch.zeros_like(self.flat)
         self.acting_size = sizes[0] + sizes[1]
-        """A + E"""
+        """A + E, the number of parameters that compute actions"""
         self.actor, self._encoder, constant_critics = torch.split(self.flat, sizes)
-        """[A] in the memory of `flat`"""
+        """[A], [E] and [C] in the memory of `flat`"""
         self.actor.grad, of_encoder, of_constant_critics = torch.split(self.flat_grad, sizes)
         self.critics = self.flat[sizes[0] :]
         """[E + C] in the memory of `flat`: the encoder, then the critics"""
@@ -63,7 +63,7 @@ class ActorWithCritics:
         self.critic_bodies = StackedMLPs(critics, trainable(constant_critics, of_constant_critics), of_critics)
         self.project()
         self.renormalizes = False
-        """whether the passes that train use batch renormalization"""
+        """whether training passes use batch renormalization"""
         self._values_of = values_of
 
     def params(self, x: Tensor, images: Sequence[Tensor] = ()) -> Tensor:
@@ -71,7 +71,7 @@ class ActorWithCritics:
         return self.actor_params(self.encode(x, images))
 
     def actor_params(self, h: Tensor) -> Tensor:
-        """The actor's means and log standard deviations [B, 2 D′] for inputs of the MLPs [B, H], before the tangent."""
+        """The actor's means and log standard deviations [B, 2 D′], before tanh, for inputs of the MLPs [B, H]."""
         if torch.is_grad_enabled():
             (out,) = self.actor_body.trained(h, renormalizes=self.renormalizes)
         else:
@@ -88,11 +88,11 @@ class ActorWithCritics:
         return self.critic_bodies.trained(torch.cat((h, action), -1), renormalizes=self.renormalizes)
 
     def minibatch_outputs(self, h: Tensor, action: Tensor) -> Tensor:
-        """Like `outputs`, with this minibatch's statistics, but without gradient or update of the running ones: targets."""
+        """Like `outputs`, but for target critics: without a gradient, and without moving the running statistics."""
         return self.critic_bodies.of_minibatch(torch.cat((h, action), -1))
 
     def values(self, h: Tensor, action: Tensor, *, constant: bool = True) -> Tensor:
-        """The values [K, B] of inputs [B, H] and actions [B, D′]. The actions get a gradient, the critics don't."""
+        """The values [K, B] of inputs [B, H] and actions [B, D′]. The actions get a gradient; the critics don't."""
         assert constant, "outputs() is what critics are trained by"
         return self._values_of(self.critic_bodies.evaluated(torch.cat((h, action), -1)))
 
@@ -102,7 +102,7 @@ class ActorWithCritics:
         self.critic_bodies.project()
 
     def acting_parameters(self) -> Floats:
-        """A copy of the parameters [P] that workers act with: those of a plain MLP, then the encoder's."""
+        """A copy of the parameters [P] with which workers act: those of a plain MLP, then those of the encoder."""
         return torch.cat((self.actor_body.folded(), self._encoder)).cpu().numpy()
 
 

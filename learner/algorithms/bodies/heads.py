@@ -1,7 +1,8 @@
-"""Critics of a distribution of returns: by quantiles (TQC, Rainbow), or by probabilities of categories (C51, XQC). Pure.
+"""Critics that predict a distribution of returns, as quantiles (TQC, Rainbow) or as category probabilities (C51, XQC). Pure.
 
-Arrays are [..., B, O]: rows, then outputs. A quantile critic's outputs are the quantiles of the fractions (2 i + 1) / 2 O; a
-categorical critic's are logits of O returns, the atoms, which are equally spaced between two bounds.
+Arrays are [..., B, O]: rows, then outputs. The outputs of a quantile critic are the quantiles at the fractions
+(2 i + 1) / 2 O. Those of a categorical critic are the logits of O returns, the atoms, which are equally spaced between two
+bounds.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from torch.nn import functional as F
 
 
 def lowest(quantiles: Tensor, kept: int) -> Tensor:
-    """The `kept` lowest [B, kept] of all quantiles [K, B, O] of K critics together, in order (Kuznetsov et al. 2020)."""
+    """The lowest quantiles [B, kept] of K critics [K, B, O], pooled, in ascending order (Kuznetsov et al. 2020)."""
     together = quantiles.transpose(0, 1).flatten(1)
     return together.sort(-1).values[:, :kept]
 
@@ -30,7 +31,7 @@ def quantile_huber(quantiles: Tensor, targets: Tensor) -> Tensor:
 
 
 class Categories:
-    """O returns, the atoms, from −bound to bound."""
+    """A categorical distribution over O equally spaced returns, the atoms, from −bound to bound."""
 
     def __init__(self, count: int, bound: float, device: str | torch.device = "cpu") -> None:
         self.bound = bound
@@ -38,14 +39,14 @@ class Categories:
         self.atoms = torch.linspace(-bound, bound, count, device=device)  # [O]
 
     def mean(self, logits: Tensor) -> Tensor:
-        """The expected returns [..., B] of logits [..., B, O]."""
+        """The expected returns [..., B] under logits [..., B, O]."""
         return logits.softmax(-1) @ self.atoms.to(logits.dtype)
 
     def shifted(self, probabilities: Tensor, reward: Tensor, discount: Tensor) -> Tensor:
-        """The distribution [B, O] of reward + discount · Z, for Z of these probabilities [B, O], on the same atoms.
+        """The distribution [B, O] of reward + discount · Z on the same atoms, where Z has these probabilities [B, O].
 
-        A return between two atoms is divided between them in proportion; one beyond the bounds counts as the bound
-        (Bellemare et al. 2017).
+        The probability of a return between two atoms is divided between them in proportion; a return beyond a bound counts
+        as the bound (Bellemare et al. 2017).
         """
         returns = reward[:, None] + discount[:, None] * self.atoms.to(reward.dtype)
         position = (returns.clamp(-self.bound, self.bound) + self.bound) / self.step

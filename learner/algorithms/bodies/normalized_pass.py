@@ -1,7 +1,7 @@
 """A pass of a whole minibatch through MLPs with batch normalization, as one node of autograd's graph.
 
 Rule: a layer's mean and variance are those of the whole minibatch, so all rows pass one layer before any row passes the
-next. That is why this pass isn't cut into chunks of rows, unlike the one of `kernels/mlp.py`.
+next. That is why this pass isn't cut into chunks of rows, unlike the pass of `kernels/mlp.py`.
 
 Arrays are [K, n, B]: K networks, n features, B rows. So a sum over the minibatch reads contiguous memory, and one call
 normalizes the features of all networks. With x̂ = (h − μ) / σ, where σ² = variance + ε, and g = ∂L/∂(γ x̂ + β): ∂L/∂β = Σ g,
@@ -20,9 +20,9 @@ from torch import Tensor
 from millrace.protocol.policy.networks import refuse_second_derivatives
 
 EPS = 1e-3
-"""ε that is added to a variance, as in CrossQ and XQC"""
+"""the ε added to each variance, as in CrossQ and XQC"""
 MOMENTUM = 0.01
-"""fraction by which running means and variances move towards those of a minibatch"""
+"""the fraction by which running means and variances move towards those of a minibatch"""
 
 
 class Layer(NamedTuple):
@@ -44,30 +44,30 @@ class RunningStatistics(NamedTuple):
     mean: Tensor
     """[K, n, 1]"""
     variance: Tensor
-    """[K, n, 1] of the population"""
+    """[K, n, 1] variance of the population"""
 
 
 class Plan(NamedTuple):
-    """How the MLPs of a pass are built."""
+    """The structure of the MLPs of a pass."""
 
     layers_of: Callable[[Tensor], Sequence[Layer]]
-    """the layers as views of a tensor like the flat parameters"""
+    """returns the layers as views of a tensor that is laid out like the flat parameters"""
     relu: bool
-    """ReLU, else tanh"""
+    """whether activations are ReLU; if not, they are tanh"""
     before: bool
-    """normalize before each activation, else after it"""
+    """whether to normalize before each activation; if not, after it"""
 
 
 class NormalizedPass(torch.autograd.Function):
-    """Rows x [B, D] -> outputs [K, B, O]."""
+    """Maps rows x [B, D] to outputs [K, B, O]."""
 
     @staticmethod
     def forward(
         ctx: Any, x: Tensor, flat: Tensor, plan: Plan, running: Sequence[RunningStatistics] | None, renormalizes: bool
     ) -> Tensor:
-        """`running` moves towards the statistics of the minibatch; None: there are none to move.
+        """The outputs [K, B, O]. Moves `running`, unless it is None, towards the statistics of the minibatch.
 
-        `renormalizes`: see `_normalized`.
+        For `renormalizes`, see `_normalized`.
         """
         h = x.t().contiguous().unsqueeze(0)
         kept = []
@@ -88,7 +88,7 @@ class NormalizedPass(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *outputs: Tensor) -> tuple[Tensor | None, ...]:
-        """The gradients of x and of the flat parameters."""
+        """The gradients with respect to x and to the flat parameters."""
         refuse_second_derivatives()
         (flat,) = ctx.saved_tensors
         plan = ctx.plan
@@ -114,14 +114,14 @@ class NormalizedPass(torch.autograd.Function):
 
 
 class _Normalization(NamedTuple):
-    """What the backward pass needs of a normalization."""
+    """The results of a normalization that the backward pass needs."""
 
     x_hat: Tensor
     """[K or 1, n, B]"""
     inverse: Tensor
     """[K or 1, n, 1] 1/σ"""
     r: Tensor | None
-    """[K, n, 1] r and d of batch renormalization; None without it"""
+    """[K, n, 1] r and d of batch renormalization; both None without it"""
     d: Tensor | None
 
     def backward(self, g: Tensor, layer: Layer, by_layer: Layer) -> Tensor:
@@ -138,10 +138,10 @@ class _Normalization(NamedTuple):
 def _normalized(
     h: Tensor, layer: Layer, running: RunningStatistics | None, renormalizes: bool, in_place: bool
 ) -> tuple[Tensor, _Normalization]:
-    """γ x̂ + β [K, n, B] of h [K or 1, n, B], and what the backward pass needs.
+    """γ x̂ + β [K, n, B] for h [K or 1, n, B], and the results that the backward pass needs.
 
-    With batch renormalization (Ioffe 2017), γ (r x̂ + d) + β, which normalizes by the running statistics as long as r and d
-    are within their bounds. The numbers r and d count as constants.
+    With batch renormalization (Ioffe 2017) it is γ (r x̂ + d) + β, which normalizes by the running statistics as long as r
+    and d are within their bounds. The backward pass treats r and d as constants.
     """
     mean = h.mean(-1, keepdim=True)
     x_hat = h.sub_(mean) if in_place else h - mean
@@ -164,20 +164,20 @@ def _normalized(
 
 R_MAX = 3.0
 D_MAX = 5.0
-"""bounds of batch renormalization: of σ / σ(running) and its inverse, and of (μ − μ(running)) / σ(running)"""
+"""The bounds of batch renormalization: R_MAX for σ / σ(running) and its inverse, D_MAX for |μ − μ(running)| / σ(running)."""
 
 
 def renormalization(mean: Tensor, inverse: Tensor, running: RunningStatistics) -> tuple[Tensor, Tensor]:
-    """R = σ / σ(running) and d = (μ − μ(running)) / σ(running), within their bounds, [K, n, 1] each."""
+    """The pair r = σ / σ(running) and d = (μ − μ(running)) / σ(running), clipped to their bounds, [K, n, 1] each."""
     running_inverse = (running.variance + EPS).rsqrt()
     r = (running_inverse / inverse).clamp(1 / R_MAX, R_MAX)
     return r, ((mean - running.mean) * running_inverse).clamp(-D_MAX, D_MAX)
 
 
 def _row_products(a: Tensor, b: Tensor) -> Tensor:
-    """Σ a b over the last dimension, which is kept.
+    """Σ a b over the last dimension, which is kept with size 1.
 
-    On a CPU, numpy adds while it multiplies; torch stores the products first.
+    On a CPU this uses numpy, which adds while it multiplies; torch would store all products first.
     """
     if a.device.type != "cpu":
         return (a * b).sum(-1, keepdim=True)
@@ -190,7 +190,7 @@ def _activation(h: Tensor, relu: bool) -> Tensor:
 
 
 def _before_activation(g: Tensor, activated: Tensor, relu: bool) -> Tensor:
-    """The gradient with respect to h, from `g`, that with respect to φ(h)."""
+    """The gradient with respect to h, from `g`, the gradient with respect to φ(h)."""
     by_pre_activation: Tensor = (
         torch.ops.aten.threshold_backward(g, activated, 0) if relu else torch.ops.aten.tanh_backward(g, activated)
     )

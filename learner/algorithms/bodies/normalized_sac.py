@@ -1,8 +1,8 @@
-"""What CrossQ and XQC share: SAC with batch normalization in actor and critics, whose actor learns at every k-th step.
+"""The base of CrossQ and XQC: SAC with batch normalization in actor and critics, whose actor learns at every k-th step.
 
 Rule: observations and next observations, with their actions, pass the critics in one minibatch. They come from different
-distributions; in separate minibatches they would be normalized by different means, and values would not fit together (Bhatt
-et al. 2024).
+distributions. In separate minibatches they would be normalized by different means, and values and targets would not be
+comparable (Bhatt et al. 2024).
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class Joint(NamedTuple):
     """The critics' input: observations and next observations in one minibatch."""
 
     x: Tensor
-    """[2 B, D] features of the observations, then of the next ones"""
+    """[2 B, D] features of the observations, then of the next observations"""
     action: Tensor
     """[2 B, D′] the actions, then those that the actor would take next"""
     next_log_prob: Tensor
@@ -36,7 +36,7 @@ class Joint(NamedTuple):
 
 
 class NormalizedSAC(SAC):
-    """An actor and critics with batch normalization, and the temperature."""
+    """SAC with batch normalization in the actor and the critics."""
 
     net: ActorWithCritics
     target: ActorWithCritics
@@ -59,13 +59,13 @@ class NormalizedSAC(SAC):
         return self.net.actor_body.shape.normalized.value
 
     def joint(self, rows: Transitions) -> Joint:
-        """The observations and actions of these rows, and the next ones with actions ã′ ~ π(s′), without a gradient."""
+        """The observations and actions of these rows, and the next observations with actions ã′ ~ π(s′), no gradient."""
         with torch.no_grad():
             action, log_prob = self.sample(rows.next_x)
         return Joint(torch.cat((rows.x, rows.next_x)), torch.cat((rows.action, action)), log_prob)
 
     def after_step(self, name: str) -> None:
-        """See `Continuous`: scales weights that must have norm 1 back to it."""
+        """See `Continuous`. Scales weights that must have norm 1 back to norm 1."""
         match name:
             case "actor":
                 self.net.actor_body.project()
@@ -73,10 +73,10 @@ class NormalizedSAC(SAC):
                 self.net.critic_bodies.project()
 
     def move_target(self) -> None:
-        """After each step of the critics: move their targets, if there are any."""
+        """Move the target critics, if there are any. Called after each step of the critics."""
 
     def step(self, rows: Transitions) -> tuple[UpdateMetrics, Tensor]:
-        """One gradient step of the critics; of the actor and the temperature if it is their turn."""
+        """Take one gradient step of the critics, and, if it is their turn, of the actor and the temperature."""
         critic = self.critic_loss(rows)
         measured = {"ent_coef": self.temperature} | self.descend("critic", critic.loss, critic.numbers)
         self.move_target()
@@ -86,7 +86,7 @@ class NormalizedSAC(SAC):
         return measured, critic.error
 
     def actor_step(self, x: Tensor) -> UpdateMetrics:
-        """One gradient step of the actor and of a learned temperature, on features [B, D]."""
+        """Take one gradient step of the actor, and of the temperature if it is learned, on features [B, D]."""
         loss, log_prob = self.actor_loss(x)
         measured = self.descend("actor", loss, {"entropy": -log_prob.mean()})
         if self.config.ent_coef is None:
@@ -99,7 +99,7 @@ class NormalizedSAC(SAC):
         return super().other_state() | {"batch_normalization": self.batch_normalization}
 
     def start_from(self, start: Start) -> None:
-        """See `Algorithm.start_from`. Raises `UsageError` if only a policy is known: its normalization is folded into it."""
+        """See `Algorithm.start_from`. Raises `UsageError` if only a policy is known, without normalization statistics."""
         if "statistics" not in start.state:
             raise UsageError(
                 "start_from: expected a run of the same algorithm with a checkpoint, got a policy without the statistics of "

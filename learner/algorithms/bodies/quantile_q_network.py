@@ -1,10 +1,10 @@
-"""Action values by quantiles of the return (QR-DQN, Dabney et al. 2018), with or without dueling and batch normalization.
+"""Action values as means of return quantiles (QR-DQN, Dabney et al. 2018), with or without dueling and batch normalization.
 
 Rule: workers act with an ordinary Q-network. The value of an action is the mean of its quantiles, so it is linear in the
-last hidden layer, as the quantiles are. Acting networks average the last layer's rows of each action. Batch normalization is
-folded into the layers (`stacked_mlps.py`).
+last hidden layer, as the quantiles are. The last layer of the acting network is therefore the mean, over the quantiles, of
+the last layer here. Batch normalization is folded into the layers (`stacked_mlps.py`).
 
-For N quantiles and n actions there are N (n + 1) outputs: for each quantile the value of the state, then n advantages.
+With dueling, N quantiles and n actions take N (n + 1) outputs: for each quantile the value of the state, then n advantages.
 Without dueling there are N n outputs, the quantiles themselves.
 """
 
@@ -30,8 +30,8 @@ class QuantileQNetwork:
     """N quantiles of the return of each of n actions."""
 
     def __init__(self, policy: PolicySpec, quantiles: int, normalized: Normalized, device: str, seed: int) -> None:
-        """`policy`: the one that workers act with. The initial parameters depend on `seed`."""
-        keep_freed_memory()  # the loss takes and frees arrays of half a megabyte again and again
+        """`policy` is the one with which workers act. The initial parameters depend on `seed`."""
+        keep_freed_memory()  # each loss allocates and frees arrays of half a megabyte
         actions = policy.action.sizes[0]
         self._quantiles = quantiles
         self._sizes = [1, actions] if policy.dueling else [actions]
@@ -42,7 +42,7 @@ class QuantileQNetwork:
         parts = [initial_fields(encoder, generator), initial(shape, generator)]
         sizes = [len(part) for part in parts]
         self.flat = torch.cat(parts).to(device)
-        """[P] all parameters, those of the encoder first"""
+        """[P] float32: all parameters, those of the encoder first"""
         self.flat_grad = torch.zeros_like(self.flat)
         self.flat.grad = self.flat_grad
         self._encoder, layers = torch.split(self.flat, sizes)
@@ -57,24 +57,24 @@ class QuantileQNetwork:
         return self._by_action(self.body.trained(self.encode(x, images)))
 
     def of_minibatch(self, x: Tensor, images: Sequence[Tensor]) -> Tensor:
-        """Like `trained`, with this minibatch's statistics, but without gradient or update of the running ones: targets."""
+        """Like `trained`, but without a gradient, and without moving the running statistics: for targets."""
         return self._by_action(self.body.of_minibatch(self.encode(x, images)))
 
     def params(self, x: Tensor, images: Sequence[Tensor] = ()) -> Tensor:
-        """The action values [B, n] of features [B, D] and images [B, *leaf] uint8, with which workers act."""
+        """The action values [B, n] of features [B, D] and images [B, *leaf] uint8, as workers compute them."""
         return self.head(self.encode(x, images))
 
     def head(self, h: Tensor) -> Tensor:
-        """Action values [B, n] of the encoder's outputs h [B, H]: means of quantiles, normalized by running statistics."""
+        """Action values [B, n], the means of quantiles, for outputs h [B, H] of the encoder. Uses the running statistics."""
         return self._by_action(self.body.evaluated(h)).mean(1)
 
     def _by_action(self, outputs: Tensor) -> Tensor:
-        """Outputs [1, B, N (n + 1)] as quantiles [B, N, n]."""
+        """Turn outputs [1, B, N (n + 1)], or [1, B, N n] without dueling, into quantiles [B, N, n]."""
         *value, advantage = torch.split(outputs.reshape(-1, self._quantiles, self._outputs), self._sizes, -1)
         return QNetwork.action_values(advantage, *value)
 
     def acting_parameters(self) -> Floats:
-        """A copy of the parameters that workers act with: those of a `QNetwork` with these action values."""
+        """A copy of the parameters [P′] with which workers act: those of a `QNetwork` with the same action values."""
         layers = self.body.folded()
         *hidden, weight, bias = named_views(layers, self.body.shape.folded().fields()).values()
         last = [of_outputs.reshape(self._quantiles, self._outputs, -1).mean(0) for of_outputs in (weight, bias)]

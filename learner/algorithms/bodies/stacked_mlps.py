@@ -1,11 +1,11 @@
 """MLPs of one shape, with or without batch normalization (Ioffe and Szegedy 2015), and how they fold into plain MLPs.
 
-Rule: a training pass normalizes by the mean and variance of its own minibatch, and moves the running ones towards them. Any
-other pass uses the running ones. Then batch normalization is linear, so it is folded into the linear layers: workers act
-with a plain MLP, and need neither statistics nor PyTorch.
+Rule: a training pass normalizes by the mean and variance of its own minibatch, and moves the running statistics towards
+them. To act, a network uses the running statistics. Batch normalization is then linear, so it is folded into the linear
+layers: workers act with a plain MLP, and need neither statistics nor PyTorch.
 
-With `Normalized.BEFORE` an MLP is BN, then linear, BN, activation for each hidden layer, then linear (XQC, Palenicek et al.
-2025); with `Normalized.AFTER`, a BN in front of every linear layer (CrossQ, Bhatt et al. 2024).
+With `Normalized.BEFORE` an MLP is a BN; then linear, BN and activation for each hidden layer; then linear (XQC, Palenicek et
+al. 2025). With `Normalized.AFTER` there is a BN in front of every linear layer (CrossQ, Bhatt et al. 2024).
 """
 
 from __future__ import annotations
@@ -27,28 +27,28 @@ class Normalized(Enum):
 
     NOWHERE = "none"
     BEFORE = "before activations"
-    """its input, and before each activation; hidden layers have no biases, because subtracting the mean would cancel them"""
+    """the input, and before each activation; hidden layers have no biases, because subtracting the mean would cancel them"""
     AFTER = "after activations"
-    """its input, and after each activation"""
+    """the input, and after each activation"""
 
 
 class MLPShape(NamedTuple):
-    """What K MLPs have in common."""
+    """The shape that K MLPs have in common."""
 
     networks: int
-    """K"""
+    """K, the number of MLPs"""
     sizes: tuple[int, ...]
-    """the number of inputs, of units of each hidden layer, and of outputs"""
+    """the number of inputs, the number of units of each hidden layer, and the number of outputs"""
     relu: bool = True
-    """ReLU, else tanh"""
+    """whether activations are ReLU; if not, they are tanh"""
     normalized: Normalized = Normalized.NOWHERE
     unit_rows: bool = False
-    """the weights of each unit have norm 1 (weight normalization)"""
+    """whether the weights of each unit are kept at norm 1 (weight normalization)"""
     output_gain: float = 1.0
-    """gain of the orthogonal initialization of the last layer; that of the others is √2"""
+    """the gain of the orthogonal initialization of the last layer; the other layers have √2"""
 
     def fields(self) -> list[Field]:
-        """The parameters, [K, …] each."""
+        """The fields of the parameters in the flat tensor, [K, …] each."""
         K = self.networks
         last = len(self.sizes) - 2
         fields: list[Field] = []
@@ -66,7 +66,7 @@ class MLPShape(NamedTuple):
         return self._replace(normalized=Normalized.NOWHERE, unit_rows=False)
 
     def statistics(self) -> list[Field]:
-        """The running mean and variance of each normalization, [K, …] each; none without normalization."""
+        """The fields of the running mean and variance of each normalization, [K, …] each; none without normalization."""
         if self.normalized is Normalized.NOWHERE:
             return []
         shapes = [(self.networks, size, 1) for size in self.sizes[:-1]]
@@ -74,7 +74,7 @@ class MLPShape(NamedTuple):
 
 
 def initial(shape: MLPShape, generator: torch.Generator) -> Tensor:
-    """Parameters [P] to begin with: orthogonal weights, gains of 1, and zeros."""
+    """Initial parameters [P]: orthogonal weights, gains of 1, and shifts and biases of 0."""
     fields = shape.fields()
     flat = torch.zeros(total_size(fields), dtype=DTYPE)
     for field, view in zip(fields, named_views(flat, fields).values(), strict=True):
@@ -87,7 +87,7 @@ def initial(shape: MLPShape, generator: torch.Generator) -> Tensor:
 
 
 def initial_statistics(shape: MLPShape) -> Tensor:
-    """Means of 0 and variances of 1, flat."""
+    """Initial running statistics [S]: means of 0 and variances of 1."""
     flat = torch.zeros(total_size(shape.statistics()), dtype=DTYPE)
     for name, view in named_views(flat, shape.statistics()).items():
         view.fill_(float(name.endswith("variance")))
@@ -95,10 +95,10 @@ def initial_statistics(shape: MLPShape) -> Tensor:
 
 
 class StackedMLPs:
-    """K MLPs of one shape, in a flat tensor of parameters [P] and one of running statistics [S], which others own."""
+    """K MLPs of one shape. The caller owns their flat tensors: parameters [P] and running statistics [S]."""
 
     def __init__(self, shape: MLPShape, parameters: Tensor, statistics: Tensor) -> None:
-        """`parameters`: a leaf of the graph. `statistics`: as `initial_statistics`, changed in place."""
+        """`parameters` is a leaf of the graph. `statistics` (see `initial_statistics`) are changed in place."""
         self.shape = shape
         self._fields = shape.fields()
         self._folded_fields = shape.folded().fields()
@@ -112,26 +112,26 @@ class StackedMLPs:
         self._now = self._layers(self._constant) if self._normalizes else []
 
     def trained(self, x: Tensor, *, renormalizes: bool = False) -> Tensor:
-        """Outputs [K, B, O] of rows [B, D]. The parameters get a gradient, and running statistics move."""
+        """Outputs [K, B, O] for rows [B, D]. The parameters get a gradient, and running statistics move."""
         if not self._normalizes:
             return self._plain(x, self._trained)
         out: Tensor = NormalizedPass.apply(x, self._trained, self._plan, self._running, renormalizes)  # type: ignore[no-untyped-call]
         return out
 
     def of_minibatch(self, x: Tensor) -> Tensor:
-        """Like `trained`, but no renormalization, gradient or update of running statistics: for target networks."""
+        """Like `trained`, but for target networks: no renormalization, no gradient, and running statistics don't move."""
         if not self._normalizes:
             return self._plain(x, self._constant)
         out: Tensor = NormalizedPass.apply(x, self._constant, self._plan, None, False)  # type: ignore[no-untyped-call]
         return out
 
     def evaluated(self, x: Tensor) -> Tensor:
-        """Outputs [K, B, O] of rows [B, D], with the running statistics. Only x gets a gradient."""
+        """Outputs [K, B, O] for rows [B, D], normalized by the running statistics. Only x gets a gradient."""
         return self._plain(x, self.folded())
 
     @torch.no_grad()
     def folded(self) -> Tensor:
-        """The parameters [P′] of plain MLPs with the outputs of `evaluated`: weight and bias of each layer, [K, …] each."""
+        """The parameters [P′] of plain MLPs with the outputs of `evaluated`: each layer's weight and bias, [K, …] each."""
         if not self._normalizes:
             return self._constant
         flat = self._constant.new_zeros(total_size(self._folded_fields))
@@ -178,6 +178,6 @@ class StackedMLPs:
 
 
 def _linear(layer: Layer, running: RunningStatistics) -> tuple[Tensor, Tensor]:
-    """Scale and shift [K, n, 1] that a normalization by running statistics amounts to."""
+    """The scale and the shift, [K, n, 1] each, to which a normalization by running statistics amounts."""
     scale = layer.gain * (running.variance + EPS).rsqrt()
     return scale, layer.shift - running.mean * scale

@@ -1,1 +1,1 @@
-"""Fast updates of small networks: a pass or a term of a loss is one node of autograd's graph, an optimizer step one call."""
+"""Fast updates of small networks. A whole pass is one node of autograd's graph, and an optimizer step is one call."""

@@ -1,8 +1,8 @@
-"""For small networks, in numpy: log-probabilities and entropies of actions, or sampled actions, from an actor's outputs.
+"""Action distributions of small networks, in numpy: log-probabilities, entropies and samples from an actor's outputs.
 
 Rule: results and gradients equal those of `millrace.protocol.policy.torch_distributions` and autograd, except for rounding.
-They save 0.1 ms of a minibatch of 64 rows, for which autograd needs a dozen nodes. Arrays are [P, B], a column for each of B
-rows. `forward` keeps what `backward` needs.
+The kernels save 0.1 ms per minibatch of 64 rows, for which autograd would need a dozen nodes. Arrays are [P, B], with a
+column for each of B rows. `forward` stores the intermediate results that `backward` needs.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ LOG_2 = math.log(2)
 
 
 class EvaluatedActions:
-    """Log π(action), the entropy of π, and V, from the outputs of an actor and a critic, [B] each."""
+    """A top that computes log π(action), the entropy of π, and V, [B] each, from the outputs of an actor and a critic."""
 
     def __init__(self, distribution_kernel: DistributionKernel) -> None:
         self._distribution = distribution_kernel
 
     def forward(self, outputs: Sequence[Array], action: Array, mask: Bools | None) -> tuple[Array, ...]:
-        """`action` [B, *action]; `mask` [B, choices]: which choices are allowed.
+        """See `Top`. `action` is [B, *action]; `mask` [B, choices] is True for the choices that are allowed.
 
-        A logit that the mask forbids has probability 0, so the factor p makes its gradient 0 in `backward`.
+        A choice that the mask forbids has probability p = 0, and this factor p makes its gradient 0 in `backward`.
         """
         params, value = outputs
         if mask is not None:
@@ -45,14 +45,14 @@ class EvaluatedActions:
 
 
 class SquashedSample:
-    """Actions a = tanh u [B, D] with u = mean + std · noise, and their log-densities [B], from the outputs of an actor.
+    """A top that samples actions a = tanh u [B, D], u = mean + std · noise, and computes their log-densities [B].
 
     log π(a) = Σ −½ noise² − log std − log √2π − log(1 − a²), where log(1 − a²) = 2 (log 2 − |u| − log(1 + exp(−2|u|)))
     ∂a/∂u = 1 − a²;  ∂log π(a)/∂u = 2 a;  ∂u/∂log std = std · noise
     """
 
     def forward(self, outputs: Sequence[Array], noise: Array) -> tuple[Array, ...]:
-        """`noise` [B, D]: drawn from the standard normal distribution."""
+        """See `Top`. `noise` [B, D] is drawn from the standard normal distribution."""
         (params,) = outputs
         mean, log_std = np.split(params, 2)
         low, high = LOG_STD_BOUNDS
@@ -77,7 +77,7 @@ class DistributionKernel(Protocol):
     """A distribution over actions, with the gradients of its log-probability and entropy."""
 
     def forward(self, params: Array, action: Array) -> tuple[Array, Array]:
-        """Parameters [P, B] and actions [B, k] -> log π(action) [B], entropy [B]."""
+        """Log π(action) [B] and the entropy [B], for parameters [P, B] and actions [B, k]."""
         ...
 
     def backward(self, by_log_prob: Array, by_entropy: Array) -> Array:
@@ -86,7 +86,7 @@ class DistributionKernel(Protocol):
 
 
 class _CategoricalKernel:
-    """∂log π(a)/∂logits = 1ₐ − p;  ∂H/∂logits = −p (log p + H)."""
+    """A categorical distribution: ∂log π(a)/∂logits = 1ₐ − p;  ∂H/∂logits = −p (log p + H)."""
 
     def forward(self, params: Array, action: Array) -> tuple[Array, Array]:
         log_p = params - np.maximum.reduce(params, 0)
@@ -148,7 +148,10 @@ class _BernoulliKernel:
 
 
 class _GaussianKernel:
-    """z = (a − μ) / σ: ∂log π/∂μ = z / σ;  ∂log π/∂log σ = z² − 1;  ∂H/∂log σ = 1. log σ does not depend on the state."""
+    """A normal distribution whose log σ does not depend on the state.
+
+    With z = (a − μ) / σ: ∂log π/∂μ = z / σ;  ∂log π/∂log σ = z² − 1;  ∂H/∂log σ = 1.
+    """
 
     def __init__(self, log_std: Array, by_log_std: Array) -> None:
         self._log_std = log_std
@@ -176,13 +179,13 @@ class _KernelFactor(NamedTuple):
     kernel: DistributionKernel
     params: int
     actions: int
-    """how many rows of the parameters [P, B], and how many columns of the actions [B, k], belong to it"""
+    """how many rows of the parameters [P, B], and how many columns of the actions [B, k], belong to this factor"""
 
 
 def distribution_kernel(spec: ActionSpec, log_std: Array | None, by_log_std: Array | None) -> DistributionKernel:
     """The kernel for this action space.
 
-    For a Box, `log_std` and its gradient `by_log_std`, which is written, are [numbers].
+    For a Box, `log_std` and `by_log_std` are [numbers]; the kernel writes the gradient of `log_std` into `by_log_std`.
     """
     factors = [_KernelFactor(_CategoricalKernel(), size, 1) for size in spec.sizes]
     if spec.bits:

@@ -1,15 +1,15 @@
 """MLPs as one node of autograd's graph, with the forward and the backward pass in numpy.
 
-Rule: outputs and gradients are those of the formulas below, except for rounding. How rows are divided into chunks depends
-only on their number, so the same minibatch gives the same bits.
+Rule: outputs and gradients are those of the formulas below, except for rounding. The division of rows into chunks depends
+only on the number of rows, so the same minibatch gives the same bits.
 
 With a small network, torch spends most of the time of a minibatch on its graph, its dispatcher and its allocator, not on
 arithmetic. Here a pass is a few dozen calls on arrays that are reused. A call owns its arrays until its backward pass, so
 one loss may contain several calls. A second backward pass, and derivatives of the gradient, are not supported.
 
-Arrays are [S, n, B]: S networks, and one column for each of B rows, so that inner loops are long. Each chunk of rows passes
-through all layers forward, or backward, while it is in the cache. With g = ∂L/∂(pre-activation): ∂L/∂W = g hᵀ, ∂L/∂b = Σ g,
-∂L/∂h = Wᵀ g; φ' is 1 − h² (tanh) or h > 0 (ReLU).
+Arrays are [S, n, B]: S networks, n units, and one column for each of B rows, so that inner loops are long. Each chunk of
+rows passes through all layers, forward or backward, while it is in the cache. With g = ∂L/∂(pre-activation): ∂L/∂W = g hᵀ,
+∂L/∂b = Σ g, ∂L/∂h = Wᵀ g; φ' is 1 − h² (tanh) or h > 0 (ReLU).
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ from millrace.protocol.policy.layout import Field, named_views
 
 MLPPass = Callable[[], object]
 
-CHUNK_ROWS = 512  # rows of a chunk, at most
-THREADED_PRODUCT_SIZE = 64 * 64 * 128  # multiplications in a matrix product from which on torch's threads make it faster
-MAX_PLANS = 256  # sizes of minibatches to remember; they vary with the number of valid rows
+CHUNK_ROWS = 512  # the largest number of rows in a chunk
+THREADED_PRODUCT_SIZE = 64 * 64 * 128  # the number of multiplications from which torch's threads speed a matrix product up
+MAX_PLANS = 256  # minibatch sizes whose plans are kept; the size varies with the number of valid rows
 
 
 class Linear(NamedTuple):
@@ -44,7 +44,7 @@ class Linear(NamedTuple):
 
     @staticmethod
     def stacked(names: Sequence[str], values: Mapping[str, Array], grads: Mapping[str, Array]) -> Linear:
-        """One layer of each of one or two networks, by the names of the layers."""
+        """The layers with these names, one of each of one or two networks, as one `Linear`."""
         weight, bias, weight_grad, bias_grad = (
             _stacked_view([of[f"{name}.{kind}"] for name in names]) for of in (values, grads) for kind in ("weight", "bias")
         )
@@ -52,35 +52,35 @@ class Linear(NamedTuple):
 
 
 class Head(NamedTuple):
-    """A linear output layer, and the number of the network that it is on."""
+    """A linear output layer, and the index of the network whose last hidden layer it reads."""
 
     layer: Linear
     network: int
 
 
 class Trunks(NamedTuple):
-    """Networks of the same shape on the same input, and their outputs, by the names of their layers."""
+    """The layers, by name, of networks of the same shape that take the same input."""
 
     hidden: Sequence[Sequence[str]]
     """the hidden layers of each network"""
     outputs: Sequence[tuple[str, int]]
-    """each linear output layer, and the number of the network that it is on"""
+    """each linear output layer, and the index of the network whose last hidden layer it reads"""
 
 
 class Top(Protocol):
     """The function that a call applies to the outputs of the networks, and its derivative."""
 
     def forward(self, outputs: Sequence[Array], *given: Any) -> tuple[Array, ...]:
-        """The outputs [out, B] and the call's other arguments -> its results. The next call overwrites the outputs."""
+        """The results, from the outputs [out, B] and the call's other arguments. The next call overwrites `outputs`."""
         ...
 
     def backward(self, by_results: Sequence[Array]) -> Sequence[Array]:
-        """The gradient [out, B] with respect to each output of the last call, from that with respect to its results."""
+        """The gradients [out, B] with respect to the outputs of the last call, from those with respect to its results."""
         ...
 
 
 class Outputs:
-    """The outputs themselves, [B, out] each."""
+    """A top that returns the outputs themselves, [B, out] each."""
 
     def forward(self, outputs: Sequence[Array]) -> tuple[Array, ...]:
         """See `Top`."""
@@ -92,7 +92,7 @@ class Outputs:
 
 
 class Values:
-    """The outputs of networks with one output each, [networks, B]."""
+    """A top for networks with one output each, which returns their outputs as one array [networks, B]."""
 
     def forward(self, outputs: Sequence[Array]) -> tuple[Array, ...]:
         """See `Top`."""
@@ -105,7 +105,7 @@ class Values:
 
 
 MakeTop = Callable[[Mapping[str, Array], Mapping[str, Array]], Top]
-"""Makes a top from the parameters and their gradients, by name; it writes the gradients of those that it uses.
+"""Makes a top from the parameters and their gradients, by name. The top writes the gradients of the parameters it uses.
 """
 
 
@@ -120,7 +120,7 @@ class SmallMLP:
         relu: bool,
         top: MakeTop = lambda values, gradients: Outputs(),
     ) -> None:
-        """`parameters`: a leaf [P], with these fields."""
+        """`parameters` is a leaf [P] of autograd's graph, laid out in these fields."""
         self._parameters = parameters
         self._constants = parameters.detach()
         self._fields = fields
@@ -130,9 +130,9 @@ class SmallMLP:
         self._free: list[_Workspace] = []
 
     def __call__(self, x: Tensor, *given: Tensor | None, constant: bool = False) -> tuple[Tensor, ...]:
-        """Features [B, D], and the other arguments of the top -> the results of the top.
+        """The results of the top, for features x [B, D] and the top's other arguments.
 
-        `constant`: the parameters get no gradient; x does.
+        If `constant`, only x gets a gradient; the parameters don't.
         """
         if torch.is_grad_enabled() and (x.requires_grad or not constant):
             parameters = self._constants if constant else self._parameters
@@ -144,13 +144,13 @@ class SmallMLP:
         return outputs
 
     def take(self) -> _Workspace:
-        """Take arrays that no call uses."""
+        """Take a workspace that no other call uses."""
         if self._free:
             return self._free.pop()
         return _Workspace(self._constants, self._fields, self._trunks, self._relu, self._top)
 
     def give_back(self, workspace: _Workspace) -> None:
-        """The next call may overwrite these arrays."""
+        """Return a workspace. The next call may overwrite its arrays."""
         self._free.append(workspace)
 
 
@@ -176,9 +176,9 @@ class _Pass(torch.autograd.Function):
 
 
 def taken_once(ctx: Any) -> Any:
-    """Take what the forward pass kept in `ctx.kept`.
+    """Take the object that the forward pass stored in `ctx.kept`.
 
-    Raises `RuntimeError`, in one line, for a second or double backward pass.
+    Raises `RuntimeError`, with a one-line message, if backward runs a second time or with `create_graph`.
     """
     if torch.is_grad_enabled():
         raise RuntimeError(
@@ -196,9 +196,9 @@ def taken_once(ctx: Any) -> Any:
 
 
 class _Workspace:
-    """The arrays of one call at a time, and the plans for the minibatch sizes so far.
+    """The arrays that one call uses at a time, and the plans for the minibatch sizes so far.
 
-    Plans of all sizes share their arrays: each takes the same ones in the same order.
+    All plans share these arrays: each plan takes the same arrays in the same order.
     """
 
     def __init__(self, parameters: Tensor, fields: Sequence[Field], trunks: Trunks, relu: bool, make_top: MakeTop) -> None:
@@ -212,7 +212,7 @@ class _Workspace:
         self._arrays: list[Array] = []
         self._taken = 0
 
-    @np.errstate(all="ignore")  # as torch does; before each step, `check_finite` names what is not finite
+    @np.errstate(all="ignore")  # torch doesn't warn either; before each step, `check_finite` names what is not finite
     def forward(self, x: Tensor, given: Sequence[Tensor | None]) -> tuple[Tensor, ...]:
         """The results of the top for features [B, D], in newly allocated memory."""
         plan = self._plans.get(len(x))
@@ -235,7 +235,7 @@ class _Workspace:
     def backward(
         self, by_results: Sequence[Tensor], wants_x: bool, wants_parameters: bool
     ) -> tuple[Tensor | None, Tensor | None]:
-        """The gradients with respect to x and all parameters, where wanted, from that with respect to each result."""
+        """The gradients with respect to x and to all parameters, or None if not wanted, from those of the results."""
         by_heads = self._top.backward([by_result.numpy() for by_result in by_results])
         by_x = self.by_input(by_heads) if wants_x else None
         return by_x, self.by_parameters(by_heads) if wants_parameters else None
@@ -251,7 +251,7 @@ class _Workspace:
         return self._gradient.clone()
 
     def by_input(self, by_heads: Sequence[Array]) -> Tensor:
-        """∂L/∂x [B, D]; there must be a hidden layer. Arguments as for `by_parameters`."""
+        """∂L/∂x [B, D]. There must be a hidden layer. The argument is that of `by_parameters`."""
         self._place(by_heads)
         for chunk in self._plan.chunks:
             for call in chunk.heads_to_input + chunk.hidden_to_input:
@@ -264,14 +264,14 @@ class _Workspace:
             place[0] = by_head
 
     def take(self, *shape: int) -> Array:
-        """The next array, C-ordered, not initialized."""
+        """The next array, in C order and not initialized."""
         size = math.prod(shape)
         number = self._taken
         self._taken += 1
         if number == len(self._arrays):
             self._arrays.append(np.empty(0, self._gradient.numpy().dtype))
         if self._arrays[number].size < size:
-            # torch allocates the array, because torch aligns all arrays in the same way. With another alignment, torch's
+            # Let torch allocate the array, because it aligns all arrays in the same way. With another alignment, its matrix
             # products could give other bits. The size is a power of two, so that a slightly larger minibatch needs no new
             # array.
             room = 1 << (size - 1).bit_length()
@@ -284,7 +284,7 @@ class _Workspace:
 
 
 class _MinibatchPlan:
-    """The calls for minibatches of one size: each chunk in turn, then the sums of the chunks' gradients."""
+    """The calls for minibatches of one size: those of each chunk in turn, then those that sum the chunks' gradients."""
 
     def __init__(
         self, rows: int, hidden: Sequence[Linear], heads: Sequence[Head], relu: bool, workspace: _Workspace
@@ -297,7 +297,7 @@ class _MinibatchPlan:
         self.gather: list[MLPPass] = []
         trunk = [self._for_each(layer, count) for layer in hidden]
         head_layers = [self._for_each(head.layer, count) for head in heads]
-        # All chunks share these arrays, so that they stay in the cache.
+        # All chunks share these arrays, so the arrays stay in the cache.
         gradients = [workspace.outputs(layer, -(-rows // count)) for layer in hidden]
         self.chunks: list[_Chunk] = []
         for i in range(count):
@@ -310,7 +310,7 @@ class _MinibatchPlan:
             self.chunks.append(chunk)
 
     def _for_each(self, layer: Linear, count: int) -> list[Linear]:
-        """The same layer once for each chunk, each with its own gradient arrays."""
+        """Copies of a layer, one for each chunk, that share its weights but have gradient arrays of their own."""
         if count == 1:
             return [layer]
         weight, bias = (self._workspace.take(count, *grad.shape) for grad in (layer.weight_grad, layer.bias_grad))
@@ -320,14 +320,14 @@ class _MinibatchPlan:
 
 
 class _Chunk:
-    """Some rows of a minibatch, and the calls of their forward and backward pass, in order."""
+    """A range of rows of a minibatch, and the calls of its forward and backward passes, in order."""
 
     def __init__(self, rows: slice, first: Linear, workspace: _Workspace) -> None:
         self.rows = rows
         self._workspace = workspace
         self.x = self._h = workspace.take(1, first.weight.shape[2], rows.stop - rows.start)
         self._dh: Array | None = None  # ∂L/∂output of the last hidden layers
-        self._networks_with_gradient: set[int] = set()  # whose part of `_dh` a head has written
+        self._networks_with_gradient: set[int] = set()  # networks whose part of `_dh` a head has written
         self._ones = np.ones(rows.stop - rows.start, first.weight.dtype)
         self.forward: list[MLPPass] = []
         self.back_from_heads: list[MLPPass] = []
@@ -337,7 +337,7 @@ class _Chunk:
         self.dx = workspace.take(first.weight.shape[0], *self.x.shape[1:])  # ∂L/∂x through each network
 
     def add_hidden(self, layer: Linear, dy: Array, relu: bool) -> None:
-        """Add a hidden layer. `dy`: the array for ∂L/∂output of this layer."""
+        """Add a hidden layer. `dy` is the array for ∂L/∂output of this layer."""
         y = self._workspace.outputs(layer, len(self._ones))
         self.forward += [*_linear(layer, self._h, y), _activation(y, relu)]
         through = _activation_gradient(dy, y, relu)
@@ -347,7 +347,7 @@ class _Chunk:
         self._dh = dy
 
     def add_head(self, layer: Linear, network: int, y: Array, dy: Array) -> None:
-        """Add a head, after all hidden layers."""
+        """Add a head. Call this only after all hidden layers have been added."""
         networks = slice(None) if self._dh is None else slice(network, network + 1)
         dh = None if self._dh is None else self._dh[networks]
         self.forward += _linear(layer, self._h[networks], y)
@@ -389,7 +389,7 @@ def _activation(y: Array, relu: bool) -> MLPPass:
 
 
 def _activation_gradient(dy: Array, y: Array, relu: bool) -> MLPPass:
-    """The call that replaces ∂L/∂output of the activation by ∂L/∂input, in place."""
+    """The call that replaces ∂L/∂output of the activation with ∂L/∂input, in place."""
     gradient = torch.from_numpy(dy)
     output = torch.from_numpy(y)
     if relu:
@@ -398,15 +398,15 @@ def _activation_gradient(dy: Array, y: Array, relu: bool) -> MLPPass:
 
 
 def uses_torch(multiplications: int) -> bool:
-    """Whether torch computes matrix products of this size: if it has threads, and they make them faster.
+    """Whether torch computes matrix products of this size: only if it has several threads and the product is large enough.
 
-    With one thread, numpy is as fast on Intel's processors and a tenth faster on AMD's.
+    With one thread, numpy is as fast as torch on Intel's processors and a tenth faster on AMD's.
     """
     return torch.get_num_threads() > 1 and multiplications >= THREADED_PRODUCT_SIZE
 
 
 def _product(a: Array, b: Array, out: Array) -> MLPPass:
-    """The call that computes `out` = a b, [S, n, k] by [S, k, m]."""
+    """The call that computes the matrix products `out` = a b, where a is [S, n, k] and b is [S, k, m]."""
     networks, n, k = out.shape[0], *a.shape[1:]
     if k > 1 and not uses_torch(n * k * b.shape[2]):
         return partial(np.matmul, a, b, out=out)
@@ -417,7 +417,7 @@ def _product(a: Array, b: Array, out: Array) -> MLPPass:
 
 
 def _stacked_view(arrays: Sequence[Array]) -> Array:
-    """One or two views of the same shape and the same array, as one view [S, *shape]."""
+    """One or two views of one array, both of the same shape, as a single view [S, *shape]."""
     first = arrays[0]
     last = arrays[-1]
     distance = last.__array_interface__["data"][0] - first.__array_interface__["data"][0]

@@ -4,10 +4,10 @@ Rule: it uses the same kernels on the same state, so it gives the same bits as `
 numbers count as zero during the step. The state belongs to the optimizer, which saves and loads it.
 
 For a small network, the overhead of `Optimizer.step` takes longer than the kernel. In addition, making an optimizer and
-calling its first `step` import torch's compiler, only to exclude these methods from compilation. This takes 0.8 s and 70 MB,
-which a learner that compiles nothing does not need.
+calling its first `step` import torch's compiler, only to exclude these methods from compilation. The import takes 0.8 s and
+70 MB, which a learner that compiles nothing can save.
 
-Denormal numbers are set to zero because they are slow: if parameters get no gradient any more, for example behind a dead
+Denormal numbers are set to zero because they are slow: if parameters no longer get a gradient, for example behind a dead
 ReLU, their moments decay to denormal numbers within 800 steps and stay there. Then a step takes a CPU twelve times as long.
 
 This file uses private parts of torch: `torch._fused_adam_`, `torch._fused_adamw_`, `__dynamo_disable`. If this version of
@@ -32,10 +32,10 @@ Kernel = Callable[..., Any]
 
 
 def make_optimizer(kind: str, flat: Tensor, **settings: Any) -> Optimizer:
-    """Adam, AdamW or RMSprop for one flat tensor that has a gradient. Each update sets its learning rate.
+    """Make an Adam, AdamW or RMSprop optimizer for one flat tensor that has a gradient. Each update sets the learning rate.
 
     Adam has β 0.9 and 0.999, and ε 1e-8 outside the square root; AdamW also decays weights by 0.01; RMSprop has α 0.99.
-    `settings`: arguments of torch's optimizer that replace these, such as `eps` and `amsgrad`.
+    `settings` are arguments of torch's optimizer that override these, such as `eps` and `amsgrad`.
     """
     avoid_compiler_import()
     match kind:
@@ -76,7 +76,7 @@ def take_step(optimizer: Optimizer) -> None:
 
 
 def state_of(optimizer: Optimizer) -> dict[str, Any]:
-    """A copy of `optimizer.state_dict()`, made in a twentieth of the time that a deep copy takes."""
+    """A copy of `optimizer.state_dict()`, made in a twentieth of the time of a deep copy."""
     numbers = {flat: i for i, flat in enumerate(flat for group in optimizer.param_groups for flat in group["params"])}
     state = {
         numbers[flat]: {name: each.clone() if isinstance(each, Tensor) else each for name, each in kept.items()}
@@ -87,7 +87,7 @@ def state_of(optimizer: Optimizer) -> dict[str, Any]:
 
 
 def load_state(optimizer: Optimizer, state: dict[str, Any]) -> None:
-    """`optimizer.load_state_dict` of a copy. Raises ValueError for the state of another kind of optimizer, or network."""
+    """Load a copy of a state. Raises ValueError if it belongs to another kind of optimizer or to another network."""
     (own_group,) = optimizer.param_groups
     optimizer.load_state_dict(copy.deepcopy(state))
     (group,) = optimizer.param_groups
@@ -104,9 +104,9 @@ def load_state(optimizer: Optimizer, state: dict[str, Any]) -> None:
 
 
 def _step_of(optimizer: Optimizer) -> Callable[[Tensor, dict[str, Any], OptimizerState], None] | None:
-    """The step of this kind of optimizer. None if the kind is not known here, or this version of torch lacks its kernel."""
+    """The function that steps this kind of optimizer; None for an unknown kind, or if this torch lacks its kernel."""
     match optimizer:
-        case AdamW():  # before Adam: in newer versions of torch AdamW is a subclass of it
+        case AdamW():  # must precede Adam, of which AdamW is a subclass in newer versions of torch
             return _adam_step("_fused_adamw_", decayed_parameter=0.85)
         case Adam():
             return _adam_step("_fused_adam_", decayed_parameter=0.9)
@@ -117,17 +117,17 @@ def _step_of(optimizer: Optimizer) -> Callable[[Tensor, dict[str, Any], Optimize
 
 
 def _adam_step(name: str, decayed_parameter: float) -> Callable[[Tensor, dict[str, Any], OptimizerState], None] | None:
-    """The step with this private function of torch, if torch has it and it does what this file expects."""
+    """The Adam step with this private function of torch, or None unless torch has it and it works as this file expects."""
     kernel = getattr(torch, name, None)
     return partial(_adam, kernel) if kernel is not None and _is_adam(kernel, decayed_parameter) else None
 
 
 @cache
 def _is_adam(kernel: Kernel, decayed_parameter: float) -> bool:
-    """Whether a first step of 0.1 from 1, with a gradient of 1 and a weight decay of 0.5, gives the expected parameter.
+    """Whether a first step gives the expected parameter, from 1 with learning rate 0.1, gradient 1 and weight decay 0.5.
 
-    Adam adds the decay to the gradient, whose size does not matter in a first step: 1 - 0.1. AdamW reduces the parameter
-    itself: (1 - 0.1 · 0.5) - 0.1.
+    Adam adds the decay to the gradient, whose size does not matter in a first step, so the result is 1 - 0.1. AdamW reduces
+    the parameter itself, so the result is (1 - 0.1 · 0.5) - 0.1.
     """
     flat = torch.ones(1)
     flat.grad = torch.ones(1)
@@ -135,7 +135,7 @@ def _is_adam(kernel: Kernel, decayed_parameter: float) -> bool:
     state = {"step": torch.zeros(()), "exp_avg": torch.zeros(1), "exp_avg_sq": torch.zeros(1)}
     try:
         _adam(kernel, flat, group, state)
-    except (TypeError, RuntimeError, NotImplementedError):  # what torch raises for arguments that it does not know
+    except (TypeError, RuntimeError, NotImplementedError):  # torch raises these for arguments that it does not know
         return False
     return abs(flat.item() - decayed_parameter) < 1e-5
 

@@ -1,4 +1,4 @@
-"""The networks as the learner trains them: a small one on the CPU passes in numpy, as one node of autograd's graph.
+"""The networks that the learner trains. A small one on the CPU computes in numpy, as one node of autograd's graph.
 
 Rule: whether numpy or torch computes a pass depends only on the network's shape and device. Both give the same numbers,
 except for rounding, so a loss need not know which one is used.
@@ -22,18 +22,18 @@ from millrace.protocol.policy.layout import CRITICS, hidden_names
 from millrace.protocol.policy.networks import ActorAndCritics, ActorCriticNetwork, QNetwork
 from millrace.protocol.specs import PolicySpec
 
-MAX_UNITS = 256  # of a layer; in larger layers, matrix products take nearly all the time (`benchmarks.update`)
+MAX_UNITS = 256  # units per layer; with more, matrix products take nearly all the time (`benchmarks.update`)
 
 
 def is_small(spec: PolicySpec, device: str) -> bool:
-    """Whether this is only an MLP without large layers, on the CPU."""
+    """Whether the network is a plain MLP without large layers, on the CPU."""
     if device != "cpu" or spec.has_encoder_layers or spec.critic:
         return False
     return max((feature_size(spec), *spec.net)) <= MAX_UNITS
 
 
 def actor_critic_network(spec: PolicySpec, device: str, seed: int) -> ActorCriticNetwork:
-    """The network of an actor and a critic."""
+    """Make the network of an actor and a critic: the small kind if it is small enough."""
     return (SmallActorCritic if is_small(spec, device) else ActorCriticNetwork)(spec, device, seed=seed)
 
 
@@ -47,31 +47,31 @@ class ActionValueNetwork(Protocol):
 
     @property
     def encode(self) -> Encoder:
-        """Makes h of features [B, D] and images [B, *leaf] uint8."""
+        """The module that computes h [B, H] from features [B, D] and images [B, *leaf] uint8."""
         ...
 
     def head(self, h: Tensor) -> Tensor:
-        """Action values [B, n] of the encoder's outputs h [B, H]."""
+        """Action values [B, n] for the encoder's outputs h [B, H]."""
         ...
 
     def acting_parameters(self) -> Floats:
-        """A copy of the parameters that workers act with."""
+        """A copy of the parameters [P′] with which workers act."""
         ...
 
 
 def q_network(spec: PolicySpec, device: str, seed: int) -> QNetwork:
-    """The network of action values."""
+    """Make the network of action values: the small kind if it is small enough."""
     return (SmallQNetwork if is_small(spec, device) else QNetwork)(spec, device, seed=seed)
 
 
 def actor_and_critics(spec: PolicySpec, device: str, seed: int) -> ActorAndCritics:
-    """The networks of an actor and two critics."""
+    """Make the networks of an actor and two critics: the small kind if they are small enough."""
     small = is_small(spec, device) and len(spec.net) > 0  # the derivative with respect to the action needs a hidden layer
     return (SmallActorAndCritics if small else ActorAndCritics)(spec, device, seed=seed)
 
 
 class SmallActorCritic(ActorCriticNetwork):
-    """A small actor and critic: one pass for both, and for the action distribution on top."""
+    """A small actor and critic. One pass computes both, and the action distribution on top."""
 
     def __init__(self, spec: PolicySpec, device: str = "cpu", *, seed: int = 0) -> None:
         super().__init__(spec, device, seed=seed)
@@ -108,7 +108,7 @@ class SmallActorCritic(ActorCriticNetwork):
 
 
 class SmallQNetwork(QNetwork):
-    """The action values of a small network."""
+    """A small network of action values."""
 
     def __init__(self, spec: PolicySpec, device: str = "cpu", *, seed: int = 0) -> None:
         super().__init__(spec, device, seed=seed)

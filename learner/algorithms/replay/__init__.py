@@ -1,1 +1,1 @@
-"""The replay buffer: where off-policy algorithms keep transitions, and how they draw them."""
+"""The replay buffers of off-policy algorithms: how transitions are stored and drawn."""

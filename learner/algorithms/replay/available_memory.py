@@ -1,4 +1,4 @@
-"""Available memory of this machine, or of its job or container if that is less, read from the files of the Linux kernel."""
+"""The available memory of this machine, or of its job or container if that has less. Read from Linux kernel files."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ GIB = 2**30
 
 
 def available_bytes(system: Path = Path("/")) -> int | None:
-    """Bytes that can be allocated without swapping, or None where the system does not say."""
+    """The number of bytes that can be allocated without swapping, or None if the system does not report it."""
     kilobytes = table(system / "proc/meminfo").get("MemAvailable:")
     machine = None if kilobytes is None else kilobytes * 1024
     return min((free for free in (machine, free_bytes(system)) if free is not None), default=None)

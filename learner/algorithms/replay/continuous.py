@@ -1,7 +1,8 @@
-"""What SAC and TD3 share: an actor with two critics, uniform actions at first, and an exact replay ratio.
+"""The base of SAC and TD3: an actor with critics, uniform actions at first, and an exact replay ratio.
 
-Rule: after each update, the gradient steps made are ⌊updates_per_step × (env steps used − learning_starts)⌋, whatever the
-size of the rollouts and the number and speed of the workers. Where these settings change, the count goes on from there.
+Rule: after each update, ⌊updates_per_step × (env steps used − learning_starts)⌋ gradient steps have been taken in all,
+whatever the size of the rollouts and the number and speed of the workers. If a resumed run changes one of the two settings,
+it counts env steps and gradient steps afresh from there.
 """
 
 from __future__ import annotations
@@ -34,7 +35,10 @@ from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
 
 
 class Networks(Protocol):
-    """An actor and critics, such as `ActorAndCritics`: h [B, H] is the encoder's output, actions [B, D′] are in [-1, 1]."""
+    """An actor and critics, such as `ActorAndCritics`.
+
+    h [B, H] is the encoder's output, and actions [B, D′] are in [-1, 1].
+    """
 
     flat: Tensor
     """[A + E + C] all parameters, those of the actor first, then the encoder's"""
@@ -45,51 +49,51 @@ class Networks(Protocol):
 
     @property
     def encode(self) -> Encoder:
-        """Makes h of features [B, D] and images [B, *leaf] uint8."""
+        """The module that computes h [B, H] from features [B, D] and images [B, *leaf] uint8."""
         ...
 
     def actor_params(self, h: Tensor) -> Tensor:
-        """The actor's output before the tangent, [B, D′] or [B, 2 D′]."""
+        """The actor's output before tanh, [B, D′] or [B, 2 D′]."""
         ...
 
     def params(self, x: Tensor, images: Sequence[Tensor] = ()) -> Tensor:
-        """The same for features [B, D] and images [B, *leaf] uint8."""
+        """Like `actor_params`, but for features [B, D] and images [B, *leaf] uint8."""
         ...
 
     def sample(self, h: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
-        """Actions and their log-densities [B], for noise [B, D′]."""
+        """Actions [B, D′] and their log-densities [B], for noise [B, D′]."""
         ...
 
     def values(self, h: Tensor, action: Tensor, *, constant: bool = False) -> Tensor:
-        """Values [critics, B]. `constant`: the critics get no gradient; the actions do."""
+        """Values [critics, B]. If `constant`, the actions get a gradient and the critics don't."""
         ...
 
     def acting_parameters(self) -> Floats:
-        """A copy of the parameters [P] that workers act with."""
+        """A copy of the parameters [P] with which workers act."""
         ...
 
 
 class Continuous(OffPolicy):
-    """An off-policy algorithm for a bounded Box: the networks, their targets, their optimizers and the source of noise."""
+    """An off-policy algorithm for a bounded Box: networks and their targets, optimizers, and the source of noise."""
 
     Config = ContinuousConfig
     ADAM: ClassVar[Mapping[str, Any]] = {}
-    """Arguments of torch's Adam, for the actor and the critics"""
+    """Arguments for torch's Adam, which trains the actor and the critics."""
     net: Networks
 
     @classmethod
     def bounded_policy_spec(
         cls, config: ContinuousConfig, observation: tuple[Leaf, ...], action: ActionSpec, **head: Any
     ) -> PolicySpec:
-        """The policy of these spaces. `head`: fields of `PolicySpec`.
+        """The policy for these spaces. The keyword arguments `head` are fields of `PolicySpec`.
 
-        Raises `UsageError`, with a one-line message, unless the action is a Box with finite bounds.
+        Raises `UsageError`, with a one-line message, unless the action space is a Box with finite bounds.
         """
         name = cls.__name__.lower()
         if action.kind != "box":
             others = "ppo or dqn" if action.kind == "discrete" else "ppo"
             raise UsageError(f"{name}: expected an action space Box, got {action.in_words}; take --algo {others} for it")
-        largest = min(float(np.finfo(kind).max) for kind in (action.dtype, "float32"))  # it stands for no bound
+        largest = min(float(np.finfo(kind).max) for kind in (action.dtype, "float32"))  # such a bound means "no bound"
         for low, high in zip(action.low, action.high, strict=True):
             if max(-low, high) >= largest:
                 raise UsageError(
@@ -108,38 +112,38 @@ class Continuous(OffPolicy):
         self._generator = torch.Generator().manual_seed(torch_seed(seed, Purpose.NOISE))
         self._counted = {"updates_per_step": config.updates_per_step, "env_steps": config.learning_starts, "made": 0}
         self._learning_starts = config.learning_starts
-        self._acts_at_once = False  # with a policy that is not from nothing, no uniform actions come first
+        self._acts_at_once = False  # True if the policy starts trained: then no uniform actions precede it
         self.tensors = {"parameters": self.net.flat, "target": self.target.flat}
         trained = {"actor_optimizer": self.net.actor, "critic_optimizer": self.net.critics}
         self.optimizers = {name: make_optimizer("adam", part, **self.ADAM) for name, part in trained.items()}
 
     def networks(self, device: str) -> Networks:
-        """New networks, the same each time: those that are trained, then their targets."""
+        """Make new networks, equal each time. Called twice: for the networks that are trained, and for their targets."""
         return actor_and_critics(self.policy, device, self.seed)
 
     def after_step(self, name: str) -> None:
-        """Called after each step of NAME_optimizer, also in cloning: returns weights to where an algorithm holds them."""
+        """Move weights back to where the algorithm keeps them. Called after each step of NAME_optimizer, even in cloning."""
 
     def begin_with_actor(self) -> None:
-        """The actor was trained before the first rollouts: it acts from the first env step, and its target equals it."""
+        """Let an actor that was trained before the first rollouts act from the first env step, and copy it to its target."""
         self.target.actor.copy_(self.net.actor)
         self._acts_at_once = True
 
     def steps_due(self) -> int:
-        """The gradient steps that the replay ratio demands now."""
-        ratio = Fraction(repr(self.config.updates_per_step))  # as it is written: 0.29 × 100 is 29
+        """The number of gradient steps that the replay ratio demands now."""
+        ratio = Fraction(repr(self.config.updates_per_step))  # the decimal number as written, so that 0.29 × 100 is 29
         steps = math.floor(ratio * max(0, self.env_steps - self._counted["env_steps"]))
         return max(0, int(self._counted["made"]) + steps - (self.gradient_steps - self.prior_gradient_steps))
 
     def noise(self, rows: int) -> Tensor:
-        """Normal noise [B, D′]."""
+        """Standard normal noise [B, D′], B being `rows`."""
         return torch.randn(rows, math.prod(self.policy.action.shape), generator=self._generator).to(self.net.flat)
 
     def transitions(self, sample: Sample | SequenceSample) -> Transitions:
-        """See `OffPolicy`; an action is a row of numbers, and x and next_x are encoded, so that losses need no images.
+        """See `OffPolicy`. Actions are flattened to [B, D′]; `x` and `next_x` are encoded, so losses need no images.
 
-        Images are shifted at random first. The loss of the critics trains the encoder through `rows.x`; next_x has no
-        gradient (Yarats et al. 2022, DrQ-v2).
+        Images are shifted at random before they are encoded. The loss of the critics trains the encoder through `rows.x`;
+        `next_x` has no gradient (Yarats et al. 2022, DrQ-v2).
         """
         rows = super().transitions(sample)
         rows = rows._replace(action=rows.action.reshape(len(rows.action), -1).to(rows.x))
@@ -158,10 +162,10 @@ class Continuous(OffPolicy):
         )
 
     def descend(self, name: str, loss: Tensor, numbers: Mapping[str, Tensor | float]) -> UpdateMetrics:
-        """Step the optimizer NAME_optimizer down the gradient of a loss, logged as NAME_loss.
+        """Step NAME_optimizer down the gradient of a loss. Returns metrics, with the loss as NAME_loss.
 
-        Sets the gradient to zero, differentiates the loss, raises `RunError` unless the loss, the numbers and the gradient's
-        norm are finite, and steps torch's Adam. Gradients are not clipped.
+        Raises `RunError` before the step unless the loss, the numbers and the gradient's norm are finite. Gradients are not
+        clipped.
         """
         optimizer = self.optimizers[f"{name}_optimizer"]
         found = self.differentiate(loss, optimizer, {**numbers, f"{name}_loss": loss})
@@ -171,13 +175,13 @@ class Continuous(OffPolicy):
         return found
 
     def weights(self) -> tuple[Floats, Floats]:
-        """Copies of the actor's parameters [P], and of the buffers: observation statistics, and what exploration needs."""
+        """Copies of the actor's parameters [P], and of the buffers: observation statistics, then exploration settings."""
         warm_up = float(self.env_steps < self.config.learning_starts and not self._acts_at_once)
         exploration = np.array([*self.exploration(), warm_up], np.float32)
         return self.net.acting_parameters(), np.concatenate((self.statistics, exploration))
 
     def exploration(self) -> list[float]:
-        """What the buffers of the policy hold between the statistics and the number that says whether it warms up."""
+        """The numbers in the policy's buffers between the statistics and the last one, which is 1 during the warm-up."""
         return []
 
     def other_state(self) -> dict[str, Any]:
@@ -187,7 +191,7 @@ class Continuous(OffPolicy):
         return super().other_state() | more
 
     def start_from(self, start: Start) -> None:
-        """See `Algorithm.start_from`. The policy acts from the first env step."""
+        """See `Algorithm.start_from`. The policy acts from the first env step, without a warm-up of uniform actions."""
         super().start_from(start)
         self._acts_at_once = True
 

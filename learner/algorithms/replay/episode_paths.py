@@ -1,8 +1,8 @@
-"""Which stored observations follow one another in an episode, so that a later one is found at once.
+"""Paths: which stored observations follow one another in an episode, so that a later one is found in constant time.
 
-Law: the paths are a function of the stored rows, and no part of a saved state: `rebuilt` makes them of the rows again. A
-path is the slots of an episode's observations, oldest first. The ring overwrites the oldest slot first, so a path loses its
-beginning before its end, and what follows a stored row is stored.
+Law: the paths are a function of the stored rows, and aren't part of a saved state: `rebuilt` computes them from the rows. A
+path is the list of the slots of an episode's observations, oldest first. The ring overwrites the oldest slot first, so a
+path loses its beginning before its end, and all observations that follow a stored row are stored.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from millrace.protocol.arrays import Bools, Doubles, Ints
 NO_SLOT = -1
 NO_PATH = -1
 FEW = 64
-"""Slots at the beginning of a path that may be left in memory when they are overwritten"""
+"""The number of overwritten slots that may stay at the beginning of a path, because removing each at once is slower."""
 
 
 @dataclass
@@ -26,11 +26,11 @@ class EpisodePath:
 
     slots: array[int] = field(default_factory=lambda: array("q"))
     first: int = 0
-    """place of `slots[0]` in the episode: what came before it is forgotten"""
+    """the place of `slots[0]` in the episode; earlier slots have been forgotten"""
 
     @property
     def end(self) -> int:
-        """The place after the newest one."""
+        """The place in the episode after its newest slot."""
         return self.first + len(self.slots)
 
 
@@ -38,18 +38,18 @@ class EpisodePaths:
     """The paths of all episodes in a ring of `size` slots."""
 
     def __init__(self, size: int) -> None:
-        self._number: Ints = np.full(size, NO_PATH)  # [size] of the path on which a slot is
-        self._place: Ints = np.zeros(size, np.int64)  # [size] where on it
+        self._number: Ints = np.full(size, NO_PATH)  # [size] the number of the path on which each slot is
+        self._place: Ints = np.zeros(size, np.int64)  # [size] the place of each slot on its path
         self._paths: dict[int, EpisodePath] = {}
         self._next = 0
 
     @staticmethod
     def memory_bytes(size: int) -> int:
-        """Memory of the paths in a ring of `size` slots, in bytes, without what arrays that grow have in reserve."""
+        """Memory of the paths in a ring of `size` slots, in bytes, without the spare capacity of growing arrays."""
         return 3 * size * np.dtype(np.int64).itemsize
 
     def overwrite(self, slots: Ints) -> None:
-        """Forget these slots [K], which are the oldest, oldest first."""
+        """Forget these slots [K], which must be the oldest ones, in order of age."""
         for number, place in zip(self._number[slots].tolist(), self._place[slots].tolist(), strict=True):
             if number == NO_PATH:
                 continue
@@ -63,7 +63,7 @@ class EpisodePaths:
         self._number[slots] = NO_PATH
 
     def append(self, slots: Ints, after: Ints) -> None:
-        """Put slots [K] on paths: each behind the slot `after` [K], the newest of its path; NO_SLOT: on a new path."""
+        """Append each of the slots [K] to the path whose newest slot is in `after` [K], or to a new path for NO_SLOT."""
         for slot, before in zip(slots.tolist(), after.tolist(), strict=True):
             if before == NO_SLOT:
                 number = self._next
@@ -77,7 +77,10 @@ class EpisodePaths:
             path.slots.append(slot)
 
     def later(self, slots: Ints, chance: Doubles) -> Ints:
-        """[K] for the slot of each row, one of the slots that follow it. `chance` [K], uniform in [0, 1): which one."""
+        """For each of the slots [K], one of the slots that follow it on its path.
+
+        `chance` [K], in [0, 1), selects which one: uniform random numbers draw uniformly.
+        """
         found = np.empty(len(slots), np.int64)
         wanted = zip(self._number[slots].tolist(), self._place[slots].tolist(), chance.tolist(), strict=True)
         for i, (number, place, part) in enumerate(wanted):
@@ -88,7 +91,10 @@ class EpisodePaths:
 
     @classmethod
     def rebuilt(cls, size: int, by_age: Ints, is_row: Bools, follows: Ints) -> EpisodePaths:
-        """The paths of stored rows. `by_age` [K]: the slots in use, oldest first. `is_row`, `follows` [size]: of each."""
+        """The paths of stored rows. `by_age` [K] are the slots in use, oldest first.
+
+        `is_row` [size] says which slots hold a row, and `follows` [size] is the slot of that row's next observation.
+        """
         paths = cls(size)
         leads = is_row.tolist()
         follow = follows.tolist()

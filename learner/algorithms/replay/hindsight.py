@@ -1,11 +1,11 @@
-"""Hindsight experience replay (Andrychowicz et al. 2017): a row is learned from as if what it led to had been the goal.
+"""Hindsight experience replay (Andrychowicz et al. 2017): learn from a row as if an outcome reached later were its goal.
 
-Law: a row says what an action did, whatever the goal was. So a row that is drawn may get as its goal one that was achieved
-later in its episode, if its reward and its end are computed anew for this goal. The learner runs no code of the environment:
-both must be functions of the two goals alone, which the user names. Each row that arrives is checked against them.
+Law: a row shows what an action did, whatever the goal was. So when a row is drawn, its goal may be replaced with one that
+was achieved later in its episode, if its reward and its end are recomputed for this goal. The learner runs no code of the
+environment: reward and end must be functions of the achieved and the desired goal alone, which the user names. Each row that
+arrives is checked against them.
 
-As gymnasium-robotics has it, reward and end of a row come from the achieved and the desired goal of its next observation.
-Pure: arrays in, arrays out.
+As in gymnasium-robotics, reward and end of a row depend on the achieved and the desired goal of its next observation. Pure.
 """
 
 from __future__ import annotations
@@ -27,30 +27,30 @@ from millrace.protocol.specs import Leaf
 
 ACHIEVED = "achieved_goal"
 DESIRED = "desired_goal"
-"""Keys of the observation, those of gymnasium-robotics"""
+"""The keys of the goals in the observation, as in gymnasium-robotics."""
 FLOAT32_ROUNDOFF = 2.0**-24
 EXAMPLE = "sparse:0.05"
 
 
 class GoalReward(Protocol):
-    """A reward that depends on nothing but two goals."""
+    """A reward function that depends on nothing but two goals."""
 
     def __call__(self, achieved: Doubles, desired: Doubles, /) -> Array:
-        """The rewards [B] of the rows that led to the achieved goals [B, G] while these goals [B, G] were desired."""
+        """The rewards [B] of rows that led to the goals `achieved` [B, G] while the goals `desired` [B, G] applied."""
         ...
 
 
 class Goals(NamedTuple):
-    """The goals that some rows of a draw get."""
+    """The replacement goals of some rows of a draw."""
 
     rows: Ints
-    """[K] which rows"""
+    """[K] the indices of these rows in the draw"""
     goal: Array
-    """[K, *goal] as observations hold it"""
+    """[K, *goal] the goals, in the form in which observations hold them"""
 
 
 class Outcome(NamedTuple):
-    """What a step is worth under a goal."""
+    """The rewards and ends of steps under some goals."""
 
     reward: Floats
     """[K]"""
@@ -65,13 +65,13 @@ def distance(achieved: Doubles, desired: Doubles) -> Doubles:
 
 
 def minus_distance(achieved: Doubles, desired: Doubles) -> Doubles:
-    """`dense`."""
+    """The reward that `dense` names."""
     return -distance(achieved, desired)
 
 
 @dataclass(frozen=True)
 class WithinDistance:
-    """`sparse:0.05` and `success:0.45`: one reward within this distance of the goal, another one beyond."""
+    """The reward that `sparse:0.05` and `success:0.45` name: one value within a distance of the goal, another beyond it."""
 
     within: float
     reward: float
@@ -83,7 +83,7 @@ class WithinDistance:
 
 
 def goal_reward(name: str) -> GoalReward:
-    """The reward that `--goal-reward` names. Raises `UsageError`, in one line."""
+    """The reward function that `--goal-reward` names. Raises `UsageError`, with a one-line message, if there is none."""
     if name == "dense":
         return minus_distance
     kind, _, number = name.partition(":")
@@ -91,7 +91,7 @@ def goal_reward(name: str) -> GoalReward:
         try:
             within = float(number)
         except ValueError:
-            pass  # a module of the user's own may be called so
+            pass  # the user's own module may have this name
         else:
             if not 0 <= within < math.inf:
                 raise UsageError(f"goal_reward {name}: expected a distance of at least 0, got {number}")
@@ -103,7 +103,7 @@ def goal_reward(name: str) -> GoalReward:
 
 
 def goals_of(observation: Sequence[Leaf]) -> tuple[int, int] | None:
-    """Which leaves of an observation are the achieved and the desired goal; None if it hasn't both, of one form."""
+    """The indices of the leaves with the achieved and the desired goal; None unless both exist and have one form."""
     paths = [leaf.path for leaf in observation]
     if ACHIEVED not in paths or DESIRED not in paths:
         return None
@@ -114,7 +114,7 @@ def goals_of(observation: Sequence[Leaf]) -> tuple[int, int] | None:
 
 
 def goals_not_used(config: AlgorithmConfig, observation: Sequence[Leaf], env: str) -> str:
-    """A line for the user if the observations have goals from which a run could learn in hindsight, and it doesn't."""
+    """A line for the user if the observations have goals but the run doesn't use hindsight; otherwise empty."""
     if not isinstance(config, OffPolicyConfig) or config.hindsight or goals_of(observation) is None:
         return ""
     return (
@@ -125,25 +125,28 @@ def goals_not_used(config: AlgorithmConfig, observation: Sequence[Leaf], env: st
 
 @dataclass(frozen=True)
 class Hindsight:
-    """Which rows of a draw get another goal, and what they are worth under it."""
+    """The settings of hindsight: how many rows of a draw get another goal, and how their outcome under it is computed."""
 
     share: float
-    """of the rows of a draw"""
+    """the fraction of the rows of a draw that get another goal"""
     achieved: int
     """the leaf of the observation that holds the achieved goal"""
     desired: int
     """the leaf that holds the desired goal"""
     name: str
-    """as settings name the reward"""
+    """the name of the reward function in the settings"""
     reward_of: GoalReward
     ends_within: float | None
-    """Distance from the goal at which the task ends; None if it doesn't end at its goal."""
+    """the distance from the goal at which the episode terminates; None if it doesn't terminate at its goal"""
     roundoff: float
-    """Largest relative error of a goal's numbers, as observations hold them."""
+    """the largest relative rounding error of a goal's numbers in observations"""
 
     @classmethod
     def of(cls, config: OffPolicyConfig, observation: Sequence[Leaf]) -> Hindsight | None:
-        """As the settings say; None if hindsight is off. Raises `UsageError`, in one line, if the run can't have it."""
+        """The hindsight that the settings ask for; None if it is off.
+
+        Raises `UsageError`, with a one-line message, if the run can't use it.
+        """
         if not config.hindsight:
             return None
         given = f"hindsight {config.hindsight:g}"
@@ -168,16 +171,17 @@ class Hindsight:
             name=config.goal_reward,
             reward_of=goal_reward(config.goal_reward),
             ends_within=config.goal_ends,
-            # A reward travels as float32, and the environment may compute it so.
+            # Rewards are sent as float32, and the environment may compute them in float32.
             roundoff=max(FLOAT32_ROUNDOFF, own_roundoff),
         )
 
     # ---------------------------------------------------------------- under another goal
 
     def outcome(self, achieved: Array, desired: Array, terminated: Bools, goal: Array) -> Outcome:
-        """What steps are worth under the goals [K, *goal]. They led to the achieved goals, under the desired ones.
+        """The rewards and ends [K] of steps under other goals `goal` [K, *goal].
 
-        `terminated` [K]: whether they ended the task then. An end that didn't come from the desired goal stays.
+        The steps led to the goals `achieved` while `desired` applied, and `terminated` [K] says which of them terminated
+        their episode then. A termination whose cause wasn't the desired goal stays.
         """
         led_to = _flat(achieved)
         wanted = _flat(goal)
@@ -188,7 +192,7 @@ class Hindsight:
         return Outcome(reward, (terminated & ~by_goal) | (distance(led_to, wanted) <= self.ends_within))
 
     def rewards(self, achieved: Doubles, desired: Doubles) -> Doubles:
-        """The rewards [B] of goals [B, G]. Raises `UsageError` if the user's function fails or returns something else."""
+        """The rewards [B] for goals [B, G]. Raises `UsageError` if the user's function fails or returns something else."""
         what = f"goal_reward {self.name}"
         try:
             found = self.reward_of(achieved, desired)
@@ -204,16 +208,17 @@ class Hindsight:
     # ---------------------------------------------------------------- the check of what arrives
 
     def check(self, batch: Batch) -> None:
-        """Raise `UsageError`, in one line, unless rewards and ends of all valid rows are those of their goals.
+        """Raise `UsageError`, with a one-line message, unless rewards and ends of all valid rows agree with their goals.
 
-        Goals may have been rounded after the reward was computed, and the reward was rounded to float32. So a row is right
-        if its reward lies between those of its goals, of goals that are as near to each other as rounding may have moved
-        them, and of goals that are as far. For a function of their distance these bounds hold exactly.
+        Goals may have been rounded after the reward was computed, and the reward was rounded to float32. So the reward is
+        computed for three pairs of goals: for the pair as it is, and for the pair as near together, and as far apart, as it
+        may have been before rounding. A row is right if its reward lies between the lowest and the highest of the three.
+        For a function of the goals' distance these bounds hold exactly.
         """
         valid = batch.valid
         achieved = _flat(batch.obs[self.achieved][1:][valid])
         desired = _flat(batch.obs[self.desired][1:][valid])
-        got = batch.reward[valid].astype(np.float64) + 0.0  # an error shows -0 as 0
+        got = batch.reward[valid].astype(np.float64) + 0.0  # adding 0 lets errors show -0 as 0
         if not len(got):
             return
         expected = self.rewards(achieved, desired)
@@ -237,9 +242,10 @@ class Hindsight:
         self._check_ends(batch, batch.terminated[valid], achieved, desired, far)
 
     def _check_ends(self, batch: Batch, terminated: Bools, achieved: Doubles, desired: Doubles, far: Doubles) -> None:
-        """Raise `UsageError` unless the task ends at its goal if and only if `goal_ends` says so.
+        """Raise `UsageError` unless episodes terminate at their goal if and only if `goal_ends` says so.
 
-        A task may end elsewhere too. So it ends at its goal unasked only if it does wherever the reward says it is reached.
+        Episodes may terminate elsewhere too. So they count as terminating at their goal only if all rows terminate in which
+        the goal is reached according to the reward.
         """
         ends_within = -1.0 if self.ends_within is None else self.ends_within
         given = "goal_ends none" if self.ends_within is None else f"goal_ends {ends_within:g}"
@@ -262,7 +268,7 @@ class Hindsight:
                 )
 
     def _moved(self, achieved: Doubles, desired: Doubles) -> tuple[Doubles, Doubles]:
-        """The achieved goals as near to the desired ones, and as far from them, as rounding may have moved them.
+        """The achieved goals moved as near to the desired ones, and as far from them, as they may have been before rounding.
 
         Each number of a goal was rounded once, and a norm of G numbers has a relative error of G/2 + 2 roundoffs.
         """
@@ -275,12 +281,12 @@ class Hindsight:
 
 
 def _flat(goals: Array) -> Doubles:
-    """Goals [B, *goal] as [B, G] float64."""
+    """Flatten goals [B, *goal] to [B, G] float64."""
     return goals.reshape(len(goals), math.prod(goals.shape[1:])).astype(np.float64)
 
 
 def _place(batch: Batch, index: int) -> str:
-    """Which valid row of a batch this is, in words."""
+    """Describe where the valid row with this index is in a batch, for an error message."""
     step, column = np.argwhere(batch.valid)[index].tolist()
     return f"lane {batch.lane[column]}, column {column % batch.columns_per_rollout}, step {step} of its rollout"
 

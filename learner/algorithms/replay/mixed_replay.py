@@ -1,7 +1,7 @@
 """A replay buffer with prior data: a fixed share of each draw is transitions of a dataset (RLPD, Ball et al. 2023).
 
-Rule: only own transitions are added, overwritten and taken back, and only they have priorities. Prior transitions stay as
-they are and are drawn uniformly. They are no part of a saved state: whoever loads it has added the same dataset before.
+Rule: only the run's own transitions are added, overwritten and rolled back, and only they have priorities. Prior transitions
+never change and are drawn uniformly. They aren't part of a saved state: add the same dataset before you load the state.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ PRIOR_SLOT = -1  # `Sample.slots` of a prior transition
 
 
 def check_dataset_fits_memory(content: Content) -> None:
-    """Raise `UsageError` if a dataset of this size does not fit the free memory. It takes its own size, once."""
+    """Raise `UsageError` if a dataset of this size does not fit into the free memory. Checkpoints make no copy of it."""
     needed = content.bytes
     free = available_bytes()
     if free is not None and needed > free:
@@ -40,16 +40,17 @@ class PriorTransitions(ReplayBuffer):
 
 
 class MixedReplay(ReplayBuffer):
-    """Own transitions, and prior ones if there are any. A draw has its prior transitions at its end."""
+    """The run's own transitions, and prior ones if there are any. In a draw, the prior transitions come last."""
 
     prior: ReplayBuffer | None = None
     _prior_share = 0.0
     _remembered_prior: Any = None
 
     def add_prior(self, batches: Iterable[Batch], slots: int, share: float) -> None:
-        """Store prior transitions. `slots`: how many observations they have. `share`: of each draw, how much is prior.
+        """Store prior transitions.
 
-        Raises `UsageError` if memory is too small, or, with hindsight, if rewards are not those of the goals.
+        `slots` is the number of their observations, and `share` the fraction of each draw that is prior. Raises `UsageError`
+        if memory is too small, or, with hindsight, if the rewards don't agree with the goals.
         """
         prior = PriorTransitions(
             self._content.observation,
@@ -69,7 +70,7 @@ class MixedReplay(ReplayBuffer):
         self._prior_share = share
 
     def sample(self, count: int, beta: float = 1.0) -> Sample:
-        """Draw transitions with replacement: all prior ones while there are no others. `beta`: as in `ReplayBuffer`."""
+        """Draw transitions with replacement; only prior ones until there are others. For `beta`, see `ReplayBuffer`."""
         if self.prior is None:
             return super().sample(count, beta)
         prior = round(self._prior_share * count) if len(self) else count
@@ -80,19 +81,19 @@ class MixedReplay(ReplayBuffer):
         return parts[0] if len(parts) == 1 else _joined(*parts)
 
     def samples(self, number: int, count: int, beta: float = 1.0) -> Iterator[Sample]:
-        """So many draws of `count` transitions, as by `sample`."""
+        """Yield `number` draws of `count` transitions each, as by `sample`."""
         if self.prior is None:
             return super().samples(number, count, beta)
         return (self.sample(count, beta) for _ in range(number))
 
     def update_priorities(self, slots: Ints, error: Floats) -> None:
-        """Set the priorities of the own transitions among these slots [B] from their errors [B]."""
+        """Set the priorities of the run's own transitions among these slots [B], from their errors [B]."""
         own = slots != PRIOR_SLOT
         if own.any():
             super().update_priorities(slots[own], error[own])
 
     def remember(self) -> None:
-        """Remember this state, for `roll_back`."""
+        """Remember the current state, for `roll_back`."""
         super().remember()
         self._remembered_prior = _generator_state(self.prior)
 
@@ -103,7 +104,7 @@ class MixedReplay(ReplayBuffer):
             self.prior.generator.bit_generator.state = self._remembered_prior
 
     def state_dict(self) -> dict[str, Any]:
-        """A copy of the own slots in use, and of what decides which prior transition is drawn next."""
+        """A copy of the run's own slots in use, and of the random generator that draws prior transitions."""
         state = super().state_dict()
         return (
             state
@@ -112,7 +113,7 @@ class MixedReplay(ReplayBuffer):
         )
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from a `state_dict`, bit for bit. Raises ValueError if it has another size, or other prior data."""
+        """Continue from a `state_dict`, bit for bit. Raises ValueError if the size, or that of the prior data, differs."""
         had = state.get("prior", {}).get("rows", 0)
         has = 0 if self.prior is None else len(self.prior)
         if had != has:
@@ -123,7 +124,7 @@ class MixedReplay(ReplayBuffer):
 
 
 def _joined(own: Sample, prior: Sample) -> Sample:
-    """One draw of two."""
+    """Join two draws into one, field by field."""
 
     def joined(one: Any, other: Any) -> Any:
         if isinstance(one, tuple):

@@ -1,11 +1,11 @@
-"""An update from a replay buffer, but for its gradient steps: continuous.py and ../dqn.py say how many are due.
+"""The base of the algorithms with a replay buffer: an update, except for its gradient steps.
 
-It is the base of DQN, and with continuous.py of SAC, TD3 and the like. These write `steps_due`, and `step`, which makes one
-gradient step and adds 1 to `gradient_steps`.
+DQN derives from it, and by way of continuous.py so do SAC, TD3 and the like. They define `steps_due`, the number of gradient
+steps of an update, and `step`, which takes one gradient step, adds 1 to `gradient_steps` and moves the target networks.
 
-No sockets, no files, no clock; seeded. The buffer holds raw observations and rewards. They are normalized when they are
-drawn, with the current statistics. A subclass moves its target networks itself, in `step`. With one torch thread on a CPU
-the same batches give the same bits, also after `load_state_dict`.
+The buffer holds raw observations and rewards. They are normalized when they are drawn, with the current statistics. With one
+torch thread on a CPU, the same batches give the same bits, even after `load_state_dict`. This file uses no sockets, no files
+and no clock, and all randomness comes from the seed.
 """
 
 from __future__ import annotations
@@ -33,27 +33,27 @@ from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
 
 
 class CriticLoss(NamedTuple):
-    """What an algorithm says of the values of a minibatch."""
+    """The loss of the critics, or of the Q-network, on a minibatch."""
 
     loss: Tensor
-    """a tensor of no dimension"""
+    """the loss, a 0-dimensional tensor"""
     error: Tensor
-    """[B] TD errors, or their sizes: prioritized replay draws by the sizes"""
+    """[B] TD errors, or their absolute values, from which prioritized replay computes priorities"""
     numbers: Mapping[str, Tensor | float]
-    """to log, by name"""
+    """the numbers to log, by name"""
 
 
 class OffPolicy(GradientDescent):
-    """An algorithm with a replay buffer. An update adds a batch to the buffer and makes the gradient steps that are due.
+    """An algorithm with a replay buffer. An update adds a batch to the buffer and takes the gradient steps that are due.
 
-    A subclass writes `__init__`, `steps_due`, `step` and `weights`.
+    A subclass defines `__init__`, `steps_due`, `step` and `weights`.
     """
 
     Config: ClassVar[type[AlgorithmConfig]] = OffPolicyConfig
 
     @staticmethod
     def policy_spec(config: Any, observation: tuple[Leaf, ...], action: ActionSpec) -> PolicySpec:
-        """See `Algorithm.policy_spec`. Raises `UsageError` if the run can't have the hindsight that its settings want."""
+        """See `Algorithm.policy_spec`. Raises `UsageError` if the settings ask for hindsight that the run can't use."""
         Hindsight.of(config, observation)
         spec = GradientDescent.policy_spec(config, observation, action)
         return replace(spec, core=config.core, core_size=config.core_size)
@@ -61,8 +61,8 @@ class OffPolicy(GradientDescent):
     def __init__(self, config: OffPolicyConfig, policy: PolicySpec, *, total_steps: int, seed: int) -> None:
         super().__init__(config, policy, total_steps=total_steps)
         self.replay = self._make_replay(config, policy, seed)
-        self.gradient_steps = 0  # what Stable-Baselines3 calls n_updates
-        self.prior_gradient_steps = 0  # of these, the ones before the first rollouts
+        self.gradient_steps = 0  # all gradient steps so far, which Stable-Baselines3 calls n_updates
+        self.prior_gradient_steps = 0  # those of them that preceded the first rollouts
 
     @staticmethod
     def _make_replay(config: OffPolicyConfig, policy: PolicySpec, seed: int) -> MixedReplay | SequenceReplay:
@@ -89,19 +89,19 @@ class OffPolicy(GradientDescent):
 
     @abstractmethod
     def steps_due(self) -> int:
-        """The number of gradient steps of this update, whose batch is in the buffer and counted in `env_steps`."""
+        """The number of gradient steps of this update, whose batch is already in the buffer and counted in `env_steps`."""
 
     @abstractmethod
     def step(self, rows: Transitions) -> tuple[UpdateMetrics, Tensor]:
-        """One gradient step on a minibatch. Adds 1 to `gradient_steps`. Returns what it measured, and the TD errors [B].
+        """Take one gradient step on a minibatch, and add 1 to `gradient_steps`. Returns its metrics, and the TD errors [B].
 
-        Raises `RunError` when a loss or a gradient is not finite, before it reaches the weights.
+        If a loss or a gradient is not finite, raises `RunError` before it reaches the weights.
         """
 
     def update(self, batch: Batch, pulse: Callable[[], None]) -> UpdateMetrics:
-        """Add a batch to the replay buffer and learn from it, calling `pulse` between gradient steps. Returns metrics.
+        """Add a batch to the replay buffer, and take the gradient steps that are due, with `pulse` between. Returns metrics.
 
-        Raises `RunError` when a loss or a gradient is not finite, before it reaches the weights.
+        If a loss or a gradient is not finite, raises `RunError` before it reaches the weights.
         """
         self.set_schedules()
         beta = 1 - (1 - self.config.priority_beta) * self.remaining()
@@ -122,7 +122,10 @@ class OffPolicy(GradientDescent):
         return metrics
 
     def steps(self, number: int, pulse: Callable[[], None], beta: float = 1.0) -> Iterator[UpdateMetrics]:
-        """Gradient steps on minibatches of the replay buffer and of prior data. `beta`: see `ReplayBuffer.sample`."""
+        """Take gradient steps on minibatches of the replay buffer and of prior data, yielding the metrics of each.
+
+        For `beta`, see `ReplayBuffer.sample`.
+        """
         for sample in self.replay.samples(number, self.config.batch_size, beta):
             metrics, error = self.step(self.transitions(sample))
             if self.replay.prioritized:
@@ -131,7 +134,7 @@ class OffPolicy(GradientDescent):
             pulse()
 
     def transitions(self, sample: Sample | SequenceSample) -> Transitions:
-        """A sample on the device of the weights, with observations and rewards normalized if the settings say so."""
+        """A sample as tensors on the device of the weights, with observations and rewards normalized if so set."""
         if isinstance(sample, SequenceSample):
             return self._of_sequences(sample)
         next_x, next_images = self.inputs(sample.next_leaves)
@@ -175,15 +178,15 @@ class OffPolicy(GradientDescent):
         )
 
     def _number(self, array: Array) -> Tensor:
-        """In the dtype of the weights."""
+        """The array as a tensor with the dtype and on the device of the weights."""
         return self.tensor(array).to(self.net.flat.dtype)
 
     # ---------------------------------------------------------------- prior data
 
     def add_prior(self, prior: PriorData) -> None:
-        """Store the rows of a dataset beside the replay buffer. They count for all statistics.
+        """Store the rows of a dataset alongside the replay buffer, and count them in all running statistics.
 
-        Raises `UsageError` with a recurrent core: a dataset has no states of it.
+        Raises `UsageError` if the policy has a recurrent core, because a dataset has no states of a core.
         """
         if isinstance(self.replay, SequenceReplay):
             raise UsageError(f"prior: expected no recurrent core, got {self.policy.core}; take --core none, or no --prior")
@@ -197,8 +200,8 @@ class OffPolicy(GradientDescent):
         self.statistics = self.normalizer.buffers()
 
     def learn_from_prior(self, pulse: Callable[[], None]) -> None:
-        """Make `prior_steps` gradient steps on prior data alone, less those that were made."""
-        self.set_schedules()  # a state that was loaded may have another learning rate
+        """Take `prior_steps` gradient steps on prior data alone, less those already taken."""
+        self.set_schedules()  # a loaded state may have brought another learning rate
         for _ in self.steps(self.config.prior_steps - self.prior_gradient_steps, pulse):
             self.prior_gradient_steps += 1
 
@@ -216,7 +219,7 @@ class OffPolicy(GradientDescent):
         self.prior_gradient_steps = state["prior_gradient_steps"]
 
     def state_dict(self) -> dict[str, Any]:
-        """See `GradientDescent`; with the replay buffer."""
+        """See `GradientDescent`. The state includes the replay buffer."""
         return super().state_dict() | {"replay": self.replay.state_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -225,7 +228,7 @@ class OffPolicy(GradientDescent):
         self.replay.load_state_dict(state["replay"])
 
     def remember(self) -> None:
-        """Remember this state, for `roll_back`. Of the replay buffer, only what changes from now on is copied."""
+        """Remember the current state, for `roll_back`. The replay buffer only copies slots before it changes them."""
         self._remembered = super().state_dict()
         self.replay.remember()
 

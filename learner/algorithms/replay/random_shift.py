@@ -1,7 +1,7 @@
-"""Random shift of images (Kostrikov et al. 2021, DrQ): critics that see few pictures often do not learn them by heart.
+"""Random shifts of images (Kostrikov et al. 2021, DrQ), which keep critics from memorizing the images in the buffer.
 
-Rule: each image of a minibatch is moved by whole pixels, up to a number in each direction, and its border is repeated. All
-channels move together, so a stack of frames keeps what moved between them.
+Rule: each image of a minibatch is moved by a random number of whole pixels in each direction, up to a limit, and its border
+pixels are repeated. All channels move together, so the motion between the frames of a stack is preserved.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from torch import Tensor
 
 
 def random_shift(images: Tensor, most: int, *, channels_last: bool, generator: torch.Generator) -> Tensor:
-    """Images [B, H, W, C] or [B, C, H, W] of any dtype, each moved by -most to most pixels in both directions."""
+    """Images [B, H, W, C] or [B, C, H, W] of any dtype, each moved by -most to most pixels along both axes."""
     if not most:
         return images
     pixels = images if channels_last else images.movedim(1, 3)

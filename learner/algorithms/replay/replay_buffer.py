@@ -1,17 +1,20 @@
-"""The replay buffer: keeps rows, and draws n-step transitions, uniformly or by priority. No sockets, no files; seeded.
+"""The replay buffer: stores rows, and draws n-step transitions, uniformly or by priority.
 
 It is a ring of preallocated numpy arrays. A slot holds a raw observation. If a valid row began with it, the slot also holds
 that row: action, reward, whether it terminated, and the slot of the next observation. So each observation is stored once
-(of a frame stack each frame, `shared_channels.py`), and n-step returns follow the rows from slot to slot when they are
-drawn. A slot without a row holds the final observation of a truncated episode, or the newest observation of an env copy,
-whose row comes with its next rollout.
+(or each frame of a frame stack, see `shared_channels.py`), and n-step returns follow the rows from slot to slot when they
+are drawn. A slot without a row holds the final observation of a truncated episode, or the newest observation of an env copy,
+whose row arrives with its next rollout.
 
 Rule: rows that are not valid are never stored. A row's next observation is newer than the row, and the ring overwrites
-the oldest slot first. So a row that is still stored always finds the rows that follow it: those of the same seat, however
-long it waits between them. The observation in which it waits is the one that its row led to, and stands in that slot.
+the oldest slot first. So a row that is still stored always finds the rows that follow it. These are rows of the same seat,
+however long the seat waits between them: while it waits, its observation is the one that its last row led to, which is
+stored once.
 
 With hindsight (`hindsight.py`), a share of the rows get another goal when they are drawn. Then the final observation of a
 terminated episode has a slot too, because it holds the goal that was achieved last.
+
+This file uses no sockets and no files, and all randomness comes from the seed.
 """
 
 from __future__ import annotations
@@ -37,30 +40,30 @@ from millrace.protocol.rollout import Batch
 from millrace.protocol.specs import ActionSpec, Leaf
 
 PRIORITY_OFFSET = 1e-6  # added to errors, so that every transition can be drawn again
-DRAWN_AT_ONCE = 1 << 20  # bytes of the transitions that are drawn together, at most: they stay in the cache
+DRAWN_AT_ONCE = 1 << 20  # the most bytes of transitions to draw together, so that they stay in the cache
 DISCRETE = ActionSpec("discrete", (), "int64")
 
 
 def row_dtype(action: ActionSpec) -> np.dtype[Any]:
-    """The record of a row: one record, so that drawing a row is one copy."""
+    """The dtype of a row: a single record, so that drawing a row is a single copy."""
     fields = [("follows", "i8"), ("reward", "f4"), ("terminated", "?"), ("is_row", "?")]
     return np.dtype([("action", action.stored_dtype, action.shape), *fields], align=True)
 
 
 class Sample(NamedTuple):
-    """B transitions of n steps, or of fewer where the episode ends or the stored rows end."""
+    """B transitions of k steps, where k is n, or less if the episode or the stored rows end sooner."""
 
-    slots: Ints  # [B] of their first rows
+    slots: Ints  # [B] the slots of their first rows
     leaves: tuple[Array, ...]  # [B, *leaf] each
     action: Array  # [B, *action] int64 or float32, as rows store them
-    reward: Floats  # [B] Σ γⁱ r over its k steps
-    discount: Floats  # [B] γᵏ; 0 where the task ended
+    reward: Floats  # [B] Σ γⁱ r over the k steps
+    discount: Floats  # [B] γᵏ; 0 where the episode terminated
     next_leaves: tuple[Array, ...]  # [B, *leaf] each, k steps later
-    weight: Floats  # [B] importance-sampling weight of the loss, at most 1
+    weight: Floats  # [B] importance-sampling weight in the loss, at most 1
     next_mask: Bools | None = None  # [B, choices] actions allowed in the next observation; None without action masks
 
     def part(self, rows: slice) -> Sample:
-        """Some of these transitions, without a copy."""
+        """A range of these transitions, as views."""
         return Sample(
             self.slots[rows],
             tuple(leaf[rows] for leaf in self.leaves),
@@ -74,17 +77,17 @@ class Sample(NamedTuple):
 
 
 class Content(NamedTuple):
-    """What a replay buffer holds, as far as its memory depends on it."""
+    """The properties of a replay buffer on which its memory depends."""
 
     observation: tuple[Leaf, ...]
     size: int
-    """slots"""
+    """the number of slots"""
     prioritized: bool = False
     action: ActionSpec = DISCRETE
     linked: bool = False
-    """whether it can find the later rows of an episode"""
+    """whether it stores the paths that lead to the later rows of an episode"""
     choices: int = 0
-    """of an action mask; 0 without masks"""
+    """the number of choices in an action mask; 0 without masks"""
 
     @property
     def bytes(self) -> int:
@@ -99,7 +102,7 @@ class Content(NamedTuple):
 def check_fits_memory(content: Content) -> None:
     """Raise `UsageError`, which names a size that fits, if the memory is too small for the buffer and a copy of it.
 
-    A checkpoint makes such a copy.
+    Writing a checkpoint makes such a copy.
     """
     size = content.size
     needed = 2 * content.bytes
@@ -115,18 +118,18 @@ def check_fits_memory(content: Content) -> None:
 
 
 class Overwritten(NamedTuple):
-    """What some slots held before they were written."""
+    """The contents of some slots before they were written."""
 
     slots: Ints  # [K]
-    rows: Array  # [K] of `row_dtype`
-    weights: Doubles | None  # [K] of the sum tree
-    leaves: tuple[Array, ...]  # [K, *leaf] each; none where only rows or priorities are written
+    rows: Array  # [K] with dtype `row_dtype`
+    weights: Doubles | None  # [K] their weights in the sum tree; None without priorities
+    leaves: tuple[Array, ...]  # [K, *leaf] each; empty if only rows or priorities were written
 
 
 def _goes_on(ends: EpisodeEnds, continues: Bools) -> Bools:
-    """[T+1, N] whether row t begins with an observation that is stored, because the row before it in its episode led there.
+    """[T+1, N] True where row t begins with an observation that is stored already, because the previous row led to it.
 
-    `continues` [N]: whether row 0 does. With seats, rows that are not valid may stand between the two.
+    `continues` [N] says this for row 0. With seats, rows that are not valid may stand between a row and the previous one.
     """
     goes_on = np.concatenate([continues[None], ends.valid & ~ends.ended])
     if ends.with_seats:
@@ -153,36 +156,36 @@ class ReplayBuffer(Rewinding[Overwritten]):
         action: ActionSpec = DISCRETE,
         hindsight: Hindsight | None = None,
     ) -> None:
-        """`action`: the action space. `alpha`: draw in proportion to |error|^alpha, or uniformly if None.
+        """`size` is the number of slots. Transitions are drawn in proportion to |error|^alpha, or uniformly if it is None.
 
         Raises `UsageError` if memory is too small.
         """
         self._content = Content(observation, size, alpha is not None, action, linked=hindsight is not None)
-        self.size = size  # slots
+        self.size = size  # number of slots
         self._check_memory(self._content)
-        self._transition_bytes = 2 * self._content.bytes // size  # of a draw: two observations
+        self._transition_bytes = 2 * self._content.bytes // size  # a drawn transition has two observations
         self._n_step = n_step
         self._gamma = gamma
         self._alpha = alpha
         self._seed = seed
         self.generator = generator(seed, self._purpose)  # decides what is drawn
         self._obs = tuple(self._room(leaf) for leaf in observation)
-        self._mask: Bools | None = None  # [size, choices], as `_obs`; made when the first masks come
+        self._mask: Bools | None = None  # [size, choices], the masks of `_obs`; allocated when the first masks arrive
         self._row = np.zeros(size, row_dtype(action))
-        self._action: Array = self._row["action"]  # this and the next four: views of `_row`
+        self._action: Array = self._row["action"]  # this array and the next four are views of `_row`
         self._reward: Floats = self._row["reward"]
         self._terminated: Bools = self._row["terminated"]
-        self._follows: Ints = self._row["follows"]  # slot of the next observation; itself if that one is not stored
+        self._follows: Ints = self._row["follows"]  # slot of the next observation; its own slot if that is not stored
         self._is_row: Bools = self._row["is_row"]
         self._tree = None if alpha is None else SumTree(size)
         self._hindsight = hindsight
         self._paths = None if hindsight is None else EpisodePaths(size)
-        self._highest = 1.0  # greatest priority so far: new transitions get it
-        self._written = 0  # slots ever written; the next one is this, modulo the size
+        self._highest = 1.0  # the highest priority so far, which new transitions get
+        self._written = 0  # number of slots ever written; modulo the size, it is the next slot
         self._rows = 0
         self._remembered: Remembered | None = None
-        self._overwritten: list[Overwritten] = []  # since `remember`, oldest first
-        self._newest: dict[int, Ints] = {}  # lane -> [columns] value of `_written` when the last observation was written
+        self._overwritten: list[Overwritten] = []  # contents saved since `remember`, oldest first
+        self._newest: dict[int, Ints] = {}  # by lane, [columns] the `_written` at which the last observation was stored
 
     def __len__(self) -> int:
         """The number of transitions that can be drawn."""
@@ -200,10 +203,10 @@ class ReplayBuffer(Rewinding[Overwritten]):
     # ---------------------------------------------------------------- writing
 
     def add(self, batch: Batch) -> None:
-        """Store the valid rows.
+        """Store the valid rows of a batch.
 
-        Raises `UsageError` when a single rollout does not fit, or the first masks do not, or, with hindsight, if rewards are
-        not those of the goals.
+        Raises `UsageError` if a single rollout does not fit, if there is no memory for the first action masks, or, with
+        hindsight, if the rewards don't agree with the goals.
         """
         if self._hindsight is not None:
             self._hindsight.check(batch)
@@ -211,7 +214,7 @@ class ReplayBuffer(Rewinding[Overwritten]):
             self._make_mask(batch.mask.shape[-1])
         if not self._written:
             self._share_channels([leaf[:, 0] for leaf in batch.obs])
-        for at in range(0, len(batch.lane), batch.columns_per_rollout):  # rollouts of a lane are in the order of collection
+        for at in range(0, len(batch.lane), batch.columns_per_rollout):  # rollouts of a lane are in order of collection
             self._add(batch, slice(at, at + batch.columns_per_rollout), int(batch.lane[at]))
 
     def _add(self, batch: Batch, columns: slice, lane: int) -> None:
@@ -222,15 +225,15 @@ class ReplayBuffer(Rewinding[Overwritten]):
         if most > self.size:
             raise UsageError(f"replay_size {self.size}: a rollout takes up to {most}; take --replay-size {most} or more")
         fresh = batch.fresh[columns]
-        known = NO_SLOT if fresh.all() else self._newest.get(lane, NO_SLOT)  # of a fresh lane, perhaps of another size
+        known = NO_SLOT if fresh.all() else self._newest.get(lane, NO_SLOT)  # the old array may not fit a fresh lane
         newest = np.where(fresh, NO_SLOT, known)
         continues = self._continues([leaf[0] for leaf in obs], newest, most)
         goes_on = _goes_on(EpisodeEnds.of(batch).columns(columns), continues)  # [T+1, N]
-        leads = valid & ~terminated if self._paths is None else valid  # [T, N] to an observation to store
+        leads = valid & ~terminated if self._paths is None else valid  # [T, N] rows whose next observation is stored
         needed = np.zeros(goes_on.shape, bool)  # [T+1, N] observations to store
         needed[:-1] = valid & ~goes_on[:-1]
         needed[1:] |= leads
-        written = np.full(needed.shape, NO_SLOT)  # [T+1, N] value of `_written` for each
+        written = np.full(needed.shape, NO_SLOT)  # [T+1, N] the `_written` at which each observation is stored
         written[needed] = self._written + np.arange(np.count_nonzero(needed))
         written[0][continues] = newest[continues]
         written = np.maximum.accumulate(written)  # while a seat waits, its newest observation stays where it is
@@ -246,7 +249,7 @@ class ReplayBuffer(Rewinding[Overwritten]):
         if self._tree is not None:
             self._tree.set(new, 0.0)
         if self._paths is not None:
-            before = np.full(needed.shape, NO_SLOT)  # [T+1, N] slot of the row that led to an observation
+            before = np.full(needed.shape, NO_SLOT)  # [T+1, N] slot of the row that led to each observation
             before[1:][valid] = slot[:-1][valid]
             self._paths.overwrite(new)
             self._paths.append(new, before[needed])
@@ -271,14 +274,14 @@ class ReplayBuffer(Rewinding[Overwritten]):
             self._mask = np.ones((self.size, choices), bool)
 
     def _share_channels(self, first: Sequence[Array]) -> None:
-        """Store the channels of images once each where the first ones, of a copy's rollout, show that it saves memory."""
+        """Share equal channels of image leaves if the first images, from one copy's rollout, show that it saves memory."""
         self._obs = tuple(
             self._room(leaf, shared=leaf.is_image and SharedChannels.worthwhile(leaf, images))
             for leaf, images in zip(self._content.observation, first, strict=True)
         )
 
     def _room(self, leaf: Leaf, *, shared: bool = False) -> Array | SharedChannels:
-        """For an array of each observation."""
+        """Allocate the array that holds a leaf of each observation."""
         return SharedChannels(self.size, leaf) if shared else np.zeros((self.size, *leaf.shape), leaf.dtype)
 
     def _per_observation(self) -> tuple[Array | SharedChannels, ...]:
@@ -286,7 +289,7 @@ class ReplayBuffer(Rewinding[Overwritten]):
         return self._obs if self._mask is None else (*self._obs, self._mask)
 
     def _continues(self, first: Sequence[Array], newest: Ints, room: int) -> Bools:
-        """[N] whether a copy's rollout begins with the newest observation that is stored for it. `newest` [N]: where.
+        """[N] True where a copy's rollout begins with the newest observation stored for it, whose `_written` is in `newest`.
 
         The observations are compared, in case a caller that stacks rollouts itself has left one out. The stored observation
         must also be so new that adding this rollout does not overwrite it.
@@ -300,7 +303,10 @@ class ReplayBuffer(Rewinding[Overwritten]):
     # ---------------------------------------------------------------- reading
 
     def sample(self, count: int, beta: float = 1.0) -> Sample:
-        """Draw transitions with replacement. `beta`: how much the weights correct for the priorities; 1 corrects fully."""
+        """Draw `count` transitions with replacement.
+
+        `beta` sets how far importance weights correct for the priorities: 1 corrects fully.
+        """
         slots, row, weight = self._uniform(count) if self._tree is None else self._by_priority(self._tree, count, beta)
         goals = None if self._hindsight is None else self._other_goals(self._hindsight.share, slots)
         reward, discount, last = self._follow(row, goals)
@@ -316,7 +322,7 @@ class ReplayBuffer(Rewinding[Overwritten]):
         )
 
     def _other_goals(self, share: float, slots: Ints) -> Goals:
-        """Goals for a share of the rows in these slots: each was achieved at a later step of its row's episode."""
+        """Other goals for a random share of the rows in these slots, each achieved at a later step of the row's episode."""
         assert self._paths is not None
         assert self._hindsight is not None
         rows = np.flatnonzero(self.generator.random(len(slots)) < share)
@@ -324,16 +330,16 @@ class ReplayBuffer(Rewinding[Overwritten]):
         return Goals(rows, self._obs[self._hindsight.achieved][later])
 
     def _leaves(self, slots: Ints, goals: Goals | None) -> tuple[Array, ...]:
-        """Copies of the observations in these slots, with other goals if there are any."""
+        """Copies of the observations in these slots, with their goals replaced if `goals` are given."""
         leaves = tuple(leaf[slots] for leaf in self._obs)
         if goals is not None and self._hindsight is not None:
             leaves[self._hindsight.desired][goals.rows] = goals.goal
         return leaves
 
     def samples(self, number: int, count: int, beta: float = 1.0) -> Iterator[Sample]:
-        """So many draws of `count` transitions. The buffer may change between them only in its priorities.
+        """Yield `number` draws of `count` transitions each. Between the draws, nothing but priorities may change.
 
-        Small uniform draws are made many at once, which takes less time.
+        Small uniform draws are made many at once, because that is faster.
         """
         at_once = 1 if self.prioritized else max(1, DRAWN_AT_ONCE // (count * self._transition_bytes))
         for first in range(0, number, at_once):
@@ -353,9 +359,9 @@ class ReplayBuffer(Rewinding[Overwritten]):
         return slots, self._row[slots], weight
 
     def _follow(self, row: Array, goals: Goals | None) -> tuple[Doubles, Doubles, Ints]:
-        """Follow each row for up to n steps. Returns the discounted reward, γᵏ (0 if the task ended) and the last slot.
+        """Follow each row for up to n steps. Returns the discounted reward, γᵏ (0 if terminated) and the last slot.
 
-        `row` is a copy, in which rows with another goal get their outcome.
+        `row` is a copy, in which the rows with another goal are changed to their outcome under it.
         """
         self._set_outcome(row, goals)
         reward = row["reward"].astype(np.float64)
@@ -365,7 +371,7 @@ class ReplayBuffer(Rewinding[Overwritten]):
         for _ in range(self._n_step - 1):
             row = self._row[at]
             self._set_outcome(row, goals)
-            going = row["is_row"] & ~ended  # else stay at this slot
+            going = row["is_row"] & ~ended  # others stay at their slot
             reward += np.where(going, discount * row["reward"], 0)
             discount = np.where(going, discount * self._gamma * ~row["terminated"], discount)
             ended |= going & row["terminated"]
@@ -373,7 +379,7 @@ class ReplayBuffer(Rewinding[Overwritten]):
         return reward, discount, at
 
     def _set_outcome(self, row: Array, goals: Goals | None) -> None:
-        """Set reward and end of the rows with another goal. What stands in a slot without a row stays without meaning."""
+        """Set reward and end of the rows with another goal. For a slot without a row, the result has no meaning."""
         if goals is None or self._hindsight is None:
             return
         led_to = row["follows"][goals.rows]
@@ -389,7 +395,7 @@ class ReplayBuffer(Rewinding[Overwritten]):
         return self._tree is not None
 
     def update_priorities(self, slots: Ints, error: Floats) -> None:
-        """Set the priorities of these slots [B] from their errors [B]. Call it before the next `add`."""
+        """Set the priorities of the transitions in these slots [B] from their errors [B]. Call it before the next `add`."""
         if self._tree is None or self._alpha is None:
             return
         priority = np.abs(error).astype(np.float64) + PRIORITY_OFFSET
@@ -412,14 +418,14 @@ class ReplayBuffer(Rewinding[Overwritten]):
             self._tree.set(old.slots, old.weights)
 
     def _find_paths(self) -> None:
-        """Find the paths of the rows that are stored now, after these were set in another way than by `add`."""
+        """Recompute the paths of the stored rows, after these were changed by anything but `add`."""
         if self._paths is not None:
             used = min(self._written, self.size)
             by_age = np.arange(self._written - used, self._written) % self.size
             self._paths = EpisodePaths.rebuilt(self.size, by_age, self._is_row, self._follows)
 
     def _keep(self, slots: Ints, leaves: Sequence[Array | SharedChannels]) -> None:
-        """Keep what these slots hold, if `remember` was called: they are written next."""
+        """Save the contents of these slots, which are about to be written, if `remember` was called."""
         if self._remembered is not None and len(slots):
             weights = None if self._tree is None else self._tree.weights[slots]
             self._overwritten.append(Overwritten(slots, self._row[slots], weights, tuple(leaf[slots] for leaf in leaves)))
@@ -451,7 +457,7 @@ class ReplayBuffer(Rewinding[Overwritten]):
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from a `state_dict`, bit for bit. Raises ValueError if it has another size."""
+        """Continue from a `state_dict`, bit for bit. Raises ValueError if its size differs from that of this buffer."""
         if state["size"] != self.size:
             raise ValueError(f"replay_size: expected {state['size']}, got {self.size}")
         self._written = state["written"]

@@ -1,7 +1,7 @@
-"""A replay buffer returns to the state that it had before an update, if that update fails. No copy of the buffer is made.
+"""Rolls a replay buffer back to the state before an update, if that update fails, without a copy of the whole buffer.
 
-Rule: once a state is remembered, a buffer keeps what a slot held before it writes the slot. Going back writes this in
-reverse order, so the oldest content comes last.
+Rule: once a state is remembered, the buffer saves the content of a slot before it writes to the slot. Rolling back writes
+the saved contents in reverse order, so the oldest content of a slot is written last.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class Remembered(NamedTuple):
 
 
 class Rewinding(ABC, Generic[KeptT]):
-    """What remembering needs of a replay buffer; `KeptT` is what some of its slots held before they were written."""
+    """A replay buffer that can roll back. `KeptT` is the type of the saved contents of some slots."""
 
     generator: np.random.Generator
     _written: int
@@ -36,10 +36,10 @@ class Rewinding(ABC, Generic[KeptT]):
     _newest: dict[int, Ints]
     _remembered: Remembered | None
     _overwritten: list[KeptT]
-    """since `remember`, oldest first"""
+    """the contents saved since `remember`, oldest first"""
 
     def remember(self) -> None:
-        """Remember this state, for `roll_back`: from now on, what a slot held is kept before it is written."""
+        """Remember the current state, for `roll_back`. From now on, slots are saved before they are written."""
         self._overwritten.clear()
         self._remembered = Remembered(
             self._written, self._rows, self._highest, dict(self._newest), self.generator.bit_generator.state
@@ -60,4 +60,4 @@ class Rewinding(ABC, Generic[KeptT]):
 
     @abstractmethod
     def _put_back(self, old: KeptT) -> None:
-        """Write what some slots held."""
+        """Write the saved contents of some slots back."""

@@ -1,13 +1,15 @@
-"""The replay buffer of a policy with memory: keeps sequences, and draws each with the one before it. Seeded; no files.
+"""The replay buffer of a policy with memory: stores sequences, and draws each together with its predecessor.
 
-A sequence is what a rollout holds of one env copy, or of one seat: T rows, and the state of the recurrent core before them,
-as the worker had it. That state comes from older weights. So the sequence before is passed through the core first, from its
-own stored state and without a gradient, until the core has a state of today's weights (stored state and burn-in, Kapturowski
-et al. 2019, R2D2).
+A sequence is the part of a rollout that belongs to one env copy, or to one seat: T rows, and the state that the recurrent
+core had on the worker before them. That state was computed with older weights. So the previous sequence is passed through
+the core first, from its own stored state and without a gradient, to compute a state with the current weights (stored state
+and burn-in, Kapturowski et al. 2019, R2D2).
 
-Rule: each row is in one sequence, and each sequence has the same chance. So each row is learned from equally often,
-whatever the length of its episode. Rows follow the row format (`millrace.protocol.rollout`): episodes may end inside a
-sequence, where the state becomes zeros, and a row that is not valid passes the state on.
+Rule: each row is in one sequence, and unless replay is prioritized each sequence is equally likely to be drawn. So each row
+is learned from equally often, whatever the length of its episode. Rows follow the row format (`millrace.protocol.rollout`):
+episodes may end inside a sequence, where the state is reset to zeros, and a row that is not valid passes the state on.
+
+This file uses no files, and all randomness comes from the seed.
 """
 
 from __future__ import annotations
@@ -30,31 +32,31 @@ from millrace.protocol.random_streams import Purpose, generator
 from millrace.protocol.rollout import Batch
 from millrace.protocol.specs import PolicySpec
 
-NONE = -1  # stands for the number of a sequence
+NONE = -1  # stands for "no sequence" where a sequence's number is expected
 FEWEST = 16
-"""Sequences of a draw, at least: rows of one sequence resemble each other, so few sequences make a noisy gradient"""
-HIGHEST_SHARE = 0.9  # of the priority of a sequence; the rest is the mean of its errors (Kapturowski et al. 2019)
+"""The least number of sequences in a draw. Rows of a sequence resemble each other, so few sequences give a noisy gradient."""
+HIGHEST_SHARE = 0.9  # share of the highest error in a sequence's priority; the rest is the mean (Kapturowski et al. 2019)
 
 
 class SequenceSample(NamedTuple):
-    """B rows in C sequences of T rows, with the T rows before each. Arrays of steps are in time order."""
+    """B rows in C sequences of T rows, each preceded by T rows of burn-in. Arrays of steps are in time order."""
 
-    slots: Ints  # [B] of the sequence that each row is in
-    leaves: tuple[Array, ...]  # [2 T + 1, C, *leaf] each: T observations before, then those of the sequence
-    state: Floats  # [C, S] of the core before the first of these that counts
+    slots: Ints  # [B] the slot of the sequence that each row is in
+    leaves: tuple[Array, ...]  # [2 T + 1, C, *leaf] each: T observations of burn-in, then those of the sequence
+    state: Floats  # [C, S] state of the core before the burn-in, or before the sequence if that has no predecessor
     keep_state: Bools  # [2 T + 1, C] False where an episode begins
-    advances: Bools  # [2 T + 1, C] False where the row leaves the state as it is
-    rows: Ints  # [B] where they are in [T, C], flattened
-    next_rows: Ints  # [B] where the observations k steps later are in [T + 1, C], flattened
+    advances: Bools  # [2 T + 1, C] False where a row leaves the core's state unchanged
+    rows: Ints  # [B] indices of the rows in [T, C], flattened
+    next_rows: Ints  # [B] indices of the observations k steps later in [T + 1, C], flattened
     action: Array  # [B, *action] int64 or float32, as rows store them
     reward: Floats  # [B] Σ γⁱ r over k steps: n, or fewer where the episode or the sequence ends
-    discount: Floats  # [B] γᵏ; 0 where the task ended
-    weight: Floats  # [B] importance-sampling weight of the loss, at most 1
+    discount: Floats  # [B] γᵏ; 0 where the episode terminated
+    weight: Floats  # [B] importance-sampling weight in the loss, at most 1
     next_mask: Bools | None  # [B, choices] actions allowed k steps later; None without action masks
 
 
 class ReplacedSequences(NamedTuple):
-    """What some slots held before they were written."""
+    """The contents of some slots before they were written."""
 
     slots: Ints
     arrays: dict[str, Array]
@@ -75,11 +77,11 @@ class SequenceReplay(Rewinding[ReplacedSequences]):
         seed: int,
         alpha: float | None = None,
     ) -> None:
-        """Room for this many `rows`, in sequences of T = `steps`. `alpha`: as in `ReplayBuffer`.
+        """Make room for this many `rows`, in sequences of T = `steps` rows. For `alpha`, see `ReplayBuffer`.
 
         Raises `UsageError` if memory is too small.
         """
-        self.size = max(1, rows // steps)  # slots; a sequence takes one
+        self.size = max(1, rows // steps)  # number of slots, each of which holds one sequence
         self._steps = steps
         self._n_step = n_step
         self._gamma = gamma
@@ -102,16 +104,16 @@ class SequenceReplay(Rewinding[ReplacedSequences]):
         self._shapes = shapes
         self._check_memory()
         self.arrays = {name: np.zeros((self.size, *shape), dtype) for name, (shape, dtype) in shapes.items()}
-        """One entry for each slot, by name. `begins`: whether the episode of obs[t+1] begins there. `before`: the number of
-        the sequence before; numbers count all sequences that were ever written."""
+        """Arrays with one entry for each slot, by name. `begins` is True where obs[t+1] begins an episode. `before` is the
+        number of the previous sequence; sequences are numbered in the order in which they were written."""
         self.generator = generator(seed, Purpose.REPLAY)  # decides what is drawn
         self._tree = None if alpha is None else SumTree(self.size)
-        self._highest = 1.0  # greatest priority so far: new sequences get it
-        self._written = 0  # sequences ever written; the next one's slot is this, modulo the size
+        self._highest = 1.0  # the highest priority so far, which new sequences get
+        self._written = 0  # number of sequences ever written; modulo the size, it is the next slot
         self._rows = 0
-        self._newest: dict[int, Ints] = {}  # lane -> [columns] number of its newest sequence
+        self._newest: dict[int, Ints] = {}  # by lane, [columns] the number of each column's newest sequence
         self._remembered: Remembered | None = None
-        self._overwritten: list[ReplacedSequences] = []  # since `remember`, oldest first
+        self._overwritten: list[ReplacedSequences] = []  # contents saved since `remember`, oldest first
 
     def __len__(self) -> int:
         """The number of rows that can be drawn."""
@@ -141,7 +143,7 @@ class SequenceReplay(Rewinding[ReplacedSequences]):
     # ---------------------------------------------------------------- writing
 
     def add(self, batch: Batch) -> None:
-        """Store the sequences that have a valid row. Raises `UsageError` if a rollout doesn't fit."""
+        """Store the sequences of a batch that have a valid row. Raises `UsageError` if there is no room for two rollouts."""
         N = batch.columns_per_rollout
         if self.size < 2 * N:
             least = 2 * N * self._steps
@@ -152,7 +154,7 @@ class SequenceReplay(Rewinding[ReplacedSequences]):
         if batch.mask is not None and "mask" not in self.arrays:
             self._make_mask(batch.mask.shape[-1])
         begins = _begins(batch)
-        for at in range(0, len(batch.lane), N):  # rollouts of a lane are in the order of collection
+        for at in range(0, len(batch.lane), N):  # rollouts of a lane are in order of collection
             self._add(batch, begins, slice(at, at + N), int(batch.lane[at]))
 
     def _add(self, batch: Batch, begins: Bools, columns: slice, lane: int) -> None:
@@ -166,7 +168,7 @@ class SequenceReplay(Rewinding[ReplacedSequences]):
         arrays["begins"] = begins[:, columns].swapaxes(0, 1)
         arrays["state"] = batch.state[columns]
         arrays["before"] = self._before(lane, batch.fresh[columns], arrays)
-        used = np.flatnonzero(arrays["valid"].any(1))  # of the columns
+        used = np.flatnonzero(arrays["valid"].any(1))  # the columns that have a valid row
         numbers = self._written + np.arange(len(used))
         slots = numbers % self.size
         self._keep(slots, all_arrays=True)
@@ -176,14 +178,14 @@ class SequenceReplay(Rewinding[ReplacedSequences]):
         if self._tree is not None and self._alpha is not None:
             self._tree.set(slots, self._highest**self._alpha)
         self._written += len(used)
-        # A seat that waits all the time, as it did at the end of its sequence before, still continues that one.
+        # A seat that waited throughout this rollout gets no sequence of its own; it still continues its previous sequence.
         waits = ~arrays["begins"].any(1)
         newest = np.where(waits, arrays["before"], NONE)
         newest[used] = numbers
         self._newest[lane] = newest
 
     def _before(self, lane: int, fresh: Bools, arrays: dict[str, Array]) -> Ints:
-        """[N] the number of the sequence that a column continues; NONE if there is none.
+        """[N] the number of the sequence that each column continues; NONE if there is none.
 
         The observations are compared, in case a caller that stacks rollouts itself has left one out.
         """
@@ -204,13 +206,13 @@ class SequenceReplay(Rewinding[ReplacedSequences]):
     # ---------------------------------------------------------------- reading
 
     def samples(self, number: int, count: int, beta: float = 1.0) -> Iterator[SequenceSample]:
-        """So many draws. `count` and `beta`: see `sample`."""
+        """Yield `number` draws. For `count` and `beta`, see `sample`."""
         return (self.sample(count, beta) for _ in range(number))
 
     def sample(self, count: int, beta: float = 1.0) -> SequenceSample:
-        """Draw sequences with replacement: as many as have `count` rows if all are valid, but at least `FEWEST`.
+        """Draw sequences with replacement: as many as hold `count` rows if all rows are valid, but at least `FEWEST`.
 
-        `beta`: as in `ReplayBuffer`.
+        For `beta`, see `ReplayBuffer`.
         """
         sequences = max(FEWEST, count // self._steps)
         if self._tree is None:
@@ -224,7 +226,7 @@ class SequenceReplay(Rewinding[ReplacedSequences]):
         T, C = self._steps, len(slots)
         own = {name: array[slots].swapaxes(0, 1) for name, array in self.arrays.items() if array.ndim > 1}  # [T, C, …] each
         number = self.arrays["before"][slots]
-        has_before = (number != NONE) & (number >= self._written - self.size)  # else it was overwritten
+        has_before = (number != NONE) & (number >= self._written - self.size)  # older ones have been overwritten
         earlier = number % self.size
         before = {name: self.arrays[name][earlier].swapaxes(0, 1) for name in (*self._leaves, "valid", "begins")}
         begins_before = before["begins"] & has_before
@@ -253,7 +255,7 @@ class SequenceReplay(Rewinding[ReplacedSequences]):
         )
 
     def update_priorities(self, slots: Ints, error: Floats) -> None:
-        """Set the priorities of sequences from the errors [B] of their rows, whose slots [B] these are."""
+        """Set the priorities of sequences from the errors [B] of their rows. `slots` [B] are the slots of the rows."""
         if self._tree is None or self._alpha is None:
             return
         sequences, of_row = np.unique(slots, return_inverse=True)
@@ -275,7 +277,7 @@ class SequenceReplay(Rewinding[ReplacedSequences]):
             self._tree.set(old.slots, old.weights)
 
     def _keep(self, slots: Ints, *, all_arrays: bool = False) -> None:
-        """Keep what these slots hold, if `remember` was called: they are written next."""
+        """Save the contents of these slots, which are about to be written, if `remember` was called."""
         if self._remembered is not None and len(slots):
             weights = None if self._tree is None else self._tree.weights[slots]
             arrays = {name: array[slots] for name, array in self.arrays.items()} if all_arrays else {}
@@ -298,7 +300,7 @@ class SequenceReplay(Rewinding[ReplacedSequences]):
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from a `state_dict`, bit for bit. Raises ValueError if its sequences have another length or number."""
+        """Continue from a `state_dict`, bit for bit. Raises ValueError if the number or length of sequences differs."""
         for name, expected, got in (
             ("rollout_steps", state["steps"], self._steps),
             ("replay_size", state["size"] * state["steps"], self.size * self._steps),
@@ -324,12 +326,12 @@ class SequenceReplay(Rewinding[ReplacedSequences]):
 
 
 def _begins(batch: Batch) -> Bools:
-    """[T, ΣN] whether row t only resets its copy, so that obs[t+1] begins an episode."""
+    """[T, ΣN] True where row t only resets its copy, so that obs[t+1] begins an episode."""
     if batch.resets is None:
         return ~batch.valid
     return np.repeat(batch.resets[:-1], batch.valid.shape[1] // batch.resets.shape[1], axis=1)
 
 
 def _flat(array: Array) -> Array:
-    """[T, C, …] as [T · C, …]."""
+    """An array [T, C, …] as a view [T · C, …] where possible."""
     return array.reshape(-1, *array.shape[2:])

@@ -1,8 +1,8 @@
-"""Images whose channels are stored once each, because those of a frame stack are the same frames over and over.
+"""Images whose distinct channels are stored once each, because successive frame stacks repeat the same frames.
 
-Law: what is read is what was written, to the byte. It is an array of images in all that a replay buffer asks of one:
-`images[slots]` copies, `images[slots] = values` overwrites. A channel is kept as long as a slot refers to it, and is known
-by its digest, so it doesn't matter in which slot, in which place or how often it stands.
+Law: reading returns exactly the bytes that were written. For a replay buffer it works like an array of images:
+`images[slots]` copies, and `images[slots] = values` overwrites. A channel is kept as long as a slot refers to it. It is
+identified by its digest, so it is shared wherever it occurs: in any slot, and in any place of the stack.
 """
 
 from __future__ import annotations
@@ -16,35 +16,35 @@ from millrace.protocol.specs import Leaf
 
 DIGEST_BYTES = 16
 CHUNK_BYTES = 1 << 24
-"""Memory is taken in pieces of about this size, so that none is copied when there are more channels"""
+"""Memory is allocated in chunks of about this size, so that nothing is copied when the number of channels grows."""
 NONE = -1
 WORTHWHILE = 0.5
-"""Share of the channels of some images that may differ, at most, for storing them once to be worth its time"""
+"""The largest share of distinct channels at which sharing saves enough memory to be worth its time."""
 INDEX_BYTES = 250
-"""of the index by digest, for each channel: about what Python's objects take"""
+"""The approximate size of the Python objects in the index by digest, per channel."""
 LEAST_BYTES = 1024
-"""of a channel: the index of smaller ones would take a large part of what sharing saves"""
+"""The smallest channel to share. With smaller ones, the index would take much of the memory that sharing saves."""
 
 
 class SharedChannels:
-    """[size, *leaf] uint8 images."""
+    """An array of images [size, *leaf] uint8 that stores equal channels once."""
 
     def __init__(self, size: int, leaf: Leaf) -> None:
         self._leaf = leaf
         height, width, channels = leaf.shape if leaf.has_channels_last else (*leaf.shape[1:], leaf.shape[0])
         self._channel_shape = height, width
         self._channel_bytes = height * width
-        self._of_slot: Ints = np.full((size, channels), NONE)  # numbers of its channels
+        self._of_slot: Ints = np.full((size, channels), NONE)  # the numbers of the channels in each slot
         self._per_chunk = max(1, CHUNK_BYTES // self._channel_bytes)
-        self._chunks: list[Bytes] = []  # [channels of a chunk, bytes of a channel] each
-        self._number: dict[bytes, int] = {}  # of a digest
-        self._digest: list[bytes] = []  # of each number
-        self._uses: list[int] = []  # how many places of slots refer to each number
+        self._chunks: list[Bytes] = []  # [channels per chunk, bytes per channel] each
+        self._number: dict[bytes, int] = {}  # the number of a channel, by its digest
+        self._digest: list[bytes] = []  # the digest of a channel, by its number
+        self._uses: list[int] = []  # how many places in slots refer to a channel, by its number
         self._free: list[int] = []
 
     @property
     def nbytes(self) -> int:
-        """Memory of the channels, their numbers and the index by digest, in bytes; that of the index is an estimate."""
+        """Memory of the channels, their numbers and the index by digest, in bytes. The size of the index is an estimate."""
         return self._of_slot.nbytes + sum(chunk.nbytes for chunk in self._chunks) + INDEX_BYTES * len(self._number)
 
     @staticmethod
@@ -71,12 +71,12 @@ class SharedChannels:
         before = self._of_slot[slots].ravel().tolist()
         numbers = [self._stored(channel) for channel in _by_channel(self._leaf, images)]
         self._of_slot[slots] = np.reshape(numbers, (len(slots), -1))
-        for number in before:  # last, so that a channel that stays isn't stored again
+        for number in before:  # last, so that a channel that stays isn't released and stored again
             if number != NONE:
                 self._release(number)
 
     def _stored(self, channel: Bytes) -> int:
-        """The number of a channel [bytes of a channel], which has one more use now."""
+        """Store a channel [bytes per channel] unless it is known, count one more use, and return its number."""
         digest = _digest(channel)
         known = self._number.get(digest)
         if known is not None:
@@ -97,7 +97,7 @@ class SharedChannels:
         end = first + self._per_chunk
         self._uses[first:] = [0] * self._per_chunk
         self._digest[first:] = [b""] * self._per_chunk
-        self._free += range(end - 1, first - 1, -1)  # last: without it, the chunk would only stay empty
+        self._free += range(end - 1, first - 1, -1)  # last: if an exception prevents this, the new chunk just stays unused
 
     def _release(self, number: int) -> None:
         self._uses[number] -= 1
@@ -108,9 +108,10 @@ class SharedChannels:
     # ---------------------------------------------------------------- saving
 
     def saved(self, used: int) -> tuple[Bytes, Ints]:
-        """The channels [M, H, W] of the first slots, in the order in which they stand there, and their numbers [used, C].
+        """The distinct channels [M, H, W] of the first `used` slots, and for each slot the indices [used, C] of its channels.
 
-        They depend on nothing but the images, so equal buffers are saved alike.
+        Channels are in order of first occurrence. So the result depends on nothing but the images, and equal buffers give
+        equal saved states.
         """
         numbers = self._of_slot[:used]
         distinct, first, place = np.unique(numbers, return_index=True, return_inverse=True)
@@ -123,14 +124,14 @@ class SharedChannels:
         return channels, rank[place].reshape(numbers.shape)
 
     def load(self, channels: Bytes, numbers: Ints) -> None:
-        """Hold what was saved. Call it before anything is written."""
+        """Restore the result of `saved`. Call this before anything is written."""
         for at, of_slot in enumerate(numbers):
             images = channels[of_slot]
             self[np.array([at])] = np.moveaxis(images, 0, -1)[None] if self._leaf.has_channels_last else images[None]
 
 
 def _by_channel(leaf: Leaf, images: Bytes) -> Bytes:
-    """Images [K, *leaf] as channels [K · C, H · W], contiguous."""
+    """The channels of images [K, *leaf], as a contiguous array [K · C, H · W]."""
     first = np.moveaxis(images, -1, 1) if leaf.has_channels_last else images
     return np.ascontiguousarray(first).reshape(first.shape[0] * first.shape[1], -1)
 

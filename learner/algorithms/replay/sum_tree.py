@@ -1,7 +1,7 @@
-"""A sum tree: draws indices in proportion to their weights and changes weights, in logarithmic time. numpy, vectorized.
+"""A sum tree: draws indices in proportion to their weights, and changes weights, in logarithmic time. Vectorized in numpy.
 
-Rule: every inner node is the sum of its two children and is computed again when one of them changes. So the tree is a
-function of its leaves, bit for bit, and rounding errors do not accumulate.
+Rule: every inner node is the sum of its two children and is recomputed when one of them changes. So the tree is a function
+of its leaves, bit for bit, and rounding errors do not accumulate.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from millrace.protocol.arrays import Doubles, Floats, Ints
 class SumTree:
     """`size` weights, 0 at first. Node i has the children 2i and 2i + 1; the leaves are the nodes from `size` on.
 
-    `size` need not be a power of two: then leaves are at two depths, and every node but the root still has one parent.
+    `size` need not be a power of two. If it isn't, leaves are at two depths; every node but the root still has one parent.
     """
 
     def __init__(self, size: int) -> None:
         self._size = max(size, 2)
         self._nodes: Doubles = np.zeros(2 * self._size)
-        self._depth = (2 * self._size - 1).bit_length() - 1  # of the deepest leaf; the root has depth 0
+        self._depth = (2 * self._size - 1).bit_length() - 1  # depth of the deepest leaf; the root has depth 0
 
     @staticmethod
     def memory_bytes(size: int) -> int:
@@ -37,7 +37,7 @@ class SumTree:
 
     @property
     def weights(self) -> Doubles:
-        """The weights [size], a view: do not write to it."""
+        """A view of the weights [size]. Don't write to it."""
         return self._nodes[self._size :]
 
     def set(self, index: Ints, weight: npt.NDArray[Any] | float) -> None:
@@ -50,7 +50,10 @@ class SumTree:
             nodes[i] = nodes[2 * i] + nodes[2 * i + 1]
 
     def find(self, mass: Doubles) -> Ints:
-        """The indices where the cumulative sum of weights exceeds `mass` [B], each in [0, total); never one of weight 0."""
+        """The first indices at which the cumulative sum of the weights exceeds `mass` [B], whose numbers are in [0, total).
+
+        An index of weight 0 is never returned.
+        """
         nodes = self._nodes
         i = np.ones(len(mass), np.int64)
         mass = mass.copy()
@@ -69,7 +72,7 @@ class SumTree:
         return self.find((np.arange(count) + generator.random(count)) * (self.total / count))
 
     def draw_weighted(self, generator: np.random.Generator, count: int, entries: int, beta: float) -> tuple[Ints, Floats]:
-        """`count` indices as by `draw`, and their importance-sampling weights [count], for this many entries in all.
+        """`count` indices as by `draw`, and their importance-sampling weights [count]. The tree has `entries` entries.
 
         P(i) = pᵢ^α / Σ p^α;  wᵢ = (entries · P(i))^−β, divided by the greatest of them (Schaul et al. 2016, section 3.4).
         """

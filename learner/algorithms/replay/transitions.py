@@ -1,7 +1,7 @@
-"""The rows that a loss takes from a replay buffer, and how a network encodes their observations.
+"""The rows that a replay buffer gives to a loss, and how a network encodes their observations.
 
-Rule: losses see what an encoder makes of observations, so they need not know of images or memory. Where one network's
-encoder stands for that of another, as in SAC, `encoded` is called once.
+Rule: losses see the encoder's outputs instead of observations, so they needn't know about images or memory. If networks
+share an encoder, as in SAC, `encoded` is called once.
 """
 
 from __future__ import annotations
@@ -16,21 +16,21 @@ from millrace.protocol.policy.encoder import Encoder, RecurrentInput
 
 
 class Sequences(NamedTuple):
-    """How B rows lie in C sequences of T rows, with T rows before each: `SequenceSample` as a recurrent core takes it."""
+    """How the B rows of a `SequenceSample` lie in C sequences of T rows, each preceded by T rows of burn-in."""
 
     before: RecurrentInput
-    """of the T rows before"""
+    """the recurrent core's input for the T rows of burn-in"""
     keep_state: Tensor
-    """[T + 1, C] of the sequence: 0 where an episode begins, else 1"""
+    """[T + 1, C] of the sequences: 0 where an episode begins, otherwise 1"""
     advances: Tensor
-    """[T + 1, C] bool: False where the row leaves the state as it is"""
+    """[T + 1, C] bool: False where a row leaves the core's state unchanged"""
     rows: Tensor
-    """[B] where they are among the T · C of the sequences"""
+    """[B] the indices of the rows among the T · C rows of the sequences"""
     next_rows: Tensor
-    """[B] where the observations that followed are among the (T + 1) · C"""
+    """[B] the indices of the observations k steps later among the (T + 1) · C observations of the sequences"""
 
     def outputs(self, encode: Encoder, x: Tensor, images: Sequence[Tensor]) -> Tensor:
-        """The core's outputs [(T + 1) · C, H] for x and images of [(2 T + 1) · C, …]. No gradient passes the rows before."""
+        """The core's outputs [(T + 1) · C, H] for x and images [(2 T + 1) · C, …]. The burn-in has no gradient."""
         warm_up = self.before.keep_state.numel()
         with torch.no_grad():
             _, state = encode.advance(x[:warm_up], [image[:warm_up] for image in images], self.before)
@@ -40,9 +40,9 @@ class Sequences(NamedTuple):
 
 
 class Transitions(NamedTuple):
-    """B transitions of n steps, or of fewer where an episode ends, as a loss takes them.
+    """The input of a loss: B transitions of k steps, k being n or less where an episode ends.
 
-    With a recurrent core, x and images are those of all rows in `sequences`, until they are encoded.
+    With a recurrent core, x and images hold all rows of the `sequences` until they are encoded.
     """
 
     x: Tensor
@@ -54,22 +54,22 @@ class Transitions(NamedTuple):
     reward: Tensor
     """[B] Σ γⁱ r; with `normalize_rewards`, divided by the standard deviation of returns and clipped to ±10"""
     discount: Tensor
-    """[B] γᵏ, or 0 if the task has terminated"""
+    """[B] γᵏ, or 0 if the episode terminated"""
     next_x: Tensor
     """[B, D] features of the observations k steps later"""
     next_images: tuple[Tensor, ...]
     """[B, *leaf] uint8 each"""
     next_mask: Tensor | None
-    """[B, choices] the actions that are allowed then; None without action masks"""
+    """[B, choices] bool, True for the actions allowed k steps later; None without action masks"""
     weight: Tensor
-    """[B] of each row in the loss; 1 unless replay is prioritized"""
+    """[B] the weight of each row in the loss; 1 unless replay is prioritized"""
     target_x: Tensor
-    """[B, D] next_x for the target network; encoded, by that network's encoder"""
+    """[B, D] next_x for the target network; once encoded, by the encoder of the target network"""
     sequences: Sequences | None = None
-    """with a recurrent core, how the rows lie in sequences"""
+    """how the rows lie in sequences; None without a recurrent core, and once the rows are encoded"""
 
     def encoded(self, encode: Encoder) -> Transitions:
-        """With the outputs of an encoder [B, H] in the place of features and images. Those of next_x have no gradient."""
+        """A copy with an encoder's outputs [B, H] in place of features and images. Those of `next_x` have no gradient."""
         if self.sequences is not None:
             h = self.sequences.outputs(encode, self.x, self.images)
             x = h[self.sequences.rows]
