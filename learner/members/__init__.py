@@ -1,1 +1,1 @@
-"""The workers that are connected: joining, leaving, keys, and the log about them."""
+"""Membership of workers: how they join and leave, which keys they may use, and the log about them."""

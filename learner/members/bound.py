@@ -1,7 +1,7 @@
-"""Opens the learner's end of the conversation: the socket at its address, and who may connect there.
+"""Opens the learner's end of the connection: the socket at its address, with the keys that may connect there.
 
-Rule: code travels only over ipc, inproc, or tcp with keys. Closing `resources` releases all that was acquired, the socket
-before its context.
+Rule: code is sent only over ipc, over inproc, or over tcp with keys. Closing `resources` releases everything that was
+acquired, the socket before its context.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class Bound:
 
 
 def listen(where: Listening, resources: ExitStack, code: str = "") -> Bound:
-    """Bind `where.bind` for workers that are started elsewhere. `code`: as of `bind`. Raises `UsageError`."""
+    """Bind `where.bind` for workers that are started elsewhere. For `code` and errors, see `bind`."""
     keyring = keyring_for(where, datetime.now(UTC).replace(microsecond=0))
     return bind(where.bind, keyring, resources, code, LINGER_ELSEWHERE_S)
 
@@ -50,7 +50,8 @@ def listen(where: Listening, resources: ExitStack, code: str = "") -> Bound:
 def bind(address: str, keyring: Keyring | None, resources: ExitStack, code: str = "", linger_s: float = LINGER_S) -> Bound:
     """Bind this address for peers whose keys are in `keyring`.
 
-    `code`: what is sent to the workers as code, for the error; empty if nothing is. Raises `UsageError`.
+    `code` names the thing that is sent to the workers as code, for an error message; it is empty if nothing is. Raises
+    `UsageError` if code would be sent over tcp without keys, or if the address can't be bound.
     """
     if code and address.startswith("tcp://") and keyring is None:
         instead = REGISTER_IT if code == FACTORY else ""

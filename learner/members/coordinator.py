@@ -1,13 +1,16 @@
-"""The part of the learner's side that all conversations share. Pure: messages and `now` in, messages out.
+"""The learner's half of a conversation with its workers: the part that all conversations share.
 
-Rule: a worker that waits for the run when it begins becomes a member, in the same session. If it is describing an
+It is pure: messages and `now` in, messages out.
+
+Rule: a worker that is waiting when the run begins becomes a member of the run, in the same session. If it is describing an
 environment at that time, it gets work once it says that it has begun the run. The membership (`Membership.hear`) answers
-messages that don't belong to a member's session, and Failures; other messages go to the part that knows what they mean. A
-membership ends by Goodbye, by Failure, by the end of the process, by silence, by a refusal, or when its key is revoked. Then
-the member's tickets and lanes are taken back, and `_deal` gives them to others. If a Heartbeat shows that a message was
-lost, the message is sent again, before the reply.
+messages that don't belong to a member's session, and Failures; a subclass handles all other messages. A membership ends by
+Goodbye, by Failure, by the end of the process, by silence, by a refusal, or when the worker's key is revoked. Then the
+member's tickets and lanes are taken back, and `_deal` gives them to others. If a Heartbeat shows that a message was lost,
+the message is sent again before the reply.
 
-A subclass defines the rest: what messages mean, what is dealt, what a loss means, and what happens after a wrong answer.
+A subclass defines the rest: how messages are answered, which work is dealt, what a loss means, and what happens after a
+wrong answer.
 """
 
 from __future__ import annotations
@@ -53,7 +56,7 @@ class Coordinator(ABC, Generic[M]):
     # ---------------------------------------------------------------- in
 
     def receive(self, peer: bytes, message: ToLearner, now: float) -> list[Outgoing]:
-        """Answer a message."""
+        """The answer to a message."""
         heard = self.membership.hear(peer, message, now)
         if not isinstance(heard, Answered):
             return self._answer(heard, message) + self._deal()
@@ -61,11 +64,11 @@ class Coordinator(ABC, Generic[M]):
         return heard.out + (self._deal() if heard.changed else [])
 
     def take_over(self, waiting: Membership[Member], now: float) -> list[Outgoing]:
-        """Begin the run for the workers that wait for it. Call this first."""
+        """Begin the run for the workers that are waiting for it. Call this before anything else."""
         return self.membership.take_over(waiting, now) + self._deal()
 
     def reject_message(self, peer: bytes, why: str, now: float) -> list[Outgoing]:
-        """Answer a message that could not be read."""
+        """The answer to a message that could not be read."""
         member = self.members.get(peer)
         if member is None:
             return [(peer, Refuse(one_line(f"not understood: {why}")))]
@@ -73,11 +76,11 @@ class Coordinator(ABC, Generic[M]):
         return self._unusable(member, why) + self._deal()
 
     def revoke(self, peer: bytes, why: str) -> list[Outgoing]:
-        """A member's key was revoked: send it the reason and remove it at once, whatever it holds."""
+        """Remove a member whose key was revoked, at once, whatever it holds, and send it the reason."""
         return self.membership.revoke(peer, why) + self._deal()
 
     def process_ended(self, ended: WorkerExit | StartFailed) -> list[Outgoing]:
-        """Handle the end of a process that this program started."""
+        """Handle the end of a worker process that this program started."""
         match ended:
             case StartFailed(worker, reason, last_lines):
                 self.events.append(WorkerStartFailed(worker, reason, last_lines))
@@ -86,33 +89,33 @@ class Coordinator(ABC, Generic[M]):
                 return self._deal() if self.membership.record_exit(ended) else []
 
     def remove_silent(self, now: float) -> list[Outgoing]:
-        """Remove workers that were silent for longer than `worker_timeout_s`.
+        """Remove workers that have been silent for longer than `worker_timeout_s`.
 
-        Call it only when every message that has arrived was given to `receive`.
+        Call this only after `receive` was given every message that has arrived.
         """
         return self._deal() if self.membership.remove_silent(now, self.worker_timeout_s) else []
 
     def drain(self, reason: str) -> list[Outgoing]:
-        """Ask every worker to leave, and deal nothing any more."""
+        """Ask every worker to leave. From now on, no work is dealt."""
         return self.membership.drain(reason)
 
     # ---------------------------------------------------------------- what differs
 
     @abstractmethod
     def _answer(self, member: M, message: ToLearner) -> list[Outgoing]:
-        """The answer to what a member sent in its session."""
+        """The answer to a message that a member sent in its session."""
 
     def _not_of_member(self, message: ToLearner, answered: Answered) -> None:
-        """Take note of a message that the membership has answered."""
+        """Called with each message that the membership has answered itself."""
 
     def _deal(self) -> list[Outgoing]:
-        """Give out what no worker has. Called after each event that may have changed which worker can take it."""
+        """Give the work that no worker has to workers. Called after each event that may have made one available."""
         return []
 
     def _again(self, member: M, heartbeat: Heartbeat, lost: Sequence[int]) -> list[Outgoing]:
         """The messages to send again because this heartbeat shows that they were lost.
 
-        `lost`: the lost ones of the member's tickets.
+        `lost` are those of the member's tickets that were lost.
         """
         return []
 

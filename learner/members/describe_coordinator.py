@@ -1,12 +1,12 @@
 """The conversation before a run: workers wait for it, and describe environments. Pure: messages and `now` in, messages out.
 
-Rule: one worker describes, the first that joined; the others wait. A worker that has not answered an order is asked last for
-the next environment, because it may hang. Each time that a worker is lost after it was asked, or that no answer arrives for
-long, twice as many workers are asked at once. So one bad machine delays the start by one try, and an environment that fails
-everywhere is found out after few tries.
+Rule: the worker that joined first describes the environment; the others wait. A worker that has not answered an order is the
+last to be asked about the next environment, because it may hang. Each time a worker is lost after it was asked, or no answer
+arrives for a long time, twice as many workers are asked at once. So one bad machine delays the start by one attempt, and an
+environment that fails everywhere is discovered after a few attempts.
 
 Rule: the run uses the first description that can be read and is accepted; other workers compare their env copies with it
-when they open lanes. A worker that declines, or describes what is not accepted, is refused; once `decliners_to_end`
+when they open lanes. A worker that declines, or whose description is not accepted, is refused; once `decliners_to_end`
 different workers have been refused, the start ends with the reason. A worker whose environment fails may come back.
 """
 
@@ -26,7 +26,8 @@ from millrace.protocol.messages import TOLD_TO_STOP, Describe, Described, Goodby
 from millrace.protocol.progress import RunProgress
 from millrace.protocol.specs import WaitSpec
 
-FIRST_TICKET = 1 << 51  # of descriptions, far from a run's tickets: the run may begin while a worker still describes
+FIRST_TICKET = 1 << 51  # the first ticket of a description, far from a run's tickets, because a worker may still be
+# describing when the run begins
 
 Accept = Callable[[DescribedEnv], None]
 """Raises `UsageError` if the run cannot be made with this environment."""
@@ -42,16 +43,16 @@ class Unknown:
 
     env: EnvSpec
     vector: str = "loop"
-    """The kind of env copies that must have the same spaces as a single copy."""
+    """The kind of env copies, whose spaces must equal those of a single copy."""
     render_mode: str | None = None
     accept: Accept = accept_any
 
 
 class DescribeCoordinator(Coordinator[Member]):
-    """Members that wait for the run."""
+    """The members that wait for the run, one of which describes the environment."""
 
     def __init__(self, wait: WaitSpec, first_session: int, *, worker_timeout_s: float, decliners_to_end: int) -> None:
-        """`decliners_to_end`: how many different workers must be unable to describe it until the start ends; 0: never."""
+        """The start ends once `decliners_to_end` different workers cannot describe the environment; 0 means never."""
         super().__init__(Membership(wait, Member, self._removed, first_session), worker_timeout_s)
         self.described: DescribedEnv | None = None
         """The first usable description of the newest environment."""
@@ -64,7 +65,7 @@ class DescribeCoordinator(Coordinator[Member]):
         self._decliners: set[str] = set()
 
     def ask(self, unknown: Unknown) -> list[Outgoing]:
-        """Have a worker describe this environment. `described` is its answer, until the next call."""
+        """Have a worker describe this environment. Its answer is in `described` until the next call."""
         self.described = None
         self._unknown = unknown
         self._at_once = 1
@@ -72,7 +73,7 @@ class DescribeCoordinator(Coordinator[Member]):
         return self._deal()
 
     def ask_more(self) -> list[Outgoing]:
-        """No description has come for long: have other workers describe the environment as well, if there are any."""
+        """Have more workers describe the environment, because no description has arrived for a long time."""
         self._double()
         return self._deal()
 
@@ -106,7 +107,7 @@ class DescribeCoordinator(Coordinator[Member]):
 
     def _again(self, member: Member, heartbeat: Heartbeat, lost: Sequence[int]) -> list[Outgoing]:
         for ticket in lost:
-            del member.tickets[ticket]  # so `_deal` orders the description again
+            del member.tickets[ticket]  # so that `_deal` orders the description again
         return self._deal()
 
     def _answer(self, member: Member, message: ToLearner) -> list[Outgoing]:
@@ -121,9 +122,9 @@ class DescribeCoordinator(Coordinator[Member]):
 
     def _take_description(self, member: Member, message: Described) -> list[Outgoing]:
         if member.tickets.pop(message.ticket, None) is None:
-            return []  # it has come before
+            return []  # this answer has arrived before
         if message.ticket != self._tickets:
-            return []  # of an earlier environment
+            return []  # it describes an earlier environment
         if self.described is not None or self._unknown is None:
             return []
         try:
@@ -143,7 +144,7 @@ class DescribeCoordinator(Coordinator[Member]):
         return self._unsuitable(member, Goodbye, reason)
 
     def _unsuitable(self, member: Member, event: type, reason: str) -> list[Outgoing]:
-        """Refuse a worker with whose environment the run cannot be made."""
+        """Refuse a worker whose environment the run cannot use."""
         refusal = self.membership.refuse(member, event, reason)
         if self._decliners_to_end:
             self._decliners.add(member.hello.worker)
@@ -154,7 +155,8 @@ class DescribeCoordinator(Coordinator[Member]):
 
 
 def _free_first(member: Member) -> tuple[bool, bool, int]:
-    """Sort key: first the workers that aren't busy with an earlier order, and of these the one that gets the first lane,
-    because it can use the copy that it describes.
+    """Sort key of the workers to ask. Those that aren't busy with an earlier order come first.
+
+    Among these, the worker that will get the first lane comes first, because it can go on using the copy that it describes.
     """
     return bool(member.tickets), member.hello.evaluates, member.join_number

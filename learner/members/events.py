@@ -1,4 +1,4 @@
-"""Events of workers, for the log and for the hub, which decides whether the run can continue. Plain data.
+"""Events in the life of workers, for the log and for the hub, which decides whether the run can continue. Plain data.
 
 `json_name` is the `event` field of a line of `--log-json`. Programs read these names, so they must not change. An event
 without such a name isn't logged as an event.
@@ -25,7 +25,7 @@ class WorkerJoined:
 
 @dataclass(frozen=True)
 class WorkerLeft:
-    """A worker is no longer a member. `tickets`: how many of its tickets are dealt again."""
+    """A worker is no longer a member. `tickets` is the number of its tickets, which are dealt again."""
 
     json_name: ClassVar[str] = "left"
     worker: str
@@ -36,9 +36,9 @@ class WorkerLeft:
 
 @dataclass(frozen=True)
 class WorkerRefused:
-    """A worker was refused, and isn't a member any more.
+    """A worker was refused, and is no longer a member.
 
-    `tickets`: how many of its tickets are dealt again, if it was one.
+    If it was a member, `tickets` is the number of its tickets, which are dealt again.
     """
 
     json_name: ClassVar[str] = "refused"
@@ -51,8 +51,8 @@ class WorkerRefused:
 class NamelessHello:
     """A Hello arrived over a connection without a routing id, and was refused.
 
-    Usually it is harmless: a worker that connected again, or its successor of the same name, has taken over the routing id,
-    and this is a leftover message of the older connection. A client that sets no routing id learns that by the refusal.
+    Usually it is harmless: a worker that reconnected, or its successor of the same name, has taken over the routing id, and
+    this is a leftover message of the older connection. If a client sets no routing id, the refusal tells it so.
     """
 
     json_name: ClassVar[str] = "nameless_hello"
@@ -62,7 +62,7 @@ class NamelessHello:
 
 @dataclass(frozen=True)
 class Failed:
-    """A worker failed in code that the user wrote. It may come back. Each event is one of the three classes below."""
+    """A worker failed in code that the user wrote. It may come back. Every such event is one of the three classes below."""
 
     json_name: ClassVar[str]
     raised_as: ClassVar[type[EnvironmentFailed | PolicyFailed]] = EnvironmentFailed
@@ -70,12 +70,12 @@ class Failed:
     worker: str
     host: str
     error: str
-    """One line. The worker names the lane in it, if there is one."""
+    """The error, in one line, which names the lane if there is one."""
     traceback: str = ""
     lanes: tuple[int, ...] = ()
-    """The lane that failed, if it is known; else those that the worker held."""
+    """The lane that failed if it is known; otherwise all lanes that the worker held."""
     worked_s: float | None = None
-    """Seconds from its first env step to the failure; None if its process is not known to have made one."""
+    """Seconds from the worker's first env step to the failure; None if its process is not known to have made one."""
     spare: bool = False
     """Whether the run didn't need the worker, because every lane had another one. Such a failure doesn't count."""
 
@@ -85,7 +85,7 @@ class Failed:
         return f"worker {self.worker} ({self.host}): {self.error}"
 
     def exception(self, why: str = "") -> EnvironmentFailed | PolicyFailed:
-        """The error to raise for it. `why`: why the run ends with this failure."""
+        """The error to raise for this failure. `why` says why the run ends with it."""
         return self.raised_as(joined(self.line, why), self.traceback)
 
 
@@ -98,8 +98,8 @@ class EnvironmentRaised(Failed):
 
 @dataclass(frozen=True)
 class PolicyRaised(Failed):
-    """A policy that the user wrote raised in a worker, returned an unusable result, or ended the worker's process: it
-    crashed, or did not return in time.
+    """A policy that the user wrote raised in a worker, returned an unusable result, crashed the worker's process, or did not
+    return in time.
     """
 
     json_name: ClassVar[str] = "policy_raised"
@@ -108,14 +108,14 @@ class PolicyRaised(Failed):
 
 @dataclass(frozen=True)
 class WorkerProcessFailed(Failed):
-    """A worker's process ended unannounced. Its environment is to blame, as if it had raised."""
+    """A worker's process ended unannounced. This counts as a failure of its environment, as if that had raised."""
 
     json_name: ClassVar[str] = "process_failed"
 
 
 @dataclass(frozen=True)
 class WorkerStartFailed:
-    """A worker's process ended by itself before it had joined. This program had started it."""
+    """A worker's process that this program had started ended by itself before it joined."""
 
     json_name: ClassVar[str] = "not_started"
     worker: str
@@ -128,7 +128,7 @@ class WorkerStartFailed:
 class WorkerToldToRejoin:
     """A worker was told to join again because its session had ended.
 
-    The `late` transitions that its message carried are counted and not used.
+    Its message carried `late` transitions, which are counted but not used.
     """
 
     json_name: ClassVar[str] = "asked_to_rejoin"
@@ -148,17 +148,17 @@ class EnvironmentNoted:
 
 @dataclass(frozen=True)
 class LaneContinued:
-    """A lane whose rollouts another worker collected continues with this worker."""
+    """A lane that another worker had continues on this worker."""
 
     json_name: ClassVar[str] = "lane_continued"
     worker: str
     lane: int
     repeated_steps: int
-    """Env steps that are replayed before it continues."""
+    """The number of env steps that are replayed before it continues."""
     new_episodes: int
     """How many of its env copies begin new episodes instead."""
     longest: int = 0
-    """Steps of the longest episode that is given up because it has more than `--replay-limit`."""
+    """The length, in steps, of the longest episode that is abandoned because it exceeds `--replay-limit`; 0 if none is."""
 
 
 @dataclass(frozen=True)
@@ -181,7 +181,7 @@ class RolloutArrived:
 
 @dataclass(frozen=True)
 class EpisodesArrived:
-    """Episodes of an evaluation were accepted."""
+    """Episodes of an evaluation have arrived and were accepted."""
 
     worker: str
 
@@ -201,8 +201,10 @@ Event = LoggedEvent | RolloutRejected | RolloutArrived | EpisodesArrived
 
 
 def describe(event: LoggedEvent) -> str:
-    """Text for the log: one line, then the traceback or the last lines of output, if any, indented so that none of them
-    looks like a line of the log. Texts of a peer are shown without control characters.
+    """The text of an event for the log: one line, then the traceback or the last lines of output, if there are any.
+
+    The latter are indented so that none of them looks like a line of the log. Control characters in a peer's texts are
+    replaced.
     """
     line = one_line(_line(event), 4 * MAX_LINE)
     match event:

@@ -1,18 +1,18 @@
 """How many failures of its environments a run survives. Pure: failures and finished work in, a verdict out.
 
-Rule: a failure is counted twice, and either count ends the run.
+Rule: there are two counts of failures, and either can end the run.
 
-* In a row: the failures of one lane since its last rollout. `max_env_failures` are allowed, and never more than
-`MOST_IN_A_ROW`, so that an environment that never works ends the run soon even if many failures are allowed. A failure after
-env steps counts as `AFTER_STEPS`, because a simulator that often crashes may by chance fail a few times before a rollout is
-complete.
-* Within an hour: the failures of all lanes that came after env steps. `max_env_failures` are allowed; as many again for each
-  env copy and each hour since the learner began; and as many again for each `WORK_S` that the workers which failed had
-  worked. So a mistake in an environment's code ends a run that has just begun, and a simulator that crashes now and then
-  does not, as long as its workers work for most of the time.
+* In a row: the failures of one lane since its last rollout. `max_env_failures` are allowed, but never more than
+  `MOST_IN_A_ROW`, so that an environment that never works ends the run quickly even if many failures are allowed. A failure
+  after env steps counts as only `AFTER_STEPS`, because a simulator that crashes often may by chance fail a few times before
+  a rollout is complete.
+* Within an hour: the failures of all lanes that occurred after env steps. `max_env_failures` are allowed; as many again for
+  each env copy and each hour since the learner began, up to one hour; and as many again for each `WORK_S` that the failed
+  workers had worked. So a mistake in an environment's code ends a run that has just begun, but a simulator that crashes now
+  and then does not, as long as its workers work most of the time.
 
-These limits end a run late, so the log warns early: at the fourth failure within an hour, and whenever their number has
-doubled.
+These limits end a run late, so the log warns early: at the fourth failure within an hour, and whenever the number of
+failures within an hour has doubled.
 """
 
 from __future__ import annotations
@@ -33,19 +33,19 @@ class FailureCount:
     """The failures of a run. Lanes are counted by number, and a worker without a lane by name."""
 
     def __init__(self, allowed: int, copies: int = 1, began_s: float = 0.0) -> None:
-        """`allowed`: `max_env_failures`. `copies`: the env copies of the run. `began_s`: when the learner began."""
+        """`allowed` is `max_env_failures`, `copies` the number of env copies, `began_s` the time when the learner began."""
         self._allowed = allowed
         self._copies = copies
         self._began_s = began_s
         self._in_a_row: dict[int | str, float] = {}
         self._error: EnvironmentFailed | PolicyFailed | None = None
         self._within_hour: list[tuple[float, float]] = []  # failures after env steps: time, and seconds worked before
-        self._told_at = TOLD_FIRST  # number of failures within an hour
+        self._told_at = TOLD_FIRST  # the number of failures within an hour at which the log warns next
 
     def failed(self, lanes: Collection[int | str], worked_s: float | None, now: float) -> str:
         """Count one failure, which stopped these lanes. Returns why the run ends, or an empty string.
 
-        `worked_s`: for how long the worker had made env steps; None if its process is not known to have made one.
+        `worked_s` is for how many seconds the worker had made env steps; None if its process is not known to have made one.
         """
         stepped = worked_s is not None
         for lane in lanes:
@@ -69,9 +69,9 @@ class FailureCount:
         return f"failure {in_a_row:g} in a row{why}; max_env_failures allows {allowed} in a row"
 
     def count(self, event: Event, now: float) -> str:
-        """Count an event that is a failure of the environment or of a policy that the user wrote. They are counted together.
+        """Count an event if it is a failure of the environment or of a policy that the user wrote, which count together.
 
-        Returns a line for the log, if a person should hear how often the environment fails; else an empty string.
+        Returns a line for the log if the user should know how often the environment fails; otherwise an empty string.
         """
         if not isinstance(event, Failed) or event.spare or self._error is not None:
             return ""
@@ -85,13 +85,13 @@ class FailureCount:
         return int(self._allowed * (1 + copy_hours + self._worked_s() / WORK_S))
 
     def _worked_s(self) -> float:
-        """How many seconds the workers that failed within the hour had worked, in total."""
+        """The total number of seconds that the workers that failed within the hour had worked."""
         return sum(before_s for _, before_s in self._within_hour)
 
     def _how_often(self, now: float) -> str:
         failures = len(self._within_hour)
         if failures < self._told_at:
-            self._told_at = max(TOLD_FIRST, min(self._told_at, 2 * failures))  # the number may have fallen
+            self._told_at = max(TOLD_FIRST, min(self._told_at, 2 * failures))  # the number of failures may have fallen
             return ""
         self._told_at = 2 * failures
         seconds = now - self._within_hour[0][0]
@@ -103,18 +103,18 @@ class FailureCount:
         )
 
     def check(self) -> None:
-        """Raise the error that ends the run, if there was one failure too many: the first such failure."""
+        """Raise the first failure that exceeded a limit, if there was one."""
         if self._error is not None:
             raise self._error
 
     def collected(self, lane: int) -> None:
-        """A rollout of this lane has arrived."""
+        """Record that a rollout of this lane has arrived."""
         self._in_a_row.pop(lane, None)
 
     def evaluated(self, worker: str | None = None) -> None:
-        """Episodes of an evaluation were played, which belong to no lane.
+        """Record that episodes of an evaluation were played. They aren't part of any lane.
 
-        `worker`: the one that played them beside training.
+        `worker` is the worker that played them alongside training; None if the workers that collect played them.
         """
         if worker is None:
             self._in_a_row.clear()

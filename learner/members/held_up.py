@@ -1,7 +1,7 @@
 """What a member is doing, and what holds it up, in words for people. Pure.
 
-Rule: a member is held up by one call of the user's code, or by its own silence. If it is slow because of many short calls,
-its env steps per second are shown instead.
+Rule: a member counts as held up if a single call of the user's code takes long, or if it is silent. If it is slow because of
+many short calls, its env steps per second are shown instead.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ DOING = {
     "evaluating": "in evaluation",
     "closing": "in close",
 }
-"""What a worker is doing, in words. A worker without a supervisor doesn't say it."""
-MOST_TOLD = 4  # workers in one line about what they are doing
-LONG_S = 2.0  # shorter times aren't shown; by default, heartbeats come every second
+"""What a worker is doing, in words. Only workers with a supervisor report it."""
+MOST_TOLD = 4  # the most workers in one line about what they are doing
+LONG_S = 2.0  # shorter times aren't shown; by default, heartbeats are sent every second
 
 
 def in_words(doing: str, seconds: float) -> str:
@@ -34,9 +34,10 @@ def in_words(doing: str, seconds: float) -> str:
 
 
 def held_up(member: Member, now: float) -> tuple[float, float, str]:
-    """For how many seconds it is held up, minus its env steps per second, and in words: who is held up where, in what.
+    """How many seconds a member has been held up, its env steps per second negated, and a line about it.
 
-    The largest tuple belongs to the member that is held up longest, or else to the slowest.
+    The line says which worker it is, on which host, and what it is doing. The largest tuple is that of the member that has
+    been held up longest or, if none is held up, of the slowest.
     """
     row = member.status(now)
     seconds = 0.0
@@ -56,10 +57,10 @@ def held_up(member: Member, now: float) -> tuple[float, float, str]:
 def what_they_do(
     members: Iterable[Member], running: Iterable[WorkerActivity], said: Mapping[str, str], now: float
 ) -> tuple[str, list[str]]:
-    """What the members are doing, longest held up first, then the worker processes that have not joined; and a line for each
-    worker that wrote something.
+    """What the workers are doing, in one line, and a line for each worker that wrote something.
 
-    `said`: the last line of each worker's log, by its name.
+    The members come first, the one that has been held up longest before the others, and then the worker processes that have
+    not joined. `said` are the last lines of the workers' logs, by name.
     """
     members = list(members)
     lines = [line for *_, line in sorted((held_up(member, now) for member in members), reverse=True)]

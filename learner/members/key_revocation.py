@@ -9,16 +9,16 @@ from millrace.protocol.wire.learner_link import LearnerLink
 
 
 class KeyRevocation:
-    """Checks the members' keys each time that the list of allowed keys has changed."""
+    """Checks the members' keys each time the list of allowed keys has changed."""
 
     def __init__(self, link: LearnerLink) -> None:
         self._link = link
         self._checked_against: ClientList | None = None
 
     def revoked(self, members: Iterable[bytes]) -> list[tuple[bytes, str]]:
-        """The peers whose key was revoked, and why. Each list of allowed keys is checked once."""
+        """The peers whose key was revoked, and why. Members are checked once against each list of allowed keys."""
         keyring = self._link.keyring
         if keyring is None or keyring.allowed is self._checked_against:
             return []
-        self._checked_against = keyring.allowed  # before the check: the list may be replaced meanwhile
+        self._checked_against = keyring.allowed  # before the check, because the list may be replaced meanwhile
         return [(peer, why) for peer in members if (why := self._link.rejection_reason(peer))]

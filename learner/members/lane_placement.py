@@ -1,9 +1,9 @@
 """Assignment of lanes to workers. Pure: no clock, no socket.
 
-Rule: every lane has an owner as long as there are workers, and no worker has two lanes more than another. Workers that only
-evaluate or still describe an environment have none. A lane moves only between its rollouts. Placement is computed again only
-after an event that can change it: with a thousand workers, checking all of them at each rollout would cost more than the
-rollout.
+Rule: every lane has an owner as long as there are workers, and no worker has two more lanes than another. Workers that only
+evaluate, or that are still describing an environment, have no lanes. A lane moves only between its rollouts. The placement
+is recomputed only after an event that can change it: with a thousand workers, checking all of them at each rollout would
+take longer than the rollout.
 """
 
 from __future__ import annotations
@@ -20,23 +20,23 @@ from millrace.protocol.messages import LaneIncarnation, Release
 
 @dataclass
 class PlacedLane:
-    """A lane as the learner sees it: which worker has it, and how often it was started."""
+    """A lane as the learner sees it: which worker has it, and how many times it has been started."""
 
     number: int
     incarnation: int = 0
     """Incremented when the lane starts again on new env copies."""
     owner: bytes | None = None
-    """Routing id of the lane's worker; None: no worker has the lane."""
+    """Routing id of the lane's worker; None if no worker has the lane."""
     moving: bool = False
-    """Whether the lane waits for its last tickets to end before it moves to another worker."""
+    """Whether the lane waits for its last tickets to end so that it can move to another worker."""
 
     @property
     def busy(self) -> int:
-        """Number of its tickets that its worker holds: a busy lane cannot move."""
+        """The number of its tickets that its worker holds. A lane moves only if there are none."""
         return 0
 
     def restart(self) -> None:
-        """Record that the lane left its worker: its next owner starts it on new env copies."""
+        """Record that the lane left its worker. Its next owner starts it on new env copies."""
         self.owner = None
         self.moving = False
 
@@ -45,45 +45,45 @@ L = TypeVar("L", bound=PlacedLane)
 
 
 def is_spare(member: Member, lanes: Iterable[PlacedLane]) -> bool:
-    """Whether the run doesn't need this worker's environments: it has no lane but may, and every lane has a worker."""
+    """Whether the run doesn't need this worker: it may have lanes but has none, and every lane has a worker."""
     return not (member.hello.evaluates or member.lanes) and all(lane.owner is not None for lane in lanes)
 
 
 class LanePlacement(Generic[L]):
-    """Places lanes with workers."""
+    """Assigns lanes to workers."""
 
     def __init__(self, lanes: Sequence[L], tie_break: Callable[[Member], Any]) -> None:
-        """`tie_break`: among workers with equally few lanes, the one with the smallest value gets the next lane."""
+        """Among workers with equally few lanes, the one with the smallest `tie_break` gets the next lane."""
         self._lanes = lanes
         self._tie_break = tie_break
         self._unplaced = {lane.number for lane in lanes}
         self._settled = False
-        self._waiting_for: Member | None = None  # a lane of this worker is to move, once its tickets have ended
+        self._waiting_for: Member | None = None  # the worker whose lane moves away once the lane's tickets have ended
 
     def joined(self) -> None:
-        """A worker joined."""
+        """Record that a worker joined."""
         self._settled = False
 
     def removed(self, member: Member) -> None:
-        """A worker was removed: its lanes need another owner."""
+        """Record that a worker was removed, so its lanes need another owner."""
         self._settled = False
         for number in member.lanes:
             self._lanes[number].restart()
         self._unplaced |= member.lanes
 
     def ticket_ended(self, member: Member) -> None:
-        """A ticket of this worker has ended."""
+        """Record that a ticket of this worker has ended."""
         if member is self._waiting_for:
             self._settled = False
 
     def place(self, active: Iterable[Member]) -> list[Outgoing]:
-        """Place all lanes that have no owner, then even out. Does nothing if nothing has changed."""
+        """Assign all lanes that have no owner, then even out. Does nothing if nothing has changed."""
         if self._settled:
             return []
         self._settled = True
         if not self._unplaced and len({lane.owner for lane in self._lanes}) == len(self._lanes):
             self._stop_waiting()
-            return []  # every lane has a worker of its own: nothing moves, however many spares there are
+            return []  # every lane has a worker of its own, so nothing moves, however many spare workers there are
         may_have_lanes = (each for each in active if not (each.hello.evaluates or each.describes))
         members = sorted(may_have_lanes, key=lambda member: member.join_number)
         if members:
@@ -91,7 +91,7 @@ class LanePlacement(Generic[L]):
         return self.even_out(members)
 
     def assign(self, lanes: Iterable[L], members: Iterable[Member]) -> None:
-        """Give each of these lanes to the worker that has the fewest."""
+        """Give each of these lanes to the worker that has the fewest lanes at that point."""
         fewest_first = [(len(member.lanes), self._tie_break(member), n, member) for n, member in enumerate(members)]
         heapq.heapify(fewest_first)
         for lane in lanes:
@@ -100,7 +100,7 @@ class LanePlacement(Generic[L]):
             heapq.heapreplace(fewest_first, (count + 1, tie_break, n, member))
 
     def even_out(self, members: Sequence[Member]) -> list[Outgoing]:
-        """Move lanes from the workers with the most to those with the fewest. Stops at a lane that must wait to move."""
+        """Move lanes from the workers with the most to those with the fewest, until one of them must wait to move."""
         self._stop_waiting()
         out: list[Outgoing] = []
         while members:

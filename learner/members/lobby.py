@@ -1,7 +1,7 @@
-"""The workers of a learner before its run begins: they join here, and one describes the environment. A shell.
+"""The lobby: the workers of a learner join here before its run begins, and one describes the environment. A shell.
 
-Rule: every wait has a deadline and says what it waits for. The hub of the run takes over the link, and the workers with
-their sessions.
+Rule: every wait has a deadline, and the log says what it waits for. The hub of the run takes over the link, and the workers
+with their sessions.
 """
 
 from __future__ import annotations
@@ -37,16 +37,16 @@ POLL_S = 0.05
 
 @dataclass(frozen=True)
 class LobbySettings:
-    """The settings of a run that matter before it begins, with the names that they have in `Config`."""
+    """The settings of a run that matter before it begins, named as in `Config`."""
 
     wait: WaitSpec
-    """What a Welcome to waiting workers says."""
+    """The content of the Welcome to waiting workers."""
     worker_timeout_s: float
     no_workers_timeout_s: float
     stall_timeout_s: float
     max_env_failures: int
     progress: RunProgress = field(default_factory=RunProgress)
-    """How far the run is: a resumed run doesn't begin at 0."""
+    """How far the run has got. A resumed run doesn't begin at 0."""
     launched_workers: int = 0
 
 
@@ -66,7 +66,7 @@ class Lobby:
         self.link = link
         self.processes = processes
         self.first_session = int.from_bytes(os.urandom(6), "little")
-        """also of the run, which continues its counts"""
+        """the number of the first session; the run continues to count from here"""
         self._settings = settings
         self._clock = clock
         coordinator = self._coordinator = DescribeCoordinator(
@@ -79,11 +79,12 @@ class Lobby:
         self._server = MemberServer(link, coordinator, self, processes, ServerSettings(log_joins=False), clock)
 
     def describe(self, unknown: Unknown, check_interrupt: Callable[[], None] = _never) -> DescribedEnv:
-        """The environment, from the first description by a worker that is accepted.
+        """Wait for a worker to describe the environment. Returns the first description that is accepted.
 
-        `check_interrupt` is called at least every 0.1 s: what it raises ends the wait. Raises `UsageError` if a worker of
-        this program, or each of `launched_workers`, says that there is no such environment, or describes one that is not
-        accepted; `EnvironmentFailed` if it fails too often; `NoWorkers` or `Stalled` if a deadline passes.
+        `check_interrupt` is called at least every 0.1 s, and an exception that it raises ends the wait. Raises `UsageError`
+        if a worker of this program, or each of `launched_workers`, says that there is no such environment or gives a
+        description that is not accepted; `EnvironmentFailed` if the environment fails too often; and `NoWorkers` or
+        `Stalled` if a deadline passes.
         """
         coordinator = self._coordinator
         server = self._server
@@ -97,7 +98,7 @@ class Lobby:
             check_interrupt()
             self._check()
             now = self._clock()
-            # In environment code, the timeouts of calls end a worker, and their errors name them.
+            # Time in the environment's code doesn't count: the timeouts of its calls end a worker, with better errors.
             busy_s = max((member.in_env_code_s for member in members.values()), default=began_s)
             if now - max(began_s, busy_s) > stall_timeout_s and members:
                 told = server.what_workers_do()
@@ -126,25 +127,25 @@ class Lobby:
         return self._coordinator.status(progress, now)
 
     def happened(self, event: Event) -> None:
-        """Count failures. None comes after env steps, so there is no line to log."""
+        """Count failures. None of them occurs after env steps, so there is no line to log."""
         self._failures.count(event, self._clock())
 
     def sent(self, peer: bytes) -> None:
-        """Do nothing when a message was sent."""
+        """Called when a message was sent. Does nothing."""
 
     def listen(self) -> None:
-        """Answer the workers while the learner prepares the run. Raises like `describe` if none can take part in it."""
+        """Answer the workers while the learner prepares the run. Raises what `describe` raises if none can take part."""
         self._server.listen(0.0)
         self._check()
 
     def hand_over(self) -> Membership[Member]:
-        """Begin the run. Returns the workers that wait for it: the run's hub takes them over."""
-        self._server.listen(0.0)  # so that it takes over nobody whose process has ended, or whose key was revoked meanwhile
+        """Close the lobby. Returns the workers that wait for the run, for its hub to take over."""
+        self._server.listen(0.0)  # so that the hub takes over nobody whose process has ended or whose key was revoked
         self._server.close()
         return self._coordinator.membership
 
     def _check(self) -> None:
-        """Raise what ends the start: too many failures, an environment that does not suit, or no worker."""
+        """Raise an error if there were too many failures, if the environment is unsuitable, or if there is no worker."""
         self._failures.check()
         if self._coordinator.unsuitable is not None:
             raise self._coordinator.unsuitable

@@ -1,7 +1,7 @@
-"""A worker as the learner sees it: what it has said about itself, and what it was given. Plain data and derived figures.
+"""A worker as the learner sees it: its own statements, and the work that it was given. Plain data and derived figures.
 
 Rule: a worker may claim anything, so each figure is bounded: seconds by the length of the session, late actions by a number
-that no loop reaches. A list of tickets is not kept.
+that no loop can reach. The list of tickets in a heartbeat is not kept, because it may be long.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from millrace.protocol.bounds import Stages
 from millrace.protocol.call_timeouts import OUR_CODE
 from millrace.protocol.messages import Heartbeat, Hello, WorkerActivity, WorkerStatus
 
-MEASURE_S = 0.5  # least time between the two heartbeats that measure a worker's speed: several may be read at once
-MAX_LATE_ACTIONS = 1_000_000  # between two heartbeats
-SUPERVISOR_WORD_S = 5.0  # for how long a supervisor's statement is valid
+MEASURE_S = 0.5  # least time between the two heartbeats that measure a worker's speed, because several may be read at once
+MAX_LATE_ACTIONS = 1_000_000  # the most late actions between two heartbeats that are believed
+SUPERVISOR_WORD_S = 5.0  # how long a supervisor's statement is valid
 
 
 @dataclass(eq=False)
 class SharingSupervisor:
-    """A supervisor whose workers share the weights that it gets, as the learner sees it. Its workers' members keep it."""
+    """A supervisor whose workers share the weights that it receives, as the learner sees it. Members refer to it."""
 
     peer: bytes
     heard_s: float = 0.0
@@ -31,27 +31,28 @@ class SharingSupervisor:
     replies: int = 0
     """Number of heartbeat replies that were sent to it."""
     received: int = 0
-    """Number of the last one that it has received: messages sent before that one have arrived, or are lost."""
+    """Number of the last reply that it has received. Messages sent before that reply have arrived or are lost."""
 
 
 @dataclass(frozen=True)
 class Speed:
-    """How fast a worker steps. A step may take minutes, and a client may count those of a rollout when that is complete.
+    """How fast a worker steps.
 
-    So the speed is that between the last two heartbeats with more steps, until the next one is overdue.
+    A step may take minutes, and a client may count the steps of a rollout only when that is complete. So the speed is
+    measured between the last two heartbeats with more steps. It falls once the next one is overdue.
     """
 
     steps: int
-    """Env steps in the heartbeat with which it was last measured."""
+    """Env steps in the heartbeat of the last measurement."""
     at_s: float
     """Time when that heartbeat arrived."""
     gained: int = 0
-    """Env steps since the measurement before."""
+    """Env steps between the previous measurement and this one."""
     seconds: float = 1.0
-    """Seconds between the two measurements."""
+    """Seconds between the previous measurement and this one."""
 
     def after(self, steps: int, now: float) -> Speed:
-        """The speed measured with a later heartbeat."""
+        """The speed after a measurement with a later heartbeat."""
         return Speed(steps, now, steps - self.steps, now - self.at_s)
 
     def steps_per_s(self, now: float) -> float:
@@ -72,40 +73,40 @@ class Member:
     heard_s: float
     """Time of the worker's last message."""
     joined_s: float = 0.0
-    """Time when it joined."""
+    """Time when the worker joined."""
     takeovers: int = 0
-    """How often processes have taken this name from each other, one directly after the other."""
+    """How many times in a row another process has taken over this name from a live one."""
     state: MemberState = MemberState.ACTIVE
     lanes: set[int] = field(default_factory=set)
     tickets: dict[int, int] = field(default_factory=dict)
-    """Tickets that the worker holds; for each, the value of `replies` when the ticket was last sent."""
+    """The tickets that the worker holds, each with the value of `replies` when the ticket was last sent."""
     replies: int = 0
-    """Number of heartbeat replies that were sent."""
+    """Number of heartbeat replies that were sent to the worker."""
     welcomed: int = 0
-    """`replies` when the run was sent to it."""
+    """The value of `replies` when the run was sent to the worker."""
     describes: bool = False
-    """Whether it may still be busy with a description that it was asked for before the run: as far as is known, it has not
-    begun the run.
+    """Whether the worker may still be busy with a description from before the run, because it has not said that it has begun
+    the run.
     """
     heartbeat: Heartbeat | None = None
     """Newest heartbeat."""
     stages_before: Stages = field(default_factory=dict)
     """Seconds in each stage of the worker's process before this session."""
     speed: Speed | None = None
-    """Speed measured with its heartbeats; None: there was none."""
+    """The worker's speed; None before its first heartbeat."""
     first_step_s: float | None = None
-    """Time at which its process was first known to make env steps: it reported one, or sent a rollout."""
+    """Time when its process was first known to have made an env step, because it reported one or sent a rollout."""
     activity: WorkerActivity | None = None
-    """What the worker is doing, as its supervisor last said."""
+    """What the worker is doing, according to its supervisor's last statement."""
     activity_s: float = 0.0
-    """Time when the supervisor said that."""
+    """Time of that statement."""
     failed_lane: int | None = None
-    """The lane whose environment failed, so that the worker left."""
+    """The lane whose environment failed, if the worker left because of that."""
     hung: bool = False
     """Whether its process was ended because a call took too long."""
     in_env_code_s: float = -math.inf
-    """Time when the supervisor last said that the worker is in code of the environment or of a policy that the user wrote:
-    until then the worker doesn't count as silent.
+    """Time when the supervisor last said that the worker is in code of the environment or of a policy that the user wrote.
+    Until then the worker doesn't count as silent.
     """
     supervisor: SharingSupervisor | None = None
     """Its supervisor, if it shares weights."""
@@ -118,14 +119,14 @@ class Member:
 
     @property
     def role(self) -> str:
-        """Its role in the run: draining, evaluating (it only evaluates), active, or spare (it has no lane)."""
+        """The worker's role: draining, evaluating (it only evaluates), active (it has lanes), or spare (it has none)."""
         if self.state is MemberState.DRAINING:
             return "draining"
         return "evaluating" if self.hello.evaluates else "active" if self.lanes else "spare"
 
     @property
     def has_counted(self) -> bool:
-        """Whether the counts of its process, as of the next heartbeat, began before its part in this run."""
+        """Whether the counts of its process, in the next heartbeat, include time before it took part in this run."""
         return not self.hello.is_first_attempt if self.heartbeat is None else self.heartbeat.waits
 
     @property
@@ -135,7 +136,7 @@ class Member:
 
     @property
     def worked_s(self) -> float | None:
-        """Seconds for which it is known to have made env steps; None if its process is not known to have made one."""
+        """Seconds from its first known env step until it was last known to be alive; None without a known step."""
         return None if self.first_step_s is None else max(0.0, self.alive_s - self.first_step_s)
 
     def has_stepped(self) -> None:
@@ -144,7 +145,7 @@ class Member:
             self.first_step_s = self.heard_s
 
     def record_activity(self, activity: WorkerActivity, now: float) -> bool:
-        """Keep what the supervisor says. True if calls of the environment have returned since its last message."""
+        """Record a supervisor's statement. Returns whether calls of the environment have returned since the last one."""
         before = self.activity
         self.activity = activity
         self.activity_s = now
@@ -153,9 +154,9 @@ class Member:
         return activity.env_calls > (0 if before is None else before.env_calls)
 
     def record_heartbeat(self, heartbeat: Heartbeat) -> list[int]:
-        """Keep the heartbeat. Returns the tickets that were lost on the way.
+        """Record a heartbeat. Returns the tickets that were lost on the way to the worker.
 
-        A ticket is lost if it was sent before a reply that the worker has seen, and the worker does not hold it.
+        A ticket is lost if it was sent before a reply that the worker has received, and the worker does not hold it.
         """
         if self.has_counted:
             self.stages_before = heartbeat.stages
@@ -170,14 +171,14 @@ class Member:
         return [ticket for ticket, sent_at in self.tickets.items() if ticket not in held and heartbeat.replies > sent_at]
 
     def begins(self, heartbeat: Heartbeat) -> None:
-        """Note if this heartbeat shows that a worker which had to describe an environment has begun the run."""
+        """Record it if this heartbeat shows that a worker that was describing an environment has begun the run."""
         if not heartbeat.waits:
             self.describes = False
 
     def new_late_actions(self, heartbeat: Heartbeat) -> int:
-        """The late actions since the last heartbeat. Those before this session belong to an earlier one.
+        """The number of late actions since the last heartbeat. Late actions from before this session don't count.
 
-        A number that no loop can reach between two heartbeats is not counted.
+        Returns 0 for a number that no loop can reach between two heartbeats.
         """
         if self.heartbeat is not None:
             before = self.heartbeat.late_actions
@@ -187,9 +188,9 @@ class Member:
         return more if 0 <= more <= MAX_LATE_ACTIONS else 0
 
     def stages(self) -> Stages:
-        """Seconds in each stage during this session, by its newest heartbeat; none is longer than the session.
+        """Seconds in each stage during this session, according to the newest heartbeat, each at most as long as the session.
 
-        The waiting of a member that only evaluates is not counted: it doesn't wait for anything from training.
+        The waiting of a member that only evaluates is not counted, because it doesn't wait for training.
         """
         lasted_s = self.heard_s - self.joined_s
         return {

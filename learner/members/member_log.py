@@ -1,7 +1,7 @@
 """A rate-limited log of workers' messages and events.
 
 Rule: lines and bytes are limited for each worker, and for all workers of one key together; workers without keys share one
-limit. So a peer that joins under ever new names, or with long texts, cannot fill the log. Omitted lines are counted.
+limit. So a peer that keeps joining under new names, or sends long texts, cannot fill the log. Omitted lines are counted.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from millrace.protocol.wire.learner_link import LearnerLink
 
 log = logging.getLogger("millrace.learner")
 
-MOST_WORKERS = 1_000  # whose budgets are remembered
+MOST_WORKERS = 1_000  # how many workers' budgets are remembered
 OF_A_WORKER = Allowance(lines=30, lines_per_s=0.2, bytes=MAX_TEXT, bytes_per_s=100)
 OF_A_KEY = Allowance(lines=5_000, lines_per_s=1, bytes=6 * MAX_TEXT, bytes_per_s=100)
-LINE_BYTES = 100  # of a line besides its text: time, level, line break
+LINE_BYTES = 100  # size of a line besides its text: time, level, line break
 
 
 class MemberLog:
@@ -29,20 +29,20 @@ class MemberLog:
         self._link = link
         self._clock = clock
         self._limit = LogRateLimiter()
-        self._of_key: dict[str, LogBudget] = {}  # as many as there are keys, and one more
-        self._traceback = ""  # the newest that was logged
-        self._of_worker: dict[tuple[str, str], LogBudget] = {}  # by key and name: workers of two keys may share a name
+        self._of_key: dict[str, LogBudget] = {}  # one for each key, and one for workers without keys
+        self._traceback = ""  # the newest traceback that was logged
+        self._of_worker: dict[tuple[str, str], LogBudget] = {}  # by key and name, because two keys may share a name
 
     def warn_limited(self, peer: bytes, line: str) -> None:
-        """Warn about what a peer sent, unless there was a line about it a short while ago."""
+        """Warn about a peer's message, unless there was a line about this peer a short while ago."""
         if (kept_back := self._limit.due(self._link.name_for_log(peer), self._clock())) is not None:
             self._write(logging.WARNING, [self._budget_of_key(peer)], one_line(line), suppressed_note(kept_back))
 
     def log_event(self, level: int, event: LoggedEvent, lines: str, cause: bytes | None) -> None:
-        """Log an event. Lines after the first are a traceback. It is left out if it is too long, or the same as the newest.
+        """Log an event. Lines after the first are a traceback, which is left out if it is too long or equals the newest one.
 
         `cause` is the peer whose message caused the event; None if no message did. Requests to join again are limited
-        more: after a restart of the learner they come in floods.
+        more strictly, because a restart of the learner causes a flood of them.
         """
         source = self._source(cause)
         kept_back: int | None = 0
@@ -58,7 +58,7 @@ class MemberLog:
         first, _, more = lines.partition("\n")
         if more and not all(budget.covers(_size(lines), now) for budget in budgets):
             lines = f"{first} (its traceback is left out: too much was logged about this worker)"
-            event = None  # it carries the traceback
+            event = None  # the event would bring the traceback into the log, too
         size = _size(lines)
         if not all(budget.covers(size, now) for budget in budgets):
             for budget in budgets:
@@ -81,7 +81,7 @@ class MemberLog:
 
     def _budget_of_worker(self, source: str, worker: str) -> LogBudget:
         budget = self._of_worker.pop((source, worker), None) or LogBudget(OF_A_WORKER)
-        self._of_worker[source, worker] = budget  # last in the table: the first is the worker that was silent for longest
+        self._of_worker[source, worker] = budget  # last in the table, whose first worker is the one least recently logged
         if len(self._of_worker) > MOST_WORKERS:
             del self._of_worker[next(iter(self._of_worker))]
         return budget

@@ -1,10 +1,11 @@
-"""The server of members: what every learner does for the workers that are connected to it. A shell: link, clock and log.
+"""The server of members, with which every learner serves its workers. A shell around link, clock and log.
 
 Rule: the inbox is emptied before silent workers are removed, and a learner that was away listens for a while first. So a
 long update, or a stopped process, never costs a healthy worker its membership.
 
-Rule: peers that send without end cost a bounded time. A turn of listening is cut off after a while (ZeroMQ takes messages
-from its connections in turn, so nobody is left out), new sessions are limited for each key, and so are answers to `Inquire`.
+Rule: peers that send without end take only a limited part of the learner's time. A turn of listening is cut off after a
+while (ZeroMQ reads its connections in turn, so nobody is left out), new sessions are limited for each key, and the time for
+answers to `Inquire` is limited.
 """
 
 from __future__ import annotations
@@ -55,27 +56,27 @@ from millrace.protocol.wire.learner_link import LearnerLink
 
 log = logging.getLogger("millrace.learner")
 
-ASK_PROCESSES_S = 0.25  # interval of asking what the workers that this program started are doing
-AWAY_S = 0.5  # a learner that has not listened for longer was busy, or its process was stopped
-TURN_S = 0.2  # most time for reading messages before the caller continues
-SHORT_TURN_S = 0.003  # least time, also in a short turn
-FAIR_SHARE = 10_000  # messages after which every connection was read, because ZeroMQ takes turns
-LAST_MESSAGES_WAIT_S = 0.1  # for the last messages of an ended process, which may still be on their way
-LAST_MESSAGES_TURNS = 10  # most such waits: other workers keep sending
+ASK_PROCESSES_S = 0.25  # interval at which to ask what the workers that this program started are doing
+AWAY_S = 0.5  # a learner that has not listened for longer was away: busy, or its process was stopped
+TURN_S = 0.2  # longest time for reading messages before the caller continues
+SHORT_TURN_S = 0.003  # shortest time for reading messages, even in a short turn
+FAIR_SHARE = 10_000  # number of messages after which every connection has been read, because ZeroMQ reads them in turn
+LAST_MESSAGES_WAIT_S = 0.1  # how long to wait for the last messages of an ended process, which may still be on their way
+LAST_MESSAGES_TURNS = 10  # the most such waits, because other workers keep sending
 STATUS_SHARE = 20  # answers to Inquire take at most 1 / STATUS_SHARE of the time
 
 
 class ServedHub(Protocol):
-    """The owner of a server: it waits in the server, which tells it what has happened."""
+    """The owner of a server. It waits in the server, which calls it with each event."""
 
     def status(self, now: float) -> Status:
         """The answer to `millrace status`."""
 
     def happened(self, event: Event) -> None:
-        """Called with each event, after it was logged."""
+        """Called with each event after it was logged."""
 
     def sent(self, peer: bytes) -> None:
-        """Called with the receiver of each message that was sent."""
+        """Called after each message that was sent, with its receiver."""
 
 
 @dataclass(frozen=True)
@@ -83,15 +84,15 @@ class ServerSettings:
     """The settings in which the servers of different hubs differ."""
 
     grace_s: float = AWAY_S
-    """For how long, after the learner was away, no worker is removed as silent."""
+    """For how many seconds, after the learner was away, no worker is removed as silent."""
     log_tracebacks: bool = True
-    """Whether to log the traceback of an environment; if not, the hub raises it."""
+    """Whether to log the traceback of an environment. False if the hub raises it."""
     log_joins: bool = True
-    """Whether to log that a worker joined; if not, it will join the run in a moment."""
+    """Whether to log that a worker joined. False in the lobby, because the worker joins the run shortly after."""
 
 
 class MemberServer:
-    """Receives from the members and sends to them; removes those whose key was revoked, that ended or are silent."""
+    """Exchanges messages with the members, and removes those that are silent, have ended, or whose key was revoked."""
 
     def __init__(
         self,
@@ -118,18 +119,18 @@ class MemberServer:
         self._remove_silent_from_s = self.listened_s
         self._ask_processes_s = self.listened_s
         self._no_members_since_s = math.inf
-        self._last_turned_away = ""  # why the last worker that didn't stay left
+        self._last_turned_away = ""  # why the last worker that left unexpectedly, or was refused, is gone
         self._encoded: tuple[ToWorker, Sequence[Buffer]] | None = None
         self._joins = JoinLimiter()
-        self._read_since_empty = 0  # messages, since the inbox was empty
-        self._status: tuple[float, Sequence[Buffer]] = (-math.inf, ())  # until when it is fresh enough, and its frames
+        self._read_since_empty = 0  # number of messages read since the inbox was last empty
+        self._status: tuple[float, Sequence[Buffer]] = (-math.inf, ())  # until when the status is fresh, and its frames
         self.unexpected_errors = 0
-        """errors of this program that a peer's message caused; each cost only that peer its membership"""
+        """number of errors of this program that a peer's message caused; each cost only that peer its membership"""
 
     def listen(self, timeout_s: float, short: bool = False) -> None:
         """Wait at most `timeout_s` for messages, answer them, and remove the members that are gone.
 
-        `short`: answer for no longer than the caller has worked since the last call; other messages wait.
+        If `short`, it answers for no longer than the caller has worked since the last call; other messages wait.
         """
         worked_s = self._clock() - self.listened_s
         self.receive(timeout_s, min(TURN_S, max(SHORT_TURN_S, worked_s)) if short else TURN_S)
@@ -138,7 +139,8 @@ class MemberServer:
         now = self._clock()
         self._record_activities(now)
         if now - self.listened_s > timeout_s + AWAY_S:
-            # Messages sent meanwhile may still be in the kernel: if this process was stopped, so was ZeroMQ's thread.
+            # Messages that were sent meanwhile may still be in the kernel, because ZeroMQ's thread may have been stopped
+            # together with this process.
             self._remove_silent_from_s = now + self._settings.grace_s
         self.listened_s = now
         if now >= self._remove_silent_from_s and (not self._read_since_empty or self._read_since_empty >= FAIR_SHARE):
@@ -146,7 +148,7 @@ class MemberServer:
             self.send(self._coordinator.remove_silent(now))
 
     def receive(self, timeout_s: float, turn_s: float = TURN_S) -> None:
-        """Wait at most `timeout_s` for messages and answer those that have come, for about `turn_s` at most."""
+        """Wait at most `timeout_s` for messages, and answer those that have arrived, for about `turn_s` at most."""
         if not self._link.poll(timeout_s):
             self._read_since_empty = 0
             return
@@ -160,17 +162,17 @@ class MemberServer:
         self._read_since_empty = 0
 
     def send(self, messages: Sequence[Outgoing], cause: bytes | None = None) -> None:
-        """Send these messages, then log what has happened. `cause`: the peer whose message caused it, if any."""
+        """Send these messages, then log the new events. `cause` is the peer whose message caused them, if any."""
         for peer, message in messages:
-            self._link.send(peer, self._frames(message))  # if it fails, the worker is soon removed as silent
+            self._link.send(peer, self._frames(message))  # if it fails, the worker will soon be removed as silent
             self._hub.sent(peer)
         if self._membership.events:
             self._log_events(cause)
 
     def wait_for(self, workers: int, timeout_s: float, turn: Callable[[], None]) -> None:
-        """Call `turn`, which listens, until this number of `workers` have joined.
+        """Call `turn`, which must listen, until this number of `workers` have joined.
 
-        Raises `NoWorkers` after `timeout_s`, or at once if that many can't join any more. Workers that only evaluate don't
+        Raises `NoWorkers` after `timeout_s`, or at once if that many can no longer join. Workers that only evaluate don't
         count.
         """
         deadline_s = self._clock() + timeout_s
@@ -188,10 +190,9 @@ class MemberServer:
             turn()
 
     def check_members(self, timeout_s: float, *, collecting: bool = False) -> None:
-        """Raise `NoWorkers` if there was no worker in any call for `timeout_s`, or at once if none can join any more. Call
-        it after each turn of a wait.
+        """Raise `NoWorkers` if there has been no worker for `timeout_s`, or at once if none can join any more.
 
-        `collecting`: workers that only evaluate don't count.
+        Call this after each turn of a wait. If `collecting`, workers that only evaluate don't count.
         """
         now = self._clock()
         if any(not (collecting and member.hello.evaluates) for member in self._membership.members.values()):
@@ -203,7 +204,7 @@ class MemberServer:
             raise self.no_workers(1, timeout_s)
 
     def check_left(self, workers: int, *, collecting: bool) -> None:
-        """Raise `NoWorkers` if this program has started the workers, nobody else can join, and fewer than these are left."""
+        """Raise `NoWorkers` if fewer than `workers` are left, all started by this program, and no others can join."""
         left = self._processes.left(collecting=collecting)
         if left >= workers:
             return
@@ -220,13 +221,13 @@ class MemberServer:
             self._remove_ended_processes(0.0)
 
     def close(self) -> None:
-        """Forget the hub. The hub refers to this server, so otherwise both, with their file descriptors, would wait for the
-        garbage collector.
+        """Forget the hub. The hub and this server refer to each other, so without this both, with their file descriptors,
+        would stay until the garbage collector runs.
         """
         del self._hub, self._processes
 
     def no_workers(self, workers: int, timeout_s: float) -> NoWorkers:
-        """The error when fewer than `workers` have joined within `timeout_s`: it says how to start one."""
+        """The error to raise when fewer than `workers` have joined within `timeout_s`. It says how to start one."""
         address = self._link.address
         reached_at = advertised_address(address, "", socket.gethostname())
         start = f"millrace worker {reached_at}{'' if self._link.keyring is None else ' --token FILE'}"
@@ -235,14 +236,14 @@ class MemberServer:
         return NoWorkers(f"waited {timeout_s:g} s for {awaited} at {address}, {joined}; start one: {start}")
 
     def what_workers_do(self) -> str:
-        """What the workers are doing, longest held up first; if there are none, what is awaited."""
+        """What the workers are doing, the one that has been held up longest first; if there are none, what is awaited."""
         members = self._membership.members.values()
         processes = self._processes
         doing, wrote = what_they_do(members, processes.activities(), processes.last_lines(), self._clock())
         return "; ".join([doing or f"waiting for {self.awaited()}", *wrote])
 
     def awaited(self) -> str:
-        """What a run without workers waits for, with the known reasons why workers may be missing."""
+        """What a run without workers is waiting for, with the known reasons why workers may be missing."""
         return f"a worker to join at {self._link.address}{self._missing_reason()}"
 
     # ---------------------------------------------------------------- inside
@@ -254,7 +255,7 @@ class MemberServer:
         return f" ({self._link.refused} were not let in; the log says why)" if self._link.refused else ""
 
     def _answer(self, peer: bytes, message: ToLearner | Inquire | BadMessage, now: float) -> Sequence[Outgoing]:
-        """Answer one message. An error costs its sender the membership, and never ends the run."""
+        """The answer to one message. An error costs the sender its membership, but never ends the run."""
         try:
             match message:
                 case BadMessage():
@@ -264,16 +265,16 @@ class MemberServer:
                     self._link.send(peer, self._status_frames(now))
                     return ()
                 case Hello() if not self._joins.admits(self._link.source(peer), now):
-                    return ()  # it says Hello again
+                    return ()  # the worker will repeat its Hello
                 case _:
                     return self._coordinator.receive(peer, message, now)
         except Exception as error:
             return self._refuse_after_error(peer, type(message).__name__, error)
 
     def _refuse_after_error(self, peer: bytes, kind: str, error: Exception) -> Sequence[Outgoing]:
-        """The last safeguard: no message should cause this.
+        """Refuse the sender of a message that caused an unexpected error, and log the first such error with its traceback.
 
-        Refuse its sender; log the first such error with its traceback.
+        This is the last safeguard: no message should cause such an error.
         """
         self.unexpected_errors += 1
         line = f"its {kind} led to an error in the learner: {type(error).__name__}"
@@ -283,7 +284,7 @@ class MemberServer:
         return [(peer, Refuse(line))] if member is None else self._membership.refuse(member, SentUnusable, line)
 
     def _status_frames(self, now: float) -> Sequence[Buffer]:
-        """Frames of a status. It is recomputed only after `STATUS_SHARE` times the time that computing it took."""
+        """The frames of a status, which is recomputed only after `STATUS_SHARE` times as long as computing it took."""
         if now >= self._status[0]:
             frames = status_frames(self._hub.status(now))
             took_s = self._clock() - now
@@ -295,7 +296,7 @@ class MemberServer:
             self.send(self._coordinator.revoke(peer, why))
 
     def _remove_ended_processes(self, last_messages_wait_s: float) -> None:
-        """Remove the workers whose processes have ended, once their last messages are read: these may say why."""
+        """Remove the workers whose processes have ended, after reading their last messages, which may say why."""
         ended = list(self._processes.ended())
         until_s = self._clock() + LAST_MESSAGES_TURNS * last_messages_wait_s
         while ended and self._link.poll(last_messages_wait_s):
@@ -313,7 +314,7 @@ class MemberServer:
                 self._membership.record_activity(activity, now)
 
     def _frames(self, message: ToWorker) -> Sequence[Buffer]:
-        """Frames of a message. Weights are encoded once, however many workers there are."""
+        """The frames of a message. Weights are encoded once, however many workers there are."""
         if not isinstance(message, Weights):
             return encode(message)
         if self._encoded is None or self._encoded[0] is not message:
@@ -333,7 +334,7 @@ class MemberServer:
             self._hub.happened(event)
 
     def _log_event(self, event: LoggedEvent, cause: bytes | None, told: str) -> str:
-        """Log an event. `told`: the worker whose failure was just logged. Returns who that is now."""
+        """Log an event. `told` is the worker whose failure was logged last. Returns its new value."""
         line = describe(event)
         expected = isinstance(event, WorkerJoined | WorkerToldToRejoin | NamelessHello)
         match event:
@@ -360,7 +361,7 @@ class MemberServer:
 
 
 def status_frames(status: Status) -> Sequence[Buffer]:
-    """Frames of a status. If it is too long for a message, the last workers are left out, and their number is given."""
+    """The frames of a status. If it is too long for a message, the last workers are left out, and their number is given."""
     while True:
         try:
             return encode(status)

@@ -1,4 +1,4 @@
-"""The states of a worker as the learner sees them, and the table of transitions by messages and events. Plain data."""
+"""The states of a worker as the learner sees them, and the table of the transitions that messages and events cause."""
 
 from __future__ import annotations
 
@@ -40,7 +40,8 @@ class KeyRevoked:
     """Event: the worker's key may no longer connect."""
 
 
-# The next state for each event. The learner itself sends Drain. Other messages of an unknown worker are answered by Rejoin.
+# The next state for each message or event. The learner itself sends Drain. Other messages of an unknown worker are answered
+# with Rejoin.
 TABLE: dict[MemberState, dict[type, MemberState]] = {
     MemberState.UNKNOWN: {Hello: MemberState.ACTIVE},
     MemberState.ACTIVE: {

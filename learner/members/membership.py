@@ -1,15 +1,15 @@
 """Membership of workers: joining, sessions, names, refusals, leaving. Pure: messages and `now` in, messages out.
 
-Rule: the learner's data about a worker ends with its session, except totals and a limited number of refusals. The number of
-members is limited.
+Rule: when a session ends, the learner forgets the worker's data, except totals and a limited number of refusals. The number
+of members is limited.
 
-Rule: the workers that have joined before there is a run keep their sessions when it begins (`take_over`). One that was
-asked for a description and has not answered gets no work before it has begun the run: it may hang.
+Rule: workers that joined before there is a run keep their sessions when it begins (`take_over`). A worker that was asked for
+a description and has not answered gets no work until it has begun the run, because it may hang.
 
-Rule: one process has one session at a time. A repeated Hello is answered by the same Welcome. A Hello of a new attempt,
-or of another process under the same name, ends the session before it. A process that lost its name in this way may join
-again; of processes that take a name from each other, the one that loses it the third time is refused. A process that was
-refused stays refused. A worker that is silent for too long is removed.
+Rule: a process has one session at a time. A repeated Hello is answered with the same Welcome. A Hello of a new attempt, or
+of another process under the same name, ends the previous session. A process that lost its name in this way may join again;
+if processes keep taking a name from each other, the one that loses it the third time is refused. A process that was refused
+stays refused. A worker that is silent for too long is removed.
 """
 
 from __future__ import annotations
@@ -56,9 +56,9 @@ from millrace.protocol.messages import (
 )
 from millrace.protocol.specs import RunSpec, StepSpec, WaitSpec
 
-REMEMBERED = 1_000  # refused processes, and names of silent workers; a peer with many names must not fill the memory
+REMEMBERED = 1_000  # how many refused processes, and how many silent workers, are remembered; this bounds memory
 MAX_MEMBERS = 4_096
-MOST_TAKEOVERS = 3  # of one name, by one live process from another
+MOST_TAKEOVERS = 3  # how many times in a row live processes may take a name from each other
 NAMELESS = "its connection has no routing id: expected the worker's name, set as the socket's routing id before it connects"
 
 Outgoing = tuple[bytes, ToWorker]
@@ -70,7 +70,7 @@ class Answered:
     """The answer to a message that no member sent in its session, or to a member's Failure."""
 
     out: list[Outgoing]
-    """The answer."""
+    """The messages of the answer."""
     changed: bool = False
     """Whether a worker joined, or members were removed."""
 
@@ -91,34 +91,34 @@ class Membership(Generic[M]):
         first_session: int,
         is_spare: Callable[[M], bool] = lambda member: False,
     ) -> None:
-        """`on_removed` is called with each member that was removed, and why: it takes back what that member held.
+        """`on_removed` is called with each member that was removed, and why. It must take back the work of that member.
 
-        `is_spare`: whether the run doesn't need a member's environments, so that its failures don't count.
+        `is_spare` says whether the run doesn't need a member, so that its failures don't count.
         """
         self.members: dict[bytes, M] = {}
         self.events: list[Event] = []
         self.draining: str | None = None
         """why the workers were asked to leave; None if they were not"""
         self.progress = {False: 0, True: 0}
-        """how often a member has reported more env steps, or more calls of the environment that have returned: by whether it
-        only evaluates
+        """how many times members have reported more env steps, or more finished calls of the environment, since the last
+        time: False counts members that may collect, True those that only evaluate
         """
         self.has_policy_code = isinstance(run, RunSpec) and bool(run.policy_code)
-        """whether a user-defined policy acts in the workers: no worker can blame a built-in one"""
+        """whether a user-defined policy acts in the workers; if not, a failure is never blamed on the policy"""
         self._run = run
         self._member_class = member_class
         self._on_removed = on_removed
         self.is_spare = is_spare
         self._first_session = self._next_session = first_session
         self._joins = 0
-        self._none_silent_before_s = -math.inf  # before this time no member can be silent for too long
-        self._of_process: dict[tuple[str, int], M] = {}  # by name and process_nonce
-        self._removed_for_silence: dict[str, int] = {}  # name -> process_nonce, until they join again; the oldest first
-        self._stages_of_left: Stages = {}  # of the members that have left
-        self._refused: dict[bytes, tuple[int, str]] = {}  # the process (by its nonce) that was refused, and why
+        self._none_silent_before_s = -math.inf  # before this time, no member can have been silent for too long
+        self._of_process: dict[tuple[str, int], M] = {}  # the members by name and process_nonce
+        self._removed_for_silence: dict[str, int] = {}  # by name, the process_nonce, until it joins again; oldest first
+        self._stages_of_left: Stages = {}  # total seconds in each stage of the members that have left
+        self._refused: dict[bytes, tuple[int, str]] = {}  # by peer, the nonce of the process that was refused, and why
 
     def active(self) -> list[M]:
-        """The members that are given work, in the order in which they joined."""
+        """The members that may be given work, in the order in which they joined."""
         return [each for each in self.members.values() if each.state is MemberState.ACTIVE and not each.describes]
 
     def collectors(self) -> list[M]:
@@ -130,7 +130,7 @@ class Membership(Generic[M]):
         return tuple(member.status(now) for member in sorted(self.members.values(), key=lambda member: member.join_number))
 
     def stages(self) -> Stages:
-        """Seconds in each stage: of all members, and of those that have left."""
+        """Total seconds in each stage, of all members and of those that have left."""
         total = dict(self._stages_of_left)
         for member in self.members.values():
             _add(total, member.stages())
@@ -143,7 +143,7 @@ class Membership(Generic[M]):
         return events
 
     def hear(self, peer: bytes, message: ToLearner, now: float) -> M | Answered:
-        """The member, if a member that stays sent this message in its session. Otherwise the answer to the message."""
+        """The member that sent this message in its session, for the caller to answer; otherwise the answer."""
         match message:
             case Hello():
                 out, joined = self.join(peer, message, now)
@@ -160,7 +160,7 @@ class Membership(Generic[M]):
         return member
 
     def member_of_session(self, peer: bytes, message: ToLearner, now: float) -> M | None:
-        """The member that sent this message in its current session, or None. Also records when the member was heard."""
+        """The member that sent this message in its current session, or None. Records that the member was heard."""
         member = self.members.get(peer)
         if member is None or isinstance(message, Hello | Alive) or member.session != message.session:
             return None
@@ -170,7 +170,7 @@ class Membership(Generic[M]):
         return member
 
     def answer_ended_session(self, peer: bytes, message: ToLearner) -> list[Outgoing]:
-        """The answer to a message of a session that has ended: join again, unless the worker leaves anyway."""
+        """The answer to a message of a session that has ended: a request to join again, unless the worker is leaving."""
         if isinstance(message, Hello | Alive | Goodbye | Failure):  # rule UNKNOWN_SESSION
             return []
         late = message.env_steps if isinstance(message, Rollout) else 0
@@ -224,7 +224,7 @@ class Membership(Generic[M]):
         return [self._welcome(member)], member
 
     def take_over(self, waiting: Membership[Member], now: float) -> list[Outgoing]:
-        """Begin the run for the workers that wait for it: their sessions continue, and another Welcome brings the run."""
+        """Begin the run for the workers that wait for it. Their sessions continue; another Welcome sends them the run."""
         self._first_session = waiting._first_session
         self._next_session = waiting._next_session
         self._joins = waiting._joins
@@ -241,7 +241,7 @@ class Membership(Generic[M]):
         return [self._welcome(member) for member in self.members.values()]
 
     def welcome_again(self, member: M, heartbeat: Heartbeat) -> list[Outgoing]:
-        """The Welcome that brings the run, again, if this heartbeat shows that it was lost."""
+        """Repeat the Welcome that sends the run if this heartbeat shows that it was lost."""
         lost = heartbeat.waits and not isinstance(self._run, WaitSpec) and heartbeat.replies > member.welcomed
         return [self._welcome(member)] if lost else []
 
@@ -250,18 +250,18 @@ class Membership(Generic[M]):
         self.remove(member, Goodbye, f"left: {reason}")
 
     def refuse(self, member: M, event: type, why: str) -> list[Outgoing]:
-        """Remove a member; its process must not come back."""
+        """Remove a member, and refuse its process from now on."""
         self._remember_refusal(member, why)
         return self._refuse_and_remove(member, event, f"refused: {why}", why)
 
     def revoke(self, peer: bytes, why: str) -> list[Outgoing]:
-        """Remove a member whose key was revoked, at once, whatever it holds."""
+        """Remove a member whose key was revoked, at once, whatever work it has."""
         return self._refuse_and_remove(self.members[peer], KeyRevoked, f"was shut out: {why}", why)
 
     def hear_supervisor(self, peer: bytes, alive: Alive, now: float) -> tuple[list[Outgoing], list[WorkerExit]]:
-        """Record what a supervisor says about members that use its key and whose nonce it knows.
+        """Record a supervisor's statements about members. They count only for members with its key whose nonce it knows.
 
-        Returns the answer, and the exits that removed members.
+        Returns the answer, and the exits of processes that removed members.
         """
         key = key_of_peer(peer)
         found = [self.record_activity(activity, now, key) for activity in alive.running]
@@ -285,7 +285,7 @@ class Membership(Generic[M]):
     def record_activity(self, activity: WorkerActivity, now: float, key: bytes | None = None) -> M | None:
         """Record what a member's process is doing. Returns the member.
 
-        `key`: the key of the supervisor that says so; None: this program is the supervisor.
+        `key` is the key of the supervisor that says so; None if this program is the supervisor.
         """
         member = self._of_process.get((activity.worker, activity.process_nonce))
         if member is None or (key is not None and key != key_of_peer(member.peer)):
@@ -295,7 +295,7 @@ class Membership(Generic[M]):
         return member
 
     def record_exit(self, worker_exit: WorkerExit, key: bytes | None = None) -> bool:
-        """Remove the member whose process has ended. True if there was one. `key`: as for `record_activity`."""
+        """Remove the member whose process has ended. Returns whether there was one. For `key`, see `record_activity`."""
         worker = worker_exit.worker
         reason = worker_exit.reason
         member = self._of_process.get((worker, worker_exit.process_nonce))
@@ -307,13 +307,13 @@ class Membership(Generic[M]):
                 self.events.append(self._failed(kind, member, f"its process {reason}"))
             self.remove(member, TimedOut, reason)
             return True
-        if self._removed_for_silence.get(worker) == worker_exit.process_nonce:  # now it is known why it was silent
+        if self._removed_for_silence.get(worker) == worker_exit.process_nonce:  # this explains why it was silent
             del self._removed_for_silence[worker]
             self.events.append(WorkerLeft(worker, reason, 0, False))
         return False
 
     def remove_silent(self, now: float, timeout_s: float) -> list[M]:
-        """Remove the members that have been silent for too long. Returns them."""
+        """Remove the members that have been silent for longer than `timeout_s`. Returns them."""
         if now < self._none_silent_before_s:
             return []
         silent = [member for member in self.members.values() if now - member.alive_s > timeout_s]
@@ -324,7 +324,7 @@ class Membership(Generic[M]):
         return silent
 
     def remove(self, member: M, event: type, why: str, refusal: str | None = None) -> None:
-        """Remove a member. `refusal`: what it is told, if it is refused."""
+        """Remove a member. If it is refused, `refusal` is the reason that it is told."""
         member.state = TABLE[member.state][event]
         del self.members[member.peer]
         _add(self._stages_of_left, member.stages())
@@ -336,7 +336,7 @@ class Membership(Generic[M]):
         self._on_removed(member, why)
 
     def drain(self, reason: str) -> list[Outgoing]:
-        """Ask every member to leave; nobody can join any more."""
+        """Ask every member to leave. From now on, nobody can join."""
         self.draining = reason
         out: list[Outgoing] = []
         for member in self.members.values():
@@ -347,7 +347,7 @@ class Membership(Generic[M]):
         return out
 
     def _fail(self, member: M, failure: Failure) -> None:
-        """Remove a member which says that code of the environment or the user's policy has failed."""
+        """Remove a member that reports a failure of the environment's code or of the user's policy."""
         by_policy = failure.of_policy and self.has_policy_code
         kind = PolicyRaised if by_policy else EnvironmentRaised
         self.events.append(self._failed(kind, member, failure.error, failure.traceback, failure.lane))
@@ -355,7 +355,7 @@ class Membership(Generic[M]):
         self.remove(member, Failure, "failed")
 
     def _failed(self, kind: type[Failed], member: M, error: str, traceback: str = "", lane: int | None = None) -> Failed:
-        """The event of a member's failure, in this lane if it is known to be the member's lane."""
+        """The event of a member's failure, in `lane` if this is one of the member's lanes, otherwise in all its lanes."""
         return kind(
             worker=member.hello.worker,
             host=member.hello.host,
@@ -379,7 +379,7 @@ class Membership(Generic[M]):
 
 
 def _remember(table: dict[K, V], key: K, value: V) -> None:
-    """Keep the value in a table of limited size: the oldest entry is dropped first."""
+    """Store a value in a table of limited size, dropping the oldest entry if the table is full."""
     table[key] = value
     if len(table) > REMEMBERED:
         del table[next(iter(table))]

@@ -1,8 +1,8 @@
-"""The learner's endpoint: its address, who may connect, and the command for workers on another machine.
+"""The learner's endpoint: its address, who may connect, and the command that starts a worker on another machine.
 
-Rule: an address that other machines can reach needs keys, unless the user says `insecure`. Keys are made automatically at
-first use. On loopback they are needed only if a key folder was named. Between processes that share a file or memory, the
-operating system decides who may connect. `membership.py` decides which of them may join a run.
+Rule: an address that other machines can reach needs keys, unless the user sets `insecure`. Keys are made automatically on
+first use. On loopback they are needed only if a key folder was named. Over ipc and inproc, the operating system decides who
+may connect. `membership.py` decides which of those who may connect may join a run.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class Listening(Protocol):
 
 @dataclass(frozen=True)
 class BindSettings:
-    """Where a vector environment listens, named as in `Config`. Without an address it starts its own workers."""
+    """Where a vector environment listens; fields are named as in `Config`. Without an address it starts its own workers."""
 
     bind: str = ""
     keys: str = ""
@@ -51,7 +51,10 @@ class BindSettings:
 
 
 def keyring_for(config: Listening, now: datetime) -> Keyring | None:
-    """The keys that may connect to `config.bind`; None if no key is needed. Raises `UsageError`."""
+    """The keys that may connect to `config.bind`; None if no key is needed.
+
+    Raises `UsageError` for both keys and `insecure`, or if the key folder can't be used.
+    """
     if config.insecure and config.keys:
         raise UsageError(f"keys {config.keys} or insecure: expected one, got both")
     if not config.bind.startswith("tcp://"):
@@ -72,7 +75,7 @@ def keyring_for(config: Listening, now: datetime) -> Keyring | None:
 
 
 def generate_run_keys(worker: str, now: datetime) -> tuple[Keyring, Token]:
-    """Keys for one run on this machine. They are not written to any file."""
+    """Make keys for one run on this machine. They are not written to any file."""
     server = Key.new()
     client = Key.new()
     return Keyring(server, ClientList().with_client(worker, client.public, now)), Token(server.public, client)

@@ -1,6 +1,6 @@
-"""The worker processes that this program started, as its learner knows them: how they end, what they do, how many are left.
+"""The learner's view of the worker processes that its program started: how they end, what they do, how many are left.
 
-The code that starts them (`millrace/launch/`) overrides these methods. The class itself is for a learner whose workers are
+The code that starts them (`millrace/launch/`) overrides these methods. The class itself serves a learner whose workers are
 all started elsewhere.
 """
 
@@ -15,43 +15,46 @@ from millrace.protocol.alive import StartFailed, WorkerActivity, WorkerExit
 
 
 class WorkerProcesses:
-    """No processes of this program: workers may join from elsewhere."""
+    """No worker processes of this program; workers may join from elsewhere."""
 
     expected: int = 0
-    """Number of processes that the user asked for. 0: any number."""
+    """The number of processes that the user asked for; 0 for any number."""
     most_copies: int = 0
-    """The largest number of env copies that their machine has room for. 0: any number."""
+    """The largest number of env copies for which their machine has room; 0 for any number."""
 
     def ended(self) -> Sequence[WorkerExit | StartFailed]:
-        """The workers whose processes have ended since the last call. It may raise."""
+        """The workers whose processes have ended since the last call. An override may raise."""
         return ()
 
     def activities(self) -> Sequence[WorkerActivity]:
-        """What the workers with running processes are doing. A stopped process is left out."""
+        """What the workers whose processes are running are doing. Stopped processes are left out."""
         return ()
 
     def last_lines(self) -> Mapping[str, str]:
-        """The last line of each worker's log, by the worker's name, without workers that have written nothing."""
+        """The last line of each worker's log, by the worker's name. Workers that have written nothing are left out."""
         return {}
 
     def left(self, *, collecting: bool) -> float:
-        """How many run or will be restarted; infinity if others may join. `collecting`: count only those that collect."""
+        """How many processes are running or will be restarted; infinity if others may join.
+
+        If `collecting`, processes that only evaluate don't count.
+        """
         return math.inf
 
     def kill(self, worker: str) -> bool:
-        """End the process of this worker at once; False if it isn't one of these."""
+        """End the process of this worker at once. Returns False if the worker isn't one of these processes."""
         return False
 
     def stop(self, timeout_s: float) -> None:
-        """Ask all to leave, and kill those that still run after `timeout_s`."""
+        """Ask all processes to end, and kill those that still run after `timeout_s`."""
 
     def lower_priority(self) -> None:
         """Give these processes, and those that replace them, the lowest CPU priority."""
 
     def stepping(self) -> Sequence[Member] | None:
-        """The workers that step the environment, if these are not the learner's members; else None."""
+        """The workers that step the environment if they are not the learner's members; otherwise None."""
         return None
 
     def take_failures(self) -> Sequence[Failed]:
-        """Failures of those workers, since the last call."""
+        """The failures of the workers of `stepping` since the last call."""
         return ()

@@ -1,1 +1,1 @@
-"""More than one learner process: shards of a batch, whose gradients are added in a fixed order."""
+"""Several learner processes for one run. They share the shards of each batch, and add gradients in a fixed order."""

@@ -1,8 +1,8 @@
-"""How a batch is divided into shards, and shards among learner processes. Pure.
+"""How a batch is divided into shards, and the shards among learner processes. Pure.
 
-Law: shard s of S has the lanes whose number leaves the remainder s when it is divided by S. Each shard passes the network
-alone, so the shapes of its passes don't depend on the number R of processes. Sums over shards are made in a fixed order, as
-a tree of pairs. Therefore every R that divides S gives the same bits.
+Law: shard s of S has the lanes whose number modulo S is s. Each shard passes the network alone, so the shapes of its passes
+don't depend on the number R of processes. Sums over shards are computed in a fixed order, as a tree of pairs. Therefore
+every R that divides S gives the same bits.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ import numpy.typing as npt
 from millrace.protocol.rollout import Batch
 
 Columns = npt.NDArray[np.int64]
-"""[columns] a number for each, such as its own or that of its lane"""
+"""[columns] a number for each column, such as its own number or that of its lane"""
 
 
 class Addend(Protocol):
-    """What can be added: a number, an array, a tensor."""
+    """A value that can be added, such as a number, an array or a tensor."""
 
     def __add__(self, other: Self, /) -> Self: ...
 
@@ -30,17 +30,17 @@ Term = TypeVar("Term", bound=Addend)
 
 
 class Division(NamedTuple):
-    """S shards of R learner processes."""
+    """The division of S shards among R learner processes."""
 
     shards: int
-    """S, a multiple of R"""
+    """S, the number of shards, a multiple of R"""
     processes: int
-    """R"""
+    """R, the number of processes"""
     rank: int
     """the number of this process, from 0"""
 
     def of_process(self, rank: int) -> range:
-        """The shards of a process: S / R that follow each other."""
+        """The shards of a process: S / R consecutive ones."""
         count = self.shards // self.processes
         return range(rank * count, (rank + 1) * count)
 
@@ -50,7 +50,7 @@ class Division(NamedTuple):
         return self.of_process(self.rank)
 
     def columns(self, lane: Columns) -> list[Columns]:
-        """The columns of each shard. `lane` [ΣN]: the lane of each column."""
+        """The columns of each shard. `lane` [ΣN] is the lane of each column."""
         return [np.flatnonzero(lane % self.shards == shard) for shard in range(self.shards)]
 
     def columns_of_process(self, lane: Columns, rank: int) -> Columns:
@@ -60,14 +60,14 @@ class Division(NamedTuple):
 
 
 def part_of(batch: Batch, columns: Columns) -> Batch:
-    """Some columns of a batch, without the list of its episodes. With seats, the columns are those of whole env copies."""
+    """Some columns of a batch, without the list of its episodes. With seats, they must be columns of whole env copies."""
     resets = batch.resets
     if resets is not None:
         seats = batch.valid.shape[1] // resets.shape[1]
         resets = resets[:, columns[::seats] // seats]
     return msgspec.structs.replace(
         batch,
-        obs=tuple(leaf.take(columns, axis=1) for leaf in batch.obs),  # contiguous, so that torch needs no other copy
+        obs=tuple(leaf.take(columns, axis=1) for leaf in batch.obs),  # contiguous, so torch needs no further copy
         action=batch.action[:, columns],
         log_prob=batch.log_prob[:, columns],
         reward=batch.reward[:, columns],
@@ -85,7 +85,7 @@ def part_of(batch: Batch, columns: Columns) -> Batch:
 
 
 def pairwise_sum(terms: Sequence[Term]) -> Term:
-    """The sum of one or more terms: neighbours are added, then neighbouring sums, until one is left."""
+    """The sum of one or more terms: adds neighbours, then neighbouring sums, until one is left."""
     while len(terms) > 1:
         pairs = [one + other for one, other in zip(terms[::2], terms[1::2], strict=False)]
         terms = [*pairs, *terms[2 * len(pairs) :]]

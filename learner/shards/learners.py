@@ -1,8 +1,8 @@
 """The learner processes of a run, connected by torch.distributed: gloo between CPUs, NCCL between GPUs. A thin shell.
 
-Rules: the number of collectives follows from what rank 0 has told, and each is one tensor of a fixed size. A process that is
-gone, or that takes longer than the timeout, ends all of them with `LearnerLost`: the program that started them starts them
-again. torch.distributed checks nobody's identity, so it listens on loopback unless the settings say otherwise.
+Rules: the number of collectives follows from the messages of rank 0, and each collective is one tensor of a fixed size. If a
+process is gone, or takes longer than the timeout, all processes end with `LearnerLost`, so that the program that started
+them can restart them. torch.distributed authenticates nobody, so it listens on loopback unless the settings say otherwise.
 """
 
 from __future__ import annotations
@@ -41,18 +41,18 @@ log = logging.getLogger("millrace.learner")
 
 POLL_S = 0.1
 TELL_EVERY_S = 30.0
-TELL_BEFORE = 0.1  # of the time that others wait for a message
-PATIENCE_S = 3.0  # for a try to connect
+TELL_BEFORE = 0.1  # a sign of life is sent after this share of the time that others wait for a message
+PATIENCE_S = 3.0  # timeout of one attempt to connect
 JOINED = "millrace/rank/"
 
 
 class Timeouts(NamedTuple):
-    """How long a process waits for others."""
+    """How many seconds a process waits for others."""
 
     join_s: float
-    """for all to be there"""
+    """until all processes have connected"""
     reply_s: float
-    """in a collective, or for the next message"""
+    """in a collective, or for the next message of rank 0"""
 
 
 class Header(msgspec.Struct, frozen=True):
@@ -66,13 +66,13 @@ HEADER = msgspec.msgpack.Decoder(Header)
 
 
 class Learners:
-    """The learner processes of a run, as one of them sees them. A single one needs no group."""
+    """The learner processes of a run, as one of them sees them. A single process needs no process group."""
 
     def __init__(self, division: Division, *, reply_s: float = math.inf) -> None:
-        """`reply_s`: how long the others wait for a message."""
+        """`reply_s` is how many seconds the others wait for a message."""
         self.division = division
         self.others_wait = True
-        """Whether the others wait for a message: not during an update or a message, nor after one that was broken off."""
+        """Whether the others wait for a message. They don't during an update or a message, or after one was interrupted."""
         self._tell_every_s = reply_s * TELL_BEFORE
         self._told_s = time.monotonic()
 
@@ -87,9 +87,10 @@ class Learners:
         return range(1, self.division.processes)
 
     def gather(self, own: Tensor) -> Tensor:
-        """From [own shards, ...] of each process, [S, ...] of all shards. Every process calls it, with the same shape.
+        """Gather tensors [own shards, ...] of all processes to one [S, ...] of all shards.
 
-        Different shapes would end processes with SIGABRT, because gloo checks sizes in a thread of its own.
+        Every process must call this, with the same shape. Different shapes would end processes with SIGABRT, because gloo
+        checks sizes in a thread of its own.
         """
         if self.division.processes == 1:
             return own
@@ -99,24 +100,24 @@ class Learners:
         return every.flatten(0, 1)
 
     def agree(self, error: str = "") -> None:
-        """Raise `UsageError` in all processes if one of them has an error. Every process calls it."""
+        """Raise `UsageError` in all processes if one of them has an error. Every process must call this."""
         reports = [Report.of(each) for each in self.gather(Report(0, error=error).encoded()[None])]
         if errors := [report.error for report in reports if report.error]:
             raise UsageError(errors[0])
 
     def still_waits(self) -> None:
-        """Tell the others, now and then, that rank 0 is there and waits for rollouts. It may be called at any time."""
+        """Tell the others, now and then, that rank 0 is alive and waits for rollouts. You may call this at any time."""
         if self.others_wait and time.monotonic() - self._told_s > self._tell_every_s:
             self.tell_all(StillThere())
 
     def end(self, reason: str, *, failed: bool = False) -> None:
-        """Tell the others that the run has ended, unless they expect no message: then the lost connection tells them."""
+        """Tell the others that the run has ended. If they expect no message, they find out when the connection is lost."""
         if self.leads and self.others_wait:
             self.tell_all(End(reason, failed))
             self.others_wait = False
 
     def tell_all(self, message: FromRankZero) -> None:
-        """Send a message without arrays to all other processes. If one does not get it, no other message can follow."""
+        """Send a message without arrays to all other processes. If that fails for one, no further message can be sent."""
         self.others_wait = False
         for rank in self.others:
             self.tell(rank, message)
@@ -134,7 +135,7 @@ class Learners:
                     distributed.send(_bytes_of(array), rank)
 
     def hear(self) -> tuple[FromRankZero, list[Array]]:
-        """The next message of rank 0, and its arrays."""
+        """Wait for the next message of rank 0. Returns it and its arrays."""
         with _lost():
             size = torch.zeros(1, dtype=torch.int64)
             distributed.recv(size, 0)
@@ -153,13 +154,13 @@ def connected(place: Place, shards: int, device: str, timeouts: Timeouts, poll: 
     """Connect the processes of a run, and disconnect them at the end.
 
     `poll` is called now and then while this process waits for others; the log says for whom. Raises `UsageError` if
-    `shards` can't be divided among them, and `LearnerLost` if not all come in time.
+    `shards` can't be divided among them, and `LearnerLost` if not all of them connect in time.
     """
     division = place.division(shards)
     if place.processes == 1:
         yield Learners(division)
         return
-    if distributed.is_initialized():  # by the program that has started this process, such as Ray Train
+    if distributed.is_initialized():  # the program that started this process, such as Ray Train, has done it
         with _told_of_the_end(Learners(division, reply_s=timeouts.reply_s)) as learners:
             yield learners
         return
@@ -171,7 +172,7 @@ def connected(place: Place, shards: int, device: str, timeouts: Timeouts, poll: 
 
     with _lost():
         store.set(f"{JOINED}{place.rank}", socket.gethostname())
-    # All wait here for all, because nothing can interrupt the wait that follows.
+    # Every process waits for all others here, because nothing can interrupt the wait in `init_process_group`.
     _wait(missing, place, timeouts.join_s, poll)
     if device == "cuda":
         torch.cuda.set_device(int(os.environ.get("LOCAL_RANK", 0)))
@@ -192,7 +193,7 @@ def connected(place: Place, shards: int, device: str, timeouts: Timeouts, poll: 
 
 @contextmanager
 def _told_of_the_end(learners: Learners) -> Iterator[Learners]:
-    """When it is left, rank 0 tells the others that the run has ended, and why."""
+    """At the end of the context, rank 0 tells the others that the run has ended, and why."""
     try:
         yield learners
         learners.end("the run has ended")
@@ -206,12 +207,12 @@ def _told_of_the_end(learners: Learners) -> Iterator[Learners]:
 
 
 def _store(place: Place, timeouts: Timeouts, poll: Callable[[], None]) -> Store:
-    """The key-value store in which the processes meet. torchrun has opened one; else rank 0 opens it."""
+    """The key-value store through which the processes find each other. Rank 0 opens it, unless torchrun already has."""
     patience = timedelta(seconds=PATIENCE_S)
     found: list[Store] = []
 
     def missing() -> list[int]:
-        # PyTorch prints a stack trace for each try that fails, so it tries only where somebody listens.
+        # PyTorch prints a stack trace for each failed attempt to connect, so first check that somebody listens there.
         with suppress(OSError, DistNetworkError, DistStoreError):
             socket.create_connection((place.host, place.port), PATIENCE_S).close()
             found.append(TCPStore(place.host, place.port, is_master=False, wait_for_workers=False, timeout=patience))
@@ -226,12 +227,12 @@ def _store(place: Place, timeouts: Timeouts, poll: Callable[[], None]) -> Store:
         found.append(store)
     else:
         _wait(missing, place, timeouts.join_s, poll)
-    # torchrun keeps the keys of the processes that it has started before.
+    # torchrun's store still holds the keys of the processes before a restart, so each restart gets its own prefix.
     return PrefixStore(os.environ.get("TORCHELASTIC_RESTART_COUNT", "0"), found[0])
 
 
 def listening(place: Place) -> socket.socket:
-    """A socket for the store. PyTorch's own would listen at all addresses of the machine, for localhost too."""
+    """A listening socket for the store. PyTorch's own would listen at all addresses of the machine, even for localhost."""
     try:
         if place.is_local:
             family = socket.getaddrinfo(place.host, place.port, type=socket.SOCK_STREAM)[0][0]
@@ -247,7 +248,7 @@ def listening(place: Place) -> socket.socket:
 
 
 def _wait(missing: Callable[[], list[int]], place: Place, seconds: float, poll: Callable[[], None]) -> None:
-    """Wait until no rank is missing. Raises `LearnerLost` after these seconds."""
+    """Wait until no rank is missing. Raises `LearnerLost` after this many seconds."""
     end_s = time.monotonic() + seconds
     tell_s = time.monotonic() + POLL_S * 10
     while ranks := missing():
@@ -266,13 +267,13 @@ def _wait(missing: Callable[[], list[int]], place: Place, seconds: float, poll: 
 
 
 def _bytes_of(array: Array) -> Tensor:
-    """The memory of an array, as a tensor of bytes; of a copy if it is not contiguous."""
+    """The memory of an array, or of a contiguous copy if it is not contiguous, as a tensor of bytes."""
     return torch.from_numpy(np.ascontiguousarray(array).reshape(-1).view(np.uint8))
 
 
 @contextmanager
 def _lost() -> Iterator[None]:
-    """Errors of torch.distributed become one line."""
+    """Turn errors of torch.distributed into `LearnerLost`, with a one-line message."""
     try:
         yield
     except (RuntimeError, ValueError) as error:  # distributed.DistError is a RuntimeError
@@ -283,5 +284,5 @@ def _lost() -> Iterator[None]:
 
 
 def _cause(error: Exception) -> str:
-    """What gloo says, without the line of its source code before it and the general advice behind it."""
+    """The message of gloo, without the source location before it and the general advice after it."""
     return first_line(error).partition(". This is")[0].rpartition(".cc:")[2].partition("] ")[2] or first_line(error)

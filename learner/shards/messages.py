@@ -1,4 +1,4 @@
-"""What rank 0, which leads the run, tells the other learner processes. Pure: messages are plain records.
+"""The messages that rank 0, which leads the run, sends to the other learner processes. Pure: messages are plain records.
 
     Begin → (Learn | StillThere)* → End
 
@@ -17,40 +17,40 @@ from millrace.protocol.rollout import Batch
 from millrace.protocol.specs import PolicySpec
 
 SMALL = ("action", "log_prob", "reward", "terminated", "truncated", "valid", "state", "lane", "fresh")
-"""The arrays of a `Batch` that every process gets whole"""
+"""The arrays of a `Batch` of which every process gets all columns."""
 
 
 class Begin(msgspec.Struct, frozen=True, tag=True):
-    """The run that is trained: its settings are those of rank 0, whatever the other processes were given."""
+    """Begin this run. It has the settings of rank 0, whatever settings the other processes were given."""
 
     config: str
-    """as TOML"""
+    """the settings, as TOML"""
     policy: PolicySpec
     run: str
-    """the path of its folder"""
+    """the path of the run folder"""
     device: str
     """cpu or cuda"""
     versions: dict[str, str]
-    """of the packages that decide results"""
+    """the versions, on rank 0, of the packages on which results depend"""
 
 
 class Learn(msgspec.Struct, frozen=True, tag=True):
-    """Learn from a batch. Its arrays: the statistics, those of the batch, and the state if it is sent."""
+    """Learn from a batch. The statistics, the arrays of the batch, and perhaps a state follow as arrays."""
 
     columns_per_rollout: int
     leaves: int
-    """number of the arrays of an observation; they have the columns of the receiver's shards only"""
+    """the number of arrays of an observation; they have only the columns of the receiver's shards"""
     extras: int
     masked: bool
     seats: bool
     state: bool
     """whether the whole state of rank 0's algorithm follows, because the receiver does not have it"""
     digest: str
-    """of the weights of rank 0, for the receiver to compare; empty if it need not"""
+    """the digest of rank 0's state, for the receiver to compare with its own; empty if it need not"""
 
 
 class StillThere(msgspec.Struct, frozen=True, tag=True):
-    """The next batch is being collected."""
+    """Rank 0 is alive, and the next batch is still being collected."""
 
 
 class End(msgspec.Struct, frozen=True, tag=True):
@@ -58,14 +58,14 @@ class End(msgspec.Struct, frozen=True, tag=True):
 
     reason: str
     failed: bool
-    """whether by an error: then a launcher should start all processes again, not only rank 0"""
+    """whether it ended with an error; then a launcher should restart all processes, not only rank 0"""
 
 
 FromRankZero = Begin | Learn | StillThere | End
 
 
 def arrays_of(batch: Batch, columns: Array) -> list[Array]:
-    """The arrays of a batch as a process gets them: whole, but of observations only these columns."""
+    """The arrays of a batch that are sent to a process. They have all columns; only observations have just `columns`."""
     optional = [array for array in (batch.mask, batch.resets) if array is not None]
     return [
         *(getattr(batch, name) for name in SMALL),
@@ -76,7 +76,10 @@ def arrays_of(batch: Batch, columns: Array) -> list[Array]:
 
 
 def batch_of(learn: Learn, arrays: Sequence[Array], columns: Array) -> Batch:
-    """The batch of `arrays_of`, without episodes. Observations of other columns are zeros, which take no memory."""
+    """The batch from the arrays of `arrays_of`, without episodes. The observations of other columns are zeros.
+
+    The operating system allocates no memory for these zeros.
+    """
     rest = iter(arrays)
     small = {name: next(rest) for name in SMALL}
     extras = tuple(next(rest) for _ in range(learn.extras))

@@ -1,4 +1,4 @@
-"""Which learner process this one is: torchrun, or whatever starts them, says so by environment variables. Pure."""
+"""Which of the learner processes this one is, according to the environment variables of torchrun or another launcher."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from millrace.protocol.bounds import one_line
 from millrace.protocol.errors import UsageError
 
 LOOPBACK = ("lo", "lo0")  # names of the loopback interface, on Linux and on macOS
-INTERFACES = ("GLOO_SOCKET_IFNAME", "NCCL_SOCKET_IFNAME")  # variables that name the one where gloo and NCCL listen
+INTERFACES = ("GLOO_SOCKET_IFNAME", "NCCL_SOCKET_IFNAME")  # variables that name the interface where gloo and NCCL listen
 
 
 class Place(NamedTuple):
-    """A process among those that a launcher has started: torchrun, or whatever sets the same variables."""
+    """The place of a process among those that torchrun, or another launcher that sets the same variables, has started."""
 
     rank: int
     processes: int
     host: str
-    """where rank 0 listens"""
+    """the host where rank 0 listens"""
     port: int
 
     @staticmethod
     def of(environment: Mapping[str, str]) -> Place:
-        """The place that RANK, WORLD_SIZE, MASTER_ADDR and MASTER_PORT name; without WORLD_SIZE there is one process.
+        """The place that RANK, WORLD_SIZE, MASTER_ADDR and MASTER_PORT describe; without WORLD_SIZE there is one process.
 
-        Raises `UsageError` if they are incomplete.
+        Raises `UsageError` if they are incomplete or not valid.
         """
         if "WORLD_SIZE" not in environment:
             return ALONE
@@ -49,11 +49,11 @@ class Place(NamedTuple):
 
     @property
     def is_local(self) -> bool:
-        """Whether only processes of this machine can reach it."""
+        """Whether only processes on this machine can reach the address of rank 0."""
         return is_local(f"tcp://{self.host}:{self.port}")
 
     def division(self, shards: int) -> Division:
-        """The shards of the processes. Raises `UsageError` if they can't be divided."""
+        """The division of shards among the processes. Raises `UsageError` if they can't be divided evenly."""
         if shards % self.processes:
             raise UsageError(
                 f"shards {shards}: expected a multiple of {self.processes}, the number of learner processes (WORLD_SIZE)"
@@ -76,14 +76,14 @@ def trains_alone(environment: Mapping[str, str]) -> str:
 
 
 def check_loopback(place: Place, *, insecure: bool) -> None:
-    """Raise `UsageError` if torch.distributed would listen on a network, unless that is wanted."""
+    """Make torch.distributed listen on loopback. Raise `UsageError` if it would listen on a network, unless `insecure`."""
     if place.processes == 1:
         return
     if place.is_local:
         names = {name for _, name in socket.if_nameindex()}
         for name in names.intersection(LOOPBACK):
             for variable in INTERFACES:
-                # Clusters often set them for all jobs, to a network.
+                # Clusters often set these variables for all jobs, to a network interface.
                 os.environ[variable] = os.environ.get(variable, name) if insecure else name
     elif not insecure:
         raise UsageError(

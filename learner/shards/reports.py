@@ -1,7 +1,7 @@
-"""What each shard says of its part of a minibatch, in a fixed number of bytes, so that its gather needs no agreement.
+"""Reports of the shards on their parts of a minibatch. They have a fixed size, so gathering them needs no negotiation.
 
-Law: numbers of a minibatch are means over its rows, so those of its parts are averaged by their rows. If one process fails,
-all learn why, and none takes the step.
+Law: the numbers of a minibatch are means over its rows, so the numbers of its parts are averaged, weighted by their rows. If
+one process fails, all processes learn why, and none takes the step.
 """
 
 from __future__ import annotations
@@ -16,21 +16,21 @@ from torch import Tensor
 from millrace.protocol.errors import UsageError
 
 MOST_BYTES = 4096
-MOST_ERROR = 1000  # characters
-NOTHING = b"\xc1"  # a report ends with a text, and UTF-8 has no such byte
+MOST_ERROR = 1000  # the most characters of an error
+NOTHING = b"\xc1"  # the padding after a report: a report ends with text, and this byte never occurs in UTF-8
 
 
 class Report(msgspec.Struct, frozen=True, array_like=True):
-    """Of one shard's part of a minibatch."""
+    """The report on one shard's part of a minibatch."""
 
     rows: int
     numbers: dict[str, float] = {}
-    """means over the rows: what the loss logs, and the loss"""
+    """the loss, and the numbers that it logs, as means over the rows"""
     error: str = ""
-    """why this process cannot take the step"""
+    """why this process cannot take the step; empty if it can"""
 
     def encoded(self) -> Tensor:
-        """As a tensor of bytes [MOST_BYTES]. Raises `UsageError` if there are too many numbers."""
+        """The report as a tensor of bytes [MOST_BYTES]. Raises `UsageError` if it has too many numbers."""
         error = self.error[:MOST_ERROR].encode(errors="replace").decode()
         content = msgspec.msgpack.encode(msgspec.structs.replace(self, error=error))
         if len(content) > MOST_BYTES:
@@ -41,12 +41,12 @@ class Report(msgspec.Struct, frozen=True, array_like=True):
 
     @staticmethod
     def of(padded: Tensor) -> Report:
-        """The report in a tensor of bytes."""
+        """Decode a report from a tensor of bytes."""
         return msgspec.msgpack.decode(padded.numpy().tobytes().rstrip(NOTHING), type=Report)
 
 
 def averaged(reports: Sequence[Report]) -> dict[str, float]:
-    """The numbers of a whole minibatch: each is averaged over the parts that have it, by their rows."""
+    """The numbers of a whole minibatch: each is averaged over the parts that have it, weighted by their rows."""
     sums: dict[str, float] = {}
     rows: dict[str, int] = {}
     for report in reports:

@@ -1,7 +1,8 @@
-"""What the learner processes of a run with shards do: rank 0 leads, and the others follow.
+"""The roles of the learner processes of a run with shards: rank 0 leads, and the others follow.
 
-Law: rank 0 is the learner of a run as without shards: workers, run folder, callbacks. The others know the run only from what
-it tells: their own settings don't count, and they open no port and write no file of the run.
+Law: rank 0 is the learner, just as in a run without shards: it has the workers, the run folder and the callbacks. The others
+know the run only from its messages: their own settings don't count, they accept no workers, and they write no file of the
+run.
 """
 
 from __future__ import annotations
@@ -28,12 +29,15 @@ log = logging.getLogger("millrace.learner")
 
 
 def timeouts(config: Config) -> Timeouts:
-    """How long the processes of a run wait for each other. Before a run begins, rank 0 may wait for its workers."""
+    """How long the processes of a run wait for each other: longer before the run begins, when rank 0 waits for workers."""
     return Timeouts(config.no_workers_timeout_s + config.shard_timeout_s, config.shard_timeout_s)
 
 
 def lead(learners: Learners, config: Config, policy: PolicySpec, run: Path) -> None:
-    """Tell the others the run. Returns when they have its algorithm. Raises `UsageError` if one of them can't take part."""
+    """Send the run to the others. Returns once they have made its algorithm.
+
+    Raises `UsageError` if one of them can't take part.
+    """
     learners.tell_all(Begin(config.to_toml(), policy, str(run), torch_device(config), versions()))
     learners.agree()
     division = learners.division
@@ -41,11 +45,13 @@ def lead(learners: Learners, config: Config, policy: PolicySpec, run: Path) -> N
 
 
 def follow(config: Config, place: Place) -> Path:
-    """Take part in the updates of a run that rank 0 leads. Returns the path of its folder, which may be on another machine;
-    that of the folder of all runs if the run was finished before.
+    """Take part in the updates of a run that rank 0 leads.
+
+    Returns the path of the run folder, which may be on another machine; if the run had already finished, the path of the
+    folder of all runs.
 
     Ctrl-C and SIGTERM don't end this process once the run has begun: launchers send them to all processes, and rank 0 ends
-    the run. `config`: only its timeouts count, and whether there is a GPU.
+    the run. Of `config`, only the timeouts, `shards`, `device` and `run_dir` matter.
     """
     interrupts = Interrupts()
 
@@ -73,7 +79,7 @@ def follow(config: Config, place: Place) -> Path:
             match learners.hear():
                 case Learn() as learn, arrays:
                     algorithm.follow(learn, arrays)
-                    del arrays  # before the next come
+                    del arrays  # free their memory before the next ones arrive
                 case StillThere(), _:
                     pass
                 case End(reason, failed=True), _:
@@ -86,7 +92,7 @@ def follow(config: Config, place: Place) -> Path:
 
 
 def algorithm_of(begin: Begin, learners: Learners) -> Sharded:
-    """The algorithm of rank 0, in this process. All processes fail if it can't be made here."""
+    """Make the algorithm of rank 0 in this process. If that fails, all processes raise `UsageError`."""
     rank = learners.division.rank
     try:
         config = config_from_toml(begin.config, "the settings of rank 0")
@@ -94,14 +100,14 @@ def algorithm_of(begin: Begin, learners: Learners) -> Sharded:
         torch.set_num_threads(config.torch_threads or 1)
         algorithm = new_sharded(config, begin.policy, begin.device, learners)
         error = _other_versions(begin.versions, versions())
-    except Exception as refused:  # whatever it is, the others wait to hear it
+    except Exception as refused:  # of any type, because the other processes wait for a report
         error = first_line(refused, type(refused).__name__)
     learners.agree(f"learner: rank {rank}: {error}" if error else "")
     return algorithm
 
 
 def _other_versions(expected: dict[str, str], got: dict[str, str]) -> str:
-    """How the packages of two processes differ; empty if they don't."""
+    """The first difference between the package versions of two processes, in one line; empty if there is none."""
     for name, version in expected.items():
         if got.get(name) != version:
             return f"{name}: expected {version}, as rank 0 has, got {got.get(name, 'none')}; install the same in both"

@@ -1,8 +1,8 @@
-"""The rows of a batch whose shards several learner processes share: each process has the observations of its own shards.
+"""The rows of a batch whose shards are divided among learner processes. Each has only the observations of its own shards.
 
-Law: of every minibatch, each shard has a part. All processes know the small arrays of the whole batch, so they draw the same
-parts of all shards, and standardize advantages over the whole minibatch. A shard without rows in a minibatch has an empty
-part.
+Law: every minibatch consists of one part per shard. All processes know the small arrays of the whole batch, so they draw the
+same parts for all shards, and standardize advantages over the whole minibatch. A shard without rows in a minibatch has an
+empty part.
 """
 
 from __future__ import annotations
@@ -29,16 +29,16 @@ from millrace.protocol.arrays import Bools, Floats
 from millrace.protocol.rollout import Batch
 
 Gather = Callable[[Tensor], Tensor]
-"""From the tensors [own shards, ...] of each process to those [S, ...] of all shards, in their order"""
+"""Gathers the tensors [own shards, ...] of all processes to one [S, ...] of all shards, in order."""
 
 
 class ShardObservations(NamedTuple):
     """The observations of a process's own shards."""
 
     batch: Batch
-    """small arrays of all columns; observations at least of the own columns"""
+    """its small arrays have all columns; its observations have at least the columns of the own shards"""
     columns: Sequence[Columns]
-    """of each of the S shards"""
+    """the columns of each of the S shards"""
     own: range
     """the shards of this process"""
     parts: Sequence[WholeBatch]
@@ -52,7 +52,7 @@ class ShardObservations(NamedTuple):
         return T + 1, N
 
     def evaluate(self, steps: int, function: Callable[[NetworkInput, Index], Tensor], pulse: Callable[[], None]) -> Floats:
-        """See `Observations`. Each process computes those of its own shards, and gets all."""
+        """See `Observations`. Each process computes the results of its own shards, and gets those of all."""
         total = self.batch.valid.shape[1]
         widest = max(map(len, self.columns))
         values = torch.zeros(len(self.own), steps, widest)
@@ -71,7 +71,7 @@ class ShardObservations(NamedTuple):
 
 
 class ShardRows(NamedTuple):
-    """The rows of a batch, of which this process learns from its own shards."""
+    """The rows of a batch. This process learns from those of its own shards."""
 
     observations: ShardObservations
     standardizes: bool
@@ -79,7 +79,7 @@ class ShardRows(NamedTuple):
     def epochs(
         self, advantage: Floats, target: Floats, used: Bools, count: int, generator: torch.Generator
     ) -> Iterator[Iterable[Sequence[Minibatch]]]:
-        """See `UpdateRows`: the parts are those of the own shards."""
+        """See `UpdateRows`. The parts of a minibatch are those of the own shards."""
         _, columns, own, parts, _ = self.observations
         rows_of_shards = [
             Minibatch.of(*part, advantage[:, columns[shard]], target[:, columns[shard]])
@@ -109,14 +109,14 @@ class ShardRows(NamedTuple):
         return endless_epochs(minibatches, count, generator)
 
     def _standardized(self, advantages: Sequence[Tensor]) -> Sequence[Tensor]:
-        """The advantages of all parts of a minibatch, with mean 0 and standard deviation 1 over all of them if wanted."""
+        """The advantages of all parts, scaled to mean 0 and standard deviation 1 over the whole minibatch if so set."""
         if not self.standardizes:
             return advantages
         return torch.split(standardized(torch.cat(list(advantages))), [len(each) for each in advantages])
 
 
 def _rows(units: Tensor, used: Tensor, *, has_core: bool) -> Tensor:
-    """The rows of some `units_in_order`: with a core, the used rows of these columns in time order."""
+    """The rows of some units of `units_in_order`. With a core, units are columns: returns their used rows in time order."""
     if not has_core:
         return units
     steps, columns = used.shape

@@ -1,11 +1,11 @@
-"""An actor-critic whose updates several learner processes share. Its state is the same in all of them, to the bit.
+"""An actor-critic whose updates are divided among learner processes. Its state is identical in all of them, bit for bit.
 
-Law of an update: rank 0 tells the others the batch. Every process passes its own shards through the network, one shard at a
-time, and all of them gather the numbers and the gradients of all shards. From there on, each computes the same. A gradient
+Law of an update: rank 0 sends the batch to the others. Every process passes its own shards through the network, one shard at
+a time, and gathers the numbers and the gradients of all shards. From then on, all processes compute the same. The gradient
 is that of a mean over the rows of a minibatch, so the loss must be a mean over the rows that it gets.
 
-What rank 0 does to the state besides updates (a resume, `--from`, cloning, an update that was undone) the others learn with
-the next batch, which then carries the whole state.
+If rank 0 changes the state other than by an update (by a resume, `--from`, cloning, or undoing an update), it sends the
+whole state along with the next batch.
 """
 
 from __future__ import annotations
@@ -37,26 +37,26 @@ from millrace.protocol.errors import RunError, UsageError, first_line
 from millrace.protocol.rollout import Batch
 from millrace.protocol.specs import PolicySpec
 
-COMPARE_EVERY = 50  # updates: then all processes compare their weights
+COMPARE_EVERY = 50  # number of updates after which all processes compare their states
 LANE = SMALL.index("lane")
 
 
 class Sharded(ActorCritic):
-    """An algorithm with shards: `sharded` makes a class of this and of the algorithm."""
+    """The base class of algorithms with shards. `sharded` derives a class from this one and from the algorithm."""
 
     learners: Learners
     """set before the first update"""
 
     _others_know_state = False
     _stopped: BaseException | None = None
-    """what `pulse` raised in this update"""
+    """the exception that `pulse` raised in this update"""
     _failed: Exception | None = None
-    """what went wrong in this process, in the current minibatch"""
+    """the exception that this process raised in the current minibatch"""
 
     # ---------------------------------------------------------------- what rank 0 tells, and the others do
 
     def update(self, batch: Batch, pulse: Callable[[], None]) -> UpdateMetrics:
-        """See `ActorCritic`. What `pulse` raises ends the update in all processes, at the next gradient step or the end."""
+        """See `ActorCritic`. If `pulse` raises, the update ends in all processes, at the next gradient step or at its end."""
         self._stopped = None
         self.learners.others_wait = False
         if self.learners.leads:
@@ -92,7 +92,7 @@ class Sharded(ActorCritic):
         self._others_know_state = True
 
     def follow(self, learn: Learn, arrays: Sequence[Array]) -> None:
-        """Make the update that rank 0 makes now."""
+        """Make the same update that rank 0 makes now, from its message and arrays."""
         statistics, *rest = arrays
         division = self.learners.division
         if learn.state:
@@ -107,7 +107,7 @@ class Sharded(ActorCritic):
         self.update(batch_of(learn, rest, columns), lambda: None)
 
     def digest(self) -> str:
-        """SHA-256 of the state, without the statistics of observations, which only rank 0 counts."""
+        """SHA-256 of the state, without the observation statistics, which only rank 0 counts."""
         found = hashlib.sha256()
         for content in _contents({**self.state_dict(), "observations": None}):
             found.update(content)
@@ -125,11 +125,11 @@ class Sharded(ActorCritic):
         return ShardRows(observations, self.standardizes_advantages())
 
     def estimate(self, batch: Batch, observations: Observations, reward: Floats, pulse: Callable[[], None]) -> Estimates:
-        """See `ActorCritic`. The batch has no observations and no episodes: only rank 0 would have all of them."""
+        """See `ActorCritic`. The batch is passed without observations and episodes, because only rank 0 has all of them."""
         return super().estimate(replace(batch, obs=(), episodes=()), observations, reward, pulse)
 
     def gradient(self, minibatch: Sequence[Minibatch]) -> UpdateMetrics:
-        """See `ActorCritic`. The gradients of all shards, each weighted by its rows, added in a fixed order."""
+        """See `ActorCritic`. Adds the gradients of all shards, each weighted by its rows, in a fixed order."""
         flat = self.net.flat
         assert flat.grad is not None
         own = torch.zeros(len(minibatch), len(flat), device=flat.device)
@@ -142,7 +142,7 @@ class Sharded(ActorCritic):
         return metrics
 
     def _learned_from(self, rows: Minibatch, gradient: Tensor) -> Report:
-        """Write the gradient of the loss of a shard's rows, times their number. Notes an error for `_reports`."""
+        """Write the gradient of a shard's loss, times the number of its rows. Saves an exception for `_reports` to raise."""
         count = len(rows.action)
         if not count or self._failed is not None:
             return Report(0)
@@ -151,14 +151,14 @@ class Sharded(ActorCritic):
             metrics = self.differentiate(loss * count, self.optimizers["optimizer"], {**numbers, "loss": loss})
             assert self.net.flat.grad is not None
             gradient.copy_(self.net.flat.grad)
-            del metrics["grad_norm"]  # that of a part
+            del metrics["grad_norm"]  # the norm of a part's gradient means nothing for the minibatch
             return Report(count, metrics)
         except Exception as error:
             self._failed = error
             return Report(0)
 
     def _reports(self, own: list[Report]) -> list[Report]:
-        """The reports of all shards. Raises what went wrong in this process, or `RunError` for another one."""
+        """The reports of all shards. Raises this process's own exception, or `RunError` if another process failed."""
         try:
             encoded = [each.encoded() for each in own]
         except Exception as error:
@@ -191,7 +191,7 @@ class Sharded(ActorCritic):
 
 @cache
 def sharded(algorithm: type[Algorithm], shards: int) -> type[Sharded]:
-    """The class of an algorithm with shards. Raises `UsageError` if it can't have any."""
+    """Make the class of an algorithm with shards. Raises `UsageError` if it can't have shards."""
     if not issubclass(algorithm, ActorCritic):
         raise UsageError(
             f"shards {shards}: {algorithm.__name__} learns in one process; expected ppo, a2c, impala, reinforce or a "
@@ -207,7 +207,7 @@ def sharded(algorithm: type[Algorithm], shards: int) -> type[Sharded]:
 
 
 def new_sharded(config: Config, policy: PolicySpec, device: str, learners: Learners) -> Sharded:
-    """The algorithm of these settings, with the weights of version 0. Raises `UsageError` if it can't have shards."""
+    """Make the algorithm of these settings, with the weights of version 0. Raises `UsageError` if it can't have shards."""
     cls: Any = sharded(algorithm_class(config.algo), config.shards)
     algorithm: Sharded = cls(config.algorithm, policy, total_steps=config.steps, seed=config.seed, device=device)
     if algorithm.optimizers.keys() != {"optimizer"}:
@@ -220,7 +220,7 @@ def new_sharded(config: Config, policy: PolicySpec, device: str, learners: Learn
 
 
 def _contents(state: object) -> Iterator[bytes]:
-    """The content of a state: tensors and plain data."""
+    """Yield the content of a state, which consists of tensors and plain data, in a fixed order."""
     match state:
         case dict():
             for name in sorted(state, key=str):
@@ -243,6 +243,6 @@ def _packed(state: dict[str, Any]) -> Array:
 
 
 def _unpacked(content: Array) -> dict[str, Any]:
-    """The state in these bytes. Reading it executes no code."""
+    """Read the state from these bytes, without executing any code in them."""
     state: dict[str, Any] = torch.load(io.BytesIO(content.tobytes()), map_location="cpu", weights_only=True)
     return state

@@ -1,7 +1,7 @@
-"""The arrays that hold the newest observations, rewards and episode ends of all env copies; with seats, of each seat.
+"""The arrays that hold the newest observations, rewards and episode ends of all env copies, or of their seats.
 
-They lie in shared memory if there is any: local workers write a step's results there themselves. Results that arrive as
-messages are written to the same arrays.
+They are in shared memory if there is any. Then local workers write the results of a step there themselves. Results that
+arrive as messages are written to the same arrays.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from millrace.protocol.wire.shared_memory import SharedMemory
 
 
 class BatchArrays:
-    """The newest results of all env copies. N is the number of rows."""
+    """The newest results of all env copies, in N rows."""
 
     def __init__(
         self, spec: StepSpec, layout: BatchLayout, observation_space: gymnasium.Space[Any], memory: SharedMemory | None
     ) -> None:
-        """`observation_space`: of a single row. `memory`: shared with local workers."""
+        """`observation_space` is that of a single row. `memory` is shared with local workers."""
         N = layout.rows[-1].stop
         self._layout = layout
         self._nest = make_unflatten(observation_space)
@@ -50,7 +50,7 @@ class BatchArrays:
         self._seats = self._leaves[count:]
 
     def store(self, lane: int, answer: Stepped) -> None:
-        """Write what a lane sent as a message."""
+        """Write the results that a lane sent in a message."""
         rows = self._layout.rows[lane]
         for array, leaf in zip(self._leaves, answer.obs, strict=True):
             array[rows] = leaf
@@ -59,7 +59,7 @@ class BatchArrays:
         self.truncated[rows] = answer.truncated
 
     def truncate(self, lane: int) -> None:
-        """Truncate the episodes of a lane: reward 0 at the newest observation."""
+        """Truncate the episodes of a lane at their newest observations, with reward 0."""
         rows = self._layout.rows[lane]
         self.reward[rows] = 0.0
         self.terminated[rows] = False
@@ -69,18 +69,18 @@ class BatchArrays:
 
     @property
     def over(self) -> Bools:
-        """[copies] whether the episode has ended: with seats, no agent is left."""
+        """[copies] True where the episode has ended. With seats, it has ended when no agent is left."""
         if not self._seats:
             return self.terminated | self.truncated
         return np.logical_not(self._seats[0].reshape(self._layout.count, -1).any(1))
 
     def of_seats(self, rows: slice | Sequence[int]) -> Infos:
-        """Which of these rows act next, which are complete, and rewards outside of any, in the form of gymnasium's infos."""
+        """Gymnasium infos of these rows: which act next, which are complete, and rewards that belong to no transition."""
         found = {leaf.path: array[rows].copy() for leaf, array in zip(SEAT_LEAVES, self._seats, strict=True)}
         return found | {f"_{name}": np.ones(len(array), bool) for name, array in found.items()}
 
     def observation(self, *, copy: bool) -> Any:
-        """Observations of all rows, nested as in the space. Without `copy` the next step overwrites them."""
+        """Observations of all rows, nested as in the space. Unless `copy`, the next step overwrites them."""
         return self._nest([array.copy() for array in self._observation] if copy else self._observation)
 
     def observation_of_some(self, rows: Sequence[int]) -> Any:
@@ -88,5 +88,5 @@ class BatchArrays:
         return self._nest([array[list(rows)] for array in self._observation])
 
     def observation_of(self, row: int) -> Any:
-        """A copy of the newest observation of this row."""
+        """A copy of the newest observation of this row, nested as in the space."""
         return self._nest([array[row].copy() for array in self._observation])

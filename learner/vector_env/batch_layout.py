@@ -1,7 +1,7 @@
-"""Layout of a batch: the rows of each lane. Pure.
+"""The layout of a batch: which rows belong to each lane and env copy. Pure.
 
-Row n of every array of a batch belongs to env copy n. With A seats, copy n has the rows n · A to n · A + A - 1. A lane has
-consecutive rows; lane 0 has the first ones.
+Row n of every array of a batch belongs to env copy n. With A seats, copy n has the rows n · A to n · A + A - 1. The rows of
+a lane are consecutive, and lane 0 comes first.
 """
 
 from __future__ import annotations
@@ -14,19 +14,19 @@ from millrace.protocol.envs.seats import columns_of
 
 
 class BatchLayout:
-    """The rows of each lane."""
+    """Which rows and env copies belong to each lane."""
 
     def __init__(self, lane_sizes: Sequence[int], seats: int = 1) -> None:
-        """`lane_sizes`: the number of env copies of each lane. `seats`: A, of each copy."""
+        """`lane_sizes` are the numbers of env copies of the lanes. `seats` is A, the number of seats of each copy."""
         ends = list(accumulate(lane_sizes))
         self._seats = seats
         self.count = ends[-1]
-        """Number of env copies."""
+        """The number of env copies."""
         self.lanes = range(len(ends))
         self._copies = [range(end - size, end) for end, size in zip(ends, lane_sizes, strict=True)]
         self._firsts = [copies.start for copies in self._copies]
         self.rows = [slice(copies.start * seats, copies.stop * seats) for copies in self._copies]
-        """Rows of each lane, by lane."""
+        """The rows of each lane, by lane."""
 
     def copies(self, lane: int) -> range:
         """The env copies of a lane, numbered as in the whole batch."""
@@ -51,7 +51,7 @@ class BatchLayout:
         return bisect_right(self._firsts, copy) - 1
 
     def by_lane(self, copies: Iterable[int]) -> dict[int, list[int]]:
-        """Env copies grouped by lane. Within a lane they are numbered from 0, in the given order."""
+        """Group env copies by lane. In the result they are numbered within their lane, from 0, in the given order."""
         grouped: dict[int, list[int]] = {}
         for copy in copies:
             lane = self.lane_of(copy)
@@ -59,12 +59,15 @@ class BatchLayout:
         return grouped
 
     def check(self, copies: Sequence[int]) -> None:
-        """Raises `ValueError` unless these are different copies that exist, at least one."""
+        """Raise `ValueError` unless there is at least one copy, and all are different and exist."""
         if not copies or len(set(copies)) != len(copies) or not 0 <= min(copies) <= max(copies) < self.count:
             raise ValueError(f"env_ids: expected different numbers from 0 to {self.count - 1}, got {list(copies)}")
 
     def positions(self, copies: Sequence[int]) -> dict[int, Sequence[int]]:
-        """Where each lane's rows are among those of `copies`, by lane. Raises `ValueError` unless all are whole lanes."""
+        """The positions of each lane's rows among the rows of `copies`, by lane.
+
+        Raises `ValueError` unless `copies` consists of whole lanes.
+        """
         self.check(copies)
         at = {copy: position for position, copy in enumerate(copies)}
         positions_of = {lane: [at.get(copy, -1) for copy in self.copies(lane)] for lane in self.by_lane(sorted(copies))}

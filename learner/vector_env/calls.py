@@ -1,4 +1,4 @@
-"""Calls of env copies, and their descriptions: what to send to each lane, and what its answer means."""
+"""Calls and descriptions of env copies: makes the orders to each lane, and reads the answers."""
 
 from __future__ import annotations
 
@@ -19,33 +19,36 @@ from millrace.protocol.wire.codec import decode_to_learner
 from millrace.protocol.wire.plain_values import unpack
 
 USE_INSTEAD = ("reset", "step", "close")
-"""Methods of an environment that only the vector environment may call."""
+"""Methods of an environment that only the vector environment itself may call."""
 
 
 class CopyCalls:
     """Calls, reads and assigns attributes of the env copies of one vector environment, and describes them."""
 
     def __init__(self, send_recv: SendRecv, parts: VectorEnvParts, known: Mapping[str, Any]) -> None:
-        """`known`: attributes of every copy that aren't plain data, and so can't be sent."""
+        """`known` are attributes that every copy has and that can't be sent, because they aren't plain data."""
         self.known = known
         self._send_recv = send_recv
         self._parts = parts
 
     def call(self, copies: Sequence[int], name: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[Any, ...]:
-        """Call, or get, the attribute of these copies. The results are in ascending order of the copies.
+        """Call, or get, an attribute of these copies. The results are in ascending order of the copies.
 
-        Raises as `ZmqVectorEnv.call`.
+        Raises the errors that `ZmqVectorEnv.call` raises.
         """
         if name in self.known:
             return (self.known[name],) * len(copies)
         return _results(name, self._answers(call_orders(self._parts.layout, copies, name, args, kwargs)))
 
     def assign(self, copies: Sequence[int], name: str, values: Sequence[Any]) -> None:
-        """Set the attribute of these copies, in ascending order, to one value each."""
+        """Set an attribute of these copies, which are in ascending order, to one value each."""
         _results(name, self._answers(assign_orders(self._parts.layout, copies, name, values)))
 
     def describe(self, copies: Sequence[int]) -> list[DescribedEnv | None]:
-        """What each of these copies is, in ascending order; None where a client cannot say it. Raises as `call`."""
+        """Descriptions of these copies, in ascending order; None where a client cannot give one.
+
+        Raises the errors that `call` raises.
+        """
         described: list[DescribedEnv | None] = []
         for lane, answer in sorted(self._answers(call_orders(self._parts.layout, copies, DESCRIPTION, (), {})).items()):
             count = len(self._parts.layout.by_lane(copies)[lane])
@@ -57,9 +60,9 @@ class CopyCalls:
         return described
 
     def make(self) -> list[DescribedEnv | None]:
-        """Make all copies, before they are reset, and describe them. Raises as `call`."""
+        """Make all copies, before they are reset, and return their descriptions. Raises the errors that `call` raises."""
         for _ in range(RESET_ATTEMPTS - 1):
-            with suppress(WorkerLost):  # another worker may make them
+            with suppress(WorkerLost):  # another worker may be able to make them
                 return self.describe(range(self._parts.layout.count))
         return self.describe(range(self._parts.layout.count))
 
@@ -72,10 +75,10 @@ class CopyCalls:
 def call_orders(
     layout: BatchLayout, copies: Sequence[int], name: str, args: tuple[Any, ...], kwargs: dict[str, Any]
 ) -> dict[int, MakeOrder]:
-    """Orders by lane that call, or get, the attribute of these copies.
+    """Orders, by lane, that call or get an attribute of these copies.
 
-    Raises `ValueError` for `reset`, `step`, `close`; `UsageError` for a name and `TypeError` for arguments that no message
-    can carry.
+    Raises `ValueError` for `reset`, `step` and `close`, `UsageError` for a name that no message can carry, and `TypeError`
+    for such arguments.
     """
     _check_name(name)
     if name in USE_INSTEAD:
@@ -87,9 +90,9 @@ def call_orders(
 
 
 def assign_orders(layout: BatchLayout, copies: Sequence[int], name: str, values: Sequence[Any]) -> dict[int, MakeOrder]:
-    """Orders by lane that assign one value to each of these copies, which are in ascending order.
+    """Orders, by lane, that assign one value to each of these copies, which are in ascending order.
 
-    Raises `UsageError` for a name and `TypeError` for a value that no message can carry.
+    Raises `UsageError` for a name that no message can carry, and `TypeError` for such a value.
     """
     _check_name(name)
     by_copy = dict(zip(copies, values, strict=True))
@@ -100,14 +103,14 @@ def assign_orders(layout: BatchLayout, copies: Sequence[int], name: str, values:
 
 
 def _check_name(name: object) -> None:
-    """Raise `UsageError` for anything but the name of an attribute: a worker could not read the message."""
+    """Raise `UsageError` for anything but the name of an attribute, because a worker could not read the message."""
     if not isinstance(name, str) or not name or one_line(name) != name:
         got = one_line(safe_repr(name), 60)
         raise UsageError(f"call: expected the name of an attribute, text of 1 to {MAX_LINE:,} characters, got {got}")
 
 
 def _results(name: str, answers: Mapping[int, Returned]) -> tuple[Any, ...]:
-    """The results of all lanes, in the order of the copies. Raises what `_error` makes if an environment raised."""
+    """The results of all lanes, in the order of the copies. If an environment raised, raises the exception of `_error`."""
     results: list[Any] = []
     for lane in sorted(answers):
         answer = answers[lane]
@@ -118,7 +121,10 @@ def _results(name: str, answers: Mapping[int, Returned]) -> tuple[Any, ...]:
 
 
 def _descriptions(answer: Returned, count: int) -> list[DescribedEnv | None]:
-    """What each of a lane's `count` copies is; None where the client cannot say it. Raises `BadMessage`."""
+    """Descriptions of a lane's `count` copies; None for all if the client cannot give them.
+
+    Raises `BadMessage` if they cannot be read.
+    """
     if answer.error:
         return [None] * count
     sent = unpack(answer.results.data)
@@ -135,7 +141,10 @@ def _descriptions(answer: Returned, count: int) -> list[DescribedEnv | None]:
 
 
 def _error(name: str, lane: int, answer: Returned) -> Exception:
-    """The exception of a call, with the worker's traceback. An `AttributeError` keeps its type, as `hasattr` needs it."""
+    """The exception to raise for a call that failed, with the worker's traceback.
+
+    An `AttributeError` keeps its type, because `hasattr` needs it.
+    """
     line = f"call of {name!r}, lane {lane}: {answer.error}"
     failed = EnvironmentFailed(line, answer.traceback)
     if not answer.error.startswith("AttributeError"):

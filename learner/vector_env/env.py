@@ -1,10 +1,11 @@
 """A `gymnasium.vector.VectorEnv` whose env copies live in worker processes, on this machine or on others.
 
-Rule: the results are, bit for bit, those of `gymnasium.vector.SyncVectorEnv` for the same seeds and actions, whichever
-way they travel. A lost worker is always reported, as truncated copies or as an error; it is never hidden.
+Rule: for the same seeds and actions, the results equal those of `gymnasium.vector.SyncVectorEnv` bit for bit, whether they
+are sent as messages or through shared memory. A lost worker is always reported, as truncated copies or as an error; it is
+never hidden.
 
-With A seats, a row of a batch is a seat's, and those of a copy are side by side; `num_envs` counts rows. What addresses an
-environment counts copies: seeds, options, `reset_mask`, `env_ids`, calls and attributes.
+With A seats, each row of a batch belongs to a seat, and the rows of a copy are consecutive; `num_envs` counts rows.
+Arguments that address an environment count copies instead: seeds, options, `reset_mask`, `env_ids`, calls and attributes.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ GymnasiumStep = tuple[Any, Array, Array, Array, Infos]
 
 
 class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
-    """Env copies in worker processes that are stepped together. `millrace.make_vec` makes it."""
+    """A vector environment whose env copies live in worker processes. Make one with `millrace.make_vec`."""
 
     def __init__(
         self,
@@ -52,17 +53,17 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         copy: bool = True,
         on_close: Callable[[], None] = lambda: None,
     ) -> None:
-        """`timeout_s`: how long a worker may take to answer.
+        """`timeout_s` is how many seconds a worker may take to answer.
 
         `on_close` is called once: by `close`, when this object is garbage collected, or when the interpreter exits.
         """
         step = description.step
         self.seats = step.seats
-        """the names of the agents of each copy; empty if the environment is gymnasium's"""
+        """the names of the agents of each copy; empty for a gymnasium environment"""
         self._layout = BatchLayout(step.lanes, step.seats_of_copy)
         self.num_envs = N = self._layout.rows[-1].stop
         self.metadata = description.metadata
-        self.autoreset_mode = AutoresetMode(step.autoreset)  # as SyncVectorEnv has it; TorchRL reads it
+        self.autoreset_mode = AutoresetMode(step.autoreset)  # SyncVectorEnv has this attribute, and TorchRL reads it
         self.render_mode = description.render_mode
         self.spec = description.spec
         self.single_observation_space = description.observation_space
@@ -71,13 +72,13 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         self.action_space = batch_space(self.single_action_space, N)
         self.copy = copy
         self.merge_infos = True
-        """whether infos are returned, merged as gymnasium does it; otherwise only `infos_by_row` has them"""
+        """whether to return infos, merged as gymnasium does; if not, only `infos_by_row` has them"""
         self.infos_by_row: dict[int, Infos] = {}
-        """the newest infos that are not empty, as each copy returned them"""
+        """the newest infos that are not empty, by row, as each copy returned them"""
         self.hub = hub
-        """who is asked; it may be told what to call while it waits"""
+        """the hub that sends the orders; set its `while_waiting` to have a function called while it waits"""
         self.address = hub.address
-        """the address that workers connect to"""
+        """the address to which workers connect"""
         self._action_leaves = step.action
         self._read_actions = make_flatten(self.single_action_space)
         memory = None if hub.shared is None else hub.shared.memory
@@ -93,7 +94,7 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         self._send_recv = SendRecv(parts, timeout_s)
         spaces = {"observation_space": self.single_observation_space, "action_space": self.single_action_space}
         self.calls = CopyCalls(self._send_recv, parts, {"spec": self.spec, **spaces})
-        """calls of some copies"""
+        """calls, reads and assigns attributes of some of the copies"""
         self._close_once = weakref.finalize(self, _call_in_process, os.getpid(), on_close)
 
     # ---------------------------------------------------------------- reset and step
@@ -101,9 +102,9 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
     def reset(self, *, seed: int | Sequence[int | None] | None = None, options: Options = None) -> tuple[Any, Infos]:
         """Begin episodes in all copies, or in those that `options["reset_mask"]` selects. Returns observations and infos.
 
-        A single seed s gives the copies s, s + 1, …. A list of options has those of each copy. Raises `WorkerLost` if each
-        attempt loses a worker. With SameStep, copies that were lost with their worker are reset together; raises
-        `UsageError` for a part of them.
+        A single seed s gives the copies the seeds s, s + 1, …. A list of options has one entry for each copy. Raises
+        `WorkerLost` if every attempt loses a worker. With SameStep, copies that were lost with their worker must be reset
+        together; raises `UsageError` for only some of them.
         """
         self._check_idle("reset")
         self.reset_async(seed, options)
@@ -116,10 +117,11 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         *,
         env_ids: Sequence[int] | Array | None = None,
     ) -> None:
-        """Begin episodes as `reset` does, or in the copies `env_ids`; a list of seeds then has one for each of these.
+        """Begin episodes as `reset` does, or only in the copies `env_ids`; a list of seeds then has one for each of these.
 
-        `reset_wait` returns what `reset` does. `recv` returns the copies that are ready, with reward 0. Raises
-        `AlreadyPendingCallError` if one of the copies, or another one of its lane, has not come back.
+        Get the results with `reset_wait`, which returns what `reset` returns, or with `recv`, which returns the copies that
+        are ready, with reward 0. Raises `AlreadyPendingCallError` if one of the copies, or another copy of its lane, has not
+        come back.
         """
         self._check_idle("reset_async", of_sent=True)
         copies, seeds, options = reset_arguments(env_ids, seed, options, self._layout.count)
@@ -128,38 +130,43 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         self._state = AsyncState.WAITING_RESET if alone else AsyncState.DEFAULT
 
     def reset_wait(self, timeout: float | None = None) -> tuple[Any, Infos]:
-        """Wait for the pending reset. Returns and raises what `reset` does; otherwise it is as `step_wait`."""
+        """Wait for the pending reset. Returns what `reset` returns.
+
+        Raises what `reset` raises, and `NoAsyncCallError` if no reset is pending. For `timeout`, see `step_wait`.
+        """
         observation, _, _, _, infos = self._wait(AsyncState.WAITING_RESET, timeout)
         return observation, infos
 
     def step(self, actions: Any) -> GymnasiumStep:
         """Step every copy. Returns observations, rewards, terminated, truncated and infos.
 
-        `actions` and observations have a row for each copy, as `action_space` and `observation_space`. Rewards are
-        [num_envs] float64; terminated and truncated are [num_envs] bool; infos are a dict, as gymnasium merges them.
+        `actions` and observations have a row for each copy, as in `action_space` and `observation_space`. Rewards are
+        [num_envs] float64; terminated and truncated are [num_envs] bool; infos are a dict, merged as gymnasium does.
 
-        With seats, the action of a row counts where `infos["acts"]` is True in the results before. `infos["complete"]` says
-        which rows are transitions: from the observation that the row had before, in which its seat acted, to the present
-        one, with this reward, terminated and truncated. Agents that take turns have acted some steps earlier: keep their
-        actions until then. Leave all other rows out; `infos["outside"]` has rewards that belong to no transition. An episode
-        is over when no seat of its copy acts. If a worker is lost, its rows are truncated and not complete.
+        With seats, the action of a row counts only if `infos["acts"]` was True for it in the previous results.
+        `infos["complete"]` says which rows are complete transitions: from the observation in which the row's seat last acted
+        to the present one, with this reward, terminated and truncated. Agents that take turns may have acted some steps
+        earlier, so keep their actions until their rows are complete. Don't learn from other rows; `infos["outside"]` has
+        rewards that belong to no transition. An episode is over when no seat of its copy acts. If a worker is lost, its rows
+        are truncated and not complete.
 
         Raises `UsageError` for copies that must be reset first, `TypeError` and `ValueError` for wrong actions,
-        `EnvironmentFailed`, `NoWorkers`, and with `on_worker_loss="raise"` `WorkerLost`.
+        `EnvironmentFailed`, `NoWorkers`, and, with `on_worker_loss="raise"`, `WorkerLost`.
         """
         self.step_async(actions)
         return self.step_wait()
 
     def step_async(self, actions: Any) -> None:
-        """Order every copy to step; `step_wait` returns the results."""
+        """Begin a step of every copy; `step_wait` returns the results."""
         self._check_idle("step_async")
         self._step(self._layout.lanes, actions, together=True)
         self._state = AsyncState.WAITING_STEP
 
     def step_wait(self, timeout: float | None = None) -> GymnasiumStep:
-        """Wait for the pending step. Returns and raises what `step` does, and `NoAsyncCallError` if there is none.
+        """Wait for the pending step. Returns what `step` returns.
 
-        A worker that does not answer within `timeout` seconds (`timeout_s` by default) is given up.
+        Raises what `step` raises, and `NoAsyncCallError` if no step is pending. A worker that does not answer within
+        `timeout` seconds (by default, the timeout of the vector environment) is treated as lost.
         """
         return self._wait(AsyncState.WAITING_STEP, timeout)
 
@@ -187,13 +194,13 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
     # ---------------------------------------------------------------- lanes that do not wait for each other
 
     def send(self, actions: Any, env_ids: Sequence[int] | Array | None = None) -> None:
-        """Step these copies, by default all, with one action each, in the order of `env_ids`; `recv` returns the results.
+        """Begin a step of these copies, by default all, with one action each; `recv` returns the results.
 
-        A lane is stepped as a whole: `env_ids` has all copies of a lane or none (`make_vec(lanes=num_envs)` makes each copy
-        a lane). Actions are [len(env_ids), *leaf]. Autoreset is that of `step`.
+        Actions are [len(env_ids), *leaf], in the order of `env_ids`. A lane is stepped as a whole, so `env_ids` must have
+        all copies of a lane or none (`make_vec(lanes=num_envs)` makes each copy a lane). Autoreset works as in `step`.
 
-        Raises `AlreadyPendingCallError` if one of the copies has not come back, `ValueError` for other numbers or a wrong
-        number of actions, `UsageError` for copies that must be reset first. Then nothing was sent.
+        Raises `AlreadyPendingCallError` if one of the copies has not come back, `ValueError` for invalid `env_ids` or a
+        wrong number of actions, and `UsageError` for copies that must be reset first. If it raises, nothing was sent.
 
         envs = millrace.make_vec("CartPole-v1", 8, workers=2, lanes=8)
         envs.reset_async(seed=1)
@@ -209,16 +216,16 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         self._state = AsyncState.DEFAULT
 
     def recv(self, min_envs: int = 1, timeout: float | None = None) -> GymnasiumStep:
-        """The results of all copies that are ready; waits until at least `min_envs` are. 0 does not wait.
+        """Wait until at least `min_envs` copies are ready, and return the results of all that are. 0 does not wait.
 
-        Observations, rewards, terminated and truncated have a row for each of these copies, in ascending order of the
-        copies, or for each of their seats; so have the infos, which also have `env_id`: int64, the numbers of the copies.
-        The arrays are the caller's. Each row is that which `step` or `reset` would have given.
+        Observations, rewards, terminated, truncated and infos have a row for each of these copies, or for each of their
+        seats, in ascending order of the copies. `infos["env_id"]` has the numbers of the copies, int64. The arrays are
+        copies that you may keep. Each row equals the one that `step` or `reset` would have returned.
 
-        A worker that does not answer within `timeout` seconds (`timeout_s` by default), counted from the order while the
-        caller waits, is given up, as by `step`. Raises `NoAsyncCallError` if nothing was sent, `EnvironmentFailed`,
-        `WorkerLost` and `NoWorkers`. After an error, all other copies can still be received, and those that are lost come
-        back truncated or are named by `WorkerLost`.
+        A worker that does not answer within `timeout` seconds (by default, the timeout of the vector environment) is treated
+        as lost, just as by `step`; only time in which you wait for it counts. Raises `NoAsyncCallError` if nothing was sent,
+        `EnvironmentFailed`, `WorkerLost` and `NoWorkers`. After an error, all other copies can still be received, and those
+        that are lost come back truncated or are named by `WorkerLost`.
         """
         self._check_idle("recv", of_sent=True)
         self._state = AsyncState.DEFAULT
@@ -229,7 +236,7 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
 
     @property
     def outstanding(self) -> list[int]:
-        """The copies that were sent an action or a reset, and that `recv` has not returned."""
+        """The copies that were sent an action or a reset, and that `recv` has not returned yet."""
         return self._send_recv.copies()
 
     # ---------------------------------------------------------------- calls
@@ -237,10 +244,10 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """Call a method of every copy, or get an attribute. Arguments and results must be plain data.
 
-        Raises `UsageError` for a name and `TypeError` for arguments that cannot be sent, `AttributeError` or
-        `EnvironmentFailed` if an environment raised, and `WorkerLost` if a worker is lost.
+        Raises `UsageError` for a name that cannot be sent, `TypeError` for arguments that cannot be sent, `AttributeError`
+        or `EnvironmentFailed` if an environment raised, and `WorkerLost` if a worker is lost.
 
-        `spec`, `observation_space` and `action_space` are as a worker described them, for such objects cannot travel.
+        `spec`, `observation_space` and `action_space` can't be sent; they are made from a worker's description of them.
         """
         if name not in self.calls.known:
             self._check_idle("call")
@@ -249,7 +256,7 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
     get_attr = call
 
     def set_attr(self, name: str, values: Any) -> None:
-        """Set an attribute. A list or tuple has one value for each copy; any other value goes to all copies."""
+        """Set an attribute of every copy. A list or tuple has one value for each copy; any other value goes to all."""
         if not isinstance(values, list | tuple):
             values = [values] * self._layout.count
         if len(values) != self._layout.count:
@@ -258,18 +265,18 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         self.calls.assign(range(self._layout.count), name, values)
 
     def render(self) -> tuple[Any, ...]:
-        """What `render` of every copy returns."""
+        """Render every copy. Returns the results of their `render`."""
         return self.call("render")
 
     @property
     def np_random_seed(self) -> tuple[int, ...]:  # type: ignore[override]
-        """The seed of each copy's random generator, as `SyncVectorEnv` shows it."""
+        """The seed of each copy's random generator, just as in `SyncVectorEnv`."""
         return self.get_attr("np_random_seed")
 
     # ---------------------------------------------------------------- close
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Ask the workers to leave, and end the local ones. Never hangs."""
+        """Ask the workers to leave, and end the local worker processes. Never hangs."""
         self._close_once()
 
     def __enter__(self) -> ZmqVectorEnv:
@@ -286,7 +293,7 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         self._send_recv.step(lanes, arrays, self._layout.rows, together=together)
 
     def _check_idle(self, doing: str, *, of_sent: bool = False) -> None:
-        """Raise if this cannot be done now. `of_sent`: it may be done while copies have not come back."""
+        """Raise if `doing` is not possible now. `of_sent` says that it is possible while copies have not come back."""
         if self.closed:
             raise ClosedEnvironmentError(f"{doing} after close()")
         if self._state is AsyncState.WAITING_STEP or (self._state is AsyncState.WAITING_RESET and not of_sent):
@@ -296,7 +303,7 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
             raise AlreadyPendingCallError(f"{doing} while copies {copies} have not come back: expected recv() first", "send")
 
     def _wait(self, awaited: AsyncState, timeout_s: float | None) -> GymnasiumStep:
-        """Wait for what is pending, which must be this."""
+        """Wait for the pending step or reset. Raises `NoAsyncCallError` unless `awaited` is what is pending."""
         if self.closed:
             raise ClosedEnvironmentError(f"{awaited.value}_wait after close()")
         if self._state is not awaited:
@@ -305,7 +312,7 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         return self._rows(self._send_recv.recv_all(timeout_s))
 
     def _rows(self, ready: Ready, copies: list[int] | None = None) -> GymnasiumStep:
-        """The rows of these copies, which came back, or of all."""
+        """The results of these copies, or of all copies if None, after they have come back."""
         batch = self._batch
         some = None if copies is None else self._layout.rows_of(copies)
         rows = slice(None) if some is None else some
@@ -321,6 +328,6 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
 
 
 def _call_in_process(pid: int, function: Callable[[], None]) -> None:
-    """Call `function` only in process `pid`: a forked child inherits this object, but does not own the workers."""
+    """Call `function` only in process `pid`, because a forked child inherits this object but does not own the workers."""
     if os.getpid() == pid:
         function()

@@ -1,4 +1,4 @@
-"""The infos of a step: packed bytes of each lane to one dict for each row, and these merged as gymnasium does it."""
+"""The infos of a step: unpacks the bytes of each lane to a dict for each row, and merges these as gymnasium does."""
 
 from __future__ import annotations
 
@@ -18,25 +18,25 @@ log = logging.getLogger("millrace.learner")
 
 
 class OfSomeRows(VectorEnv[Any, Any, Array]):
-    """Merges the infos of some rows, as gymnasium's vector environments merge those of all."""
+    """Merges the infos of some rows, as gymnasium's vector environments merge those of all rows."""
 
-    closed = True  # there is nothing to close
+    closed = True  # so that nobody tries to close it
 
     def __init__(self, count: int) -> None:
         self.num_envs = count
 
 
 class InfoReader:
-    """Reads the infos of lanes that came back."""
+    """Reads the infos of lanes that have come back."""
 
     def __init__(self, layout: BatchLayout, refuse: Callable[[int, str], None]) -> None:
-        """`refuse` is called with a lane whose infos cannot be read, and why."""
+        """`refuse` is called with a lane whose infos cannot be read, and the reason."""
         self._layout = layout
         self._refuse = refuse
-        self._warned: set[str] = set()  # keys of infos that arrived as their repr
+        self._warned: set[str] = set()  # keys of infos that were logged because they arrived as their repr
 
     def by_row(self, ready: Ready) -> dict[int, Infos]:
-        """The infos that are not empty, in the order of the rows."""
+        """The infos that are not empty, by row, in the order of the rows."""
         infos = dict(ready.losses)
         for lane, packed in ready.results.items():
             if not isinstance(packed, bytes) or not packed:
@@ -57,7 +57,7 @@ class InfoReader:
 
 
 def merged(by_row: Mapping[int, Infos], env: VectorEnv[Any, Any, Array], rows: Sequence[int] | None = None) -> Infos:
-    """Infos of these rows as gymnasium merges them; None: of all of the vector environment."""
+    """The infos of these rows, or of all rows if `rows` is None, merged as gymnasium does."""
     infos: Infos = {}
     merges = OfSomeRows(len(rows)) if rows is not None else env
     number_of = range(env.num_envs) if rows is None else {n: number for number, n in enumerate(rows)}
@@ -67,7 +67,7 @@ def merged(by_row: Mapping[int, Infos], env: VectorEnv[Any, Any, Array], rows: S
 
 
 def unpack_infos(packed: bytes, rows: Sequence[int]) -> dict[int, Infos]:
-    """Infos by row, of a lane that has these rows. Raises `BadMessage` for bytes that aren't infos."""
+    """The infos of a lane with these rows, by row. Raises `BadMessage` for bytes that aren't infos."""
     try:
         pairs = [(n, info) for n, info in unpack(packed)]
     except (TypeError, ValueError) as error:

@@ -1,6 +1,7 @@
 """The orders to a lane: reset, step and call. Pure.
 
-Each function returns one that makes the message, as soon as session, ticket and incarnation of the lane are known.
+Each `..._order` function returns a function that makes the message once the session, the ticket and the incarnation of the
+lane are known.
 """
 
 from __future__ import annotations
@@ -16,12 +17,12 @@ from millrace.protocol.wire.plain_values import pack
 
 
 def packed(value: object) -> Bytes:
-    """A plain value as an array of bytes. Raises `TypeError` for what is not plain."""
+    """A plain value as an array of bytes. Raises `TypeError` if the value isn't plain data."""
     return np.frombuffer(pack(value), np.uint8)
 
 
 def reset_order(copies: Sequence[int], seeds: Sequence[int | None], options: Bytes) -> MakeOrder:
-    """Begin episodes in these copies of the lane, with one seed each. `options` are packed."""
+    """An order to begin episodes in these copies of the lane, with one seed each. `options` are packed."""
 
     def make(session: int, ticket: int, life: LaneIncarnation) -> Reset:
         return Reset(session, ticket, life.lane, life.incarnation, tuple(copies), tuple(seeds), options)
@@ -30,7 +31,7 @@ def reset_order(copies: Sequence[int], seeds: Sequence[int | None], options: Byt
 
 
 def step_order(actions: Sequence[Array]) -> MakeOrder:
-    """Step all copies of the lane with these actions: [N, *leaf] each."""
+    """An order to step all copies of the lane with these actions, [N, *leaf] each."""
     leaves = tuple(array.copy() for array in actions)
 
     def make(session: int, ticket: int, life: LaneIncarnation) -> Step:
@@ -40,7 +41,7 @@ def step_order(actions: Sequence[Array]) -> MakeOrder:
 
 
 def call_order(copies: Sequence[int], name: str, arguments: object, *, assign: bool) -> MakeOrder:
-    """Get or call the attribute of this name in these copies of the lane, or assign to it."""
+    """An order to get, call or assign an attribute of these copies of the lane."""
     packed_arguments = packed(arguments)
 
     def make(session: int, ticket: int, life: LaneIncarnation) -> Call:

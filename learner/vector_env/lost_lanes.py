@@ -1,7 +1,7 @@
 """Bookkeeping of lanes whose worker was lost. Pure.
 
-Rule: each loss is reported in exactly one step result, as truncated copies, or it is raised. The new copies of a lost
-lane are reset before they step.
+Rule: each loss is either reported in exactly one step result, as truncated copies, or raised as an error. The new copies of
+a lost lane are reset before they step.
 """
 
 from __future__ import annotations
@@ -14,48 +14,48 @@ from millrace.protocol.errors import WorkerLost
 from millrace.protocol.random_streams import Purpose, env_seed
 
 RESET_ATTEMPTS = 3
-"""How often a reset is tried while each attempt loses a worker."""
+"""How many times a reset is tried if every attempt loses a worker."""
 UNKNOWN_REASON = "its worker is gone"
 
 
 class LostLanes:
-    """The lanes that are lost and not yet reported, and those that are reported and not yet reset."""
+    """The lanes whose loss has not been reported yet, and the lanes that have been reported and not been reset yet."""
 
     def __init__(self) -> None:
-        self._unreported: dict[int, str] = {}  # lane -> why
+        self._unreported: dict[int, str] = {}  # by lane, why it was lost
         self._awaiting_reset: set[int] = set()
 
     @property
     def unreported(self) -> Mapping[int, str]:
-        """Lanes that no step result has reported yet, and why each was lost."""
+        """Lanes whose loss no step result has reported yet, and why each was lost."""
         return self._unreported
 
     @property
     def awaiting_reset(self) -> AbstractSet[int]:
-        """Lanes whose next order must be a reset: their env copies are new."""
+        """Lanes whose next order must be a reset, because their env copies are new."""
         return self._awaiting_reset
 
     def add(self, lost: Mapping[int, str]) -> None:
-        """These lanes were lost, for these reasons."""
+        """Record that these lanes were lost, for these reasons."""
         self._unreported |= lost
 
     def expect_reset(self, lanes: Iterable[int]) -> None:
-        """The caller knows that these lanes were lost."""
+        """Record that the caller knows of the loss of these lanes, so they wait for a reset."""
         self._awaiting_reset.update(lanes)
 
     def answered(self, lanes: AbstractSet[int]) -> None:
-        """These lanes answered an order: they have been reset if they had to be."""
+        """Record that these lanes answered an order. If they waited for a reset, that order was the reset."""
         self._awaiting_reset -= lanes
 
     def forget(self, lanes: Iterable[int]) -> None:
-        """These lanes begin new episodes: earlier losses no longer matter."""
+        """Forget earlier losses of these lanes, because they begin new episodes."""
         for lane in lanes:
             self._unreported.pop(lane, None)
 
     def report(self, unanswered: Sequence[int]) -> dict[int, str]:
-        """Report lanes that have no result for this step, and why. From now on they wait for a reset.
+        """Report lanes that were lost instead of answering this step. Returns why. From now on they wait for a reset.
 
-        A lane that answered this step and was lost afterwards is reported in the next step.
+        A lane that was lost after it answered this step is reported in the next step.
         """
         reported = {lane: self._unreported.pop(lane, UNKNOWN_REASON) for lane in unanswered}
         self.expect_reset(reported)
@@ -63,7 +63,7 @@ class LostLanes:
 
 
 def replacement_seeds(seeds: Iterable[int | None], incarnation: int) -> tuple[int | None, ...]:
-    """Seeds for copies that replace lost ones: other than the old seeds, and the same whenever this loss is repeated."""
+    """Seeds for copies that replace lost ones. They differ from the old seeds, and are the same if this loss is repeated."""
     return tuple(None if seed is None else env_seed(seed, Purpose.REPLACEMENT, incarnation) for seed in seeds)
 
 

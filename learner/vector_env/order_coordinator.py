@@ -1,9 +1,9 @@
 """The learner's half of the conversation of a vector environment. Pure: messages and `now` in, messages out.
 
-Rule: an order goes to one lane, and a lane has one order at a time; lanes do not wait for each other. The order is answered,
-or its lane is lost with its worker. A lost lane starts again on new env copies, in its next incarnation. An order that a
-Heartbeat shows to be lost on the way is sent again. Steps through shared memory don't count as orders here; only their infos
-come as messages, where they are too long for the shared memory.
+Rule: an order goes to one lane, and a lane has one order at a time; lanes do not wait for each other. Either the order is
+answered, or its lane is lost with its worker. A lost lane starts again on new env copies, in its next incarnation. If a
+Heartbeat shows that an order was lost on the way, the order is sent again. Steps through shared memory don't count as orders
+here; only if their infos are too long for the shared memory, these arrive as messages.
 """
 
 from __future__ import annotations
@@ -44,10 +44,10 @@ class OrderedLane(PlacedLane):
     """A lane whose env copies are stepped by orders."""
 
     started: bool = False
-    """Whether an order of this incarnation was sent. If so, its env copies exist and can be lost."""
+    """Whether an order was sent to this incarnation. If so, its env copies exist and can be lost."""
 
     def restart(self) -> None:
-        """The lane left its worker."""
+        """Record that the lane left its worker. Its next incarnation has new env copies."""
         super().restart()
         self.started = False
         self.incarnation += 1
@@ -62,20 +62,23 @@ class OrderCoordinator(Coordinator[Member]):
         self.spec = spec
         self.lanes = [OrderedLane(lane) for lane in range(len(spec.lanes))]
         self.orders: dict[int, Order] = {}
-        """Orders that were sent and not answered, by ticket."""
+        """Orders that have been sent and not been answered, by ticket."""
         self.answers: dict[int, Answer] = {}
         """Answers by lane, until the next orders."""
         self.shared_orders: dict[int, int] = {}
-        """Number of the order through shared memory that is under way, by lane."""
+        """Number of the step through shared memory that is under way, by lane."""
         self.infos: dict[int, bytes] = {}
-        """Packed infos of such an order, by lane, if they came as a message."""
+        """Packed infos of such a step, by lane, if they arrived as a message."""
         self.lost: dict[int, str] = {}
         """Lanes whose env copies are gone, with the reason, until the vector environment has handled them."""
         self._placement = LanePlacement(self.lanes, _by_name)
         self._tickets = 0
 
     def give_up(self, member: Member, why: str) -> list[Outgoing]:
-        """Remove this worker, for which the learner waits no longer, and no other of its name: keys may share names."""
+        """Remove this worker, because the learner no longer waits for it.
+
+        A worker of the same name that uses another key stays.
+        """
         self.membership.remove(member, TimedOut, why)
         return []
 
@@ -88,13 +91,13 @@ class OrderCoordinator(Coordinator[Member]):
         return lost
 
     def forget(self, lane: int) -> None:
-        """Forget the answer to the last order of one lane; the caller has taken it."""
+        """Forget the answer to the last order of a lane, which the caller has taken."""
         self.answers.pop(lane, None)
         self.shared_orders.pop(lane, None)
         self.infos.pop(lane, None)
 
     def place(self, lane: int, patient: bool) -> bool:
-        """Assign the lane to a worker. False if there is none; if `patient`, also if every worker has a lane already."""
+        """Assign the lane to a worker. Returns False if there is none or, if `patient`, if each already has a lane."""
         if self.lanes[lane].owner is not None:
             return True
         candidates = [member for member in self.membership.active() if not (patient and member.lanes)]
@@ -103,7 +106,7 @@ class OrderCoordinator(Coordinator[Member]):
         return bool(candidates)
 
     def rebalance(self) -> list[Outgoing]:
-        """All lanes are about to begin anew: move some from the workers with the most to those with the fewest."""
+        """Move lanes from the workers with the most to those with the fewest. All lanes must be about to be reset."""
         return self._placement.even_out(self.membership.active())
 
     def owner(self, lane: int) -> Member | None:
@@ -112,7 +115,7 @@ class OrderCoordinator(Coordinator[Member]):
         return None if peer is None else self.members[peer]
 
     def order(self, lane: int, make_order: MakeOrder) -> list[Outgoing]:
-        """Send an order to a lane that was placed."""
+        """Make an order to a lane, which must have a worker, and return the message to send."""
         member = self.owner(lane)
         record = self.lanes[lane]
         assert member is not None
@@ -132,7 +135,7 @@ class OrderCoordinator(Coordinator[Member]):
             case Stepped() | Returned():
                 return self._take_answer(member, message)
             case Described():
-                return []  # it was asked before the vector environment began
+                return []  # the answer to a request from before the vector environment began
             case Goodbye(_, reason):
                 self.membership.leave(member, reason)
                 return []
@@ -143,7 +146,7 @@ class OrderCoordinator(Coordinator[Member]):
             return self._long_infos(member, message)
         order = self.orders.get(message.ticket)
         if order is None or message.ticket not in member.tickets:
-            return []  # this answer has come before
+            return []  # this answer has arrived before
         try:
             check(message, order, self.spec)
         except BadMessage as error:
@@ -153,7 +156,7 @@ class OrderCoordinator(Coordinator[Member]):
         return []
 
     def _long_infos(self, member: Member, answer: Answer) -> list[Outgoing]:
-        """Infos of a step through shared memory. They count only if they belong to the lane's newest order."""
+        """Store the infos of a step through shared memory, if they belong to the lane's newest step."""
         if not isinstance(answer, Stepped):
             return self._unusable(member, "answer to an order through shared memory: expected Stepped, got Returned")
         mine = answer.lane in member.lanes and self.lanes[answer.lane].incarnation == answer.incarnation
@@ -178,7 +181,7 @@ class OrderCoordinator(Coordinator[Member]):
 
 
 def _by_name(member: Member) -> tuple[int, str]:
-    """Sort key: the next lane goes to the worker with the fewest lanes; in a tie, to the first name in this order."""
+    """Sort key of workers with equally few lanes: the first in the order of their names gets the next lane."""
     return len(member.hello.worker), member.hello.worker
 
 

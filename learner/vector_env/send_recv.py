@@ -1,8 +1,8 @@
-"""What lanes are asked for, and what comes back: every step, reset and call of a vector environment goes this way.
+"""Sends every step, reset and call of a vector environment to its lanes, and collects the results.
 
-Rule: for the same seeds and actions, each lane gives the same rows, whether lanes are waited for together or not, and
-whichever way steps travel. A lost worker is reported once, as truncated copies or as an error, and costs no other lane its
-results.
+Rule: for the same seeds and actions, each lane gives the same rows, whether or not the caller waits for all lanes together,
+and whether steps are sent as messages or through shared memory. A lost worker is reported once, as truncated copies or as an
+error, and no other lane loses its results.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ log = logging.getLogger("millrace.learner")
 
 @dataclass(frozen=True)
 class VectorEnvParts:
-    """What a vector environment is made of."""
+    """The parts of a vector environment that this file uses."""
 
     hub: StepHub
     layout: BatchLayout
@@ -48,9 +48,9 @@ class VectorEnvParts:
     lost_lanes: LostLanes
     autoreset: Literal["NextStep", "SameStep", "Disabled"]
     seeds: list[int | None]
-    """of each copy's last seeded reset"""
+    """the seed of each copy's last reset with a seed"""
     ever_reset: Bools
-    """[copies] whether the copy was ever reset"""
+    """[copies] True for copies that were ever reset"""
     on_worker_loss: Literal["truncate", "raise"] = "truncate"
 
     def replacement_seeds(self, lane: int) -> tuple[int | None, ...]:
@@ -64,15 +64,15 @@ class VectorEnvParts:
 
 
 class SendRecv:
-    """The lanes that were asked for something, until it has come back."""
+    """Sends orders to lanes and receives their results. It keeps track of the lanes that have not come back."""
 
     def __init__(self, parts: VectorEnvParts, timeout_s: float) -> None:
-        """`timeout_s`: how long a worker may take, if no other time is given."""
+        """`timeout_s` is how many seconds a worker may take, unless a call gives another time."""
         self.timeout_s = timeout_s
         self._parts = parts
         self._sent = SentLanes(parts.layout)
         self._all_were_reset = False
-        self._to_raise: dict[int, str] = {}  # lanes that were lost, and for which the caller gets an error
+        self._to_raise: dict[int, str] = {}  # lanes whose loss the caller gets as an error, and why they were lost
         self._watched = WatchedTime(parts.hub.now())
 
     def copies(self) -> list[int]:
@@ -82,10 +82,10 @@ class SendRecv:
     # ---------------------------------------------------------------- out
 
     def reset(self, copies: Sequence[int], seeds: Sequence[int | None], options: Options) -> None:
-        """Begin episodes in these copies. `seeds`: of all copies; a list of `options` has those of all copies.
+        """Begin episodes in these copies. `seeds`, and `options` if it is a list, have an entry for every copy there is.
 
-        Raises `TypeError` for options that aren't plain data, and `UsageError` for a part of a lane whose copies were lost,
-        with SameStep: no step resets them before their first episode.
+        Raises `TypeError` for options that aren't plain data. With SameStep, raises `UsageError` for only some copies of a
+        lane that was lost, because no step would reset the others.
         """
         parts = self._parts
         layout = self._parts.layout
@@ -115,11 +115,13 @@ class SendRecv:
         *,
         together: bool,
     ) -> None:
-        """Step these lanes. `actions`: arrays, whose rows `at[lane]` are those of the lane, and whether they fit into shared
-        memory without rounding. `together`: `recv_all` takes the results.
+        """Step these lanes.
 
-        Raises `UsageError` for copies that must be reset first, and with `on_worker_loss="raise"` `WorkerLost` for copies
-        that were lost. Then nothing is sent.
+        `actions` are the arrays of actions, in which `at[lane]` are the rows of a lane, and whether they fit into shared
+        memory without rounding. `together` says that `recv_all` will take the results.
+
+        Raises `UsageError` for copies that must be reset first, and, with `on_worker_loss="raise"`, `WorkerLost` for copies
+        that were lost. If it raises, nothing is sent.
         """
         parts = self._parts
         hub = self._parts.hub
@@ -135,8 +137,8 @@ class SendRecv:
         self._sent.send(lanes, Sent(Asked.STEP, now))
         for lane in lanes:
             if lane in unreported:
-                continue  # the loss is reported in its place
-            if lane in awaiting_reset:  # as NEXT_STEP: the step after a truncation resets
+                continue  # this step reports the loss in place of a result
+            if lane in awaiting_reset:  # just as in NextStep mode, the step after a truncation resets
                 hub.send_order(lane, parts.reset_of_new_copies(lane).order())
             elif fit and hub.can_share(lane):
                 shared.append(lane)
@@ -163,9 +165,10 @@ class SendRecv:
     # ---------------------------------------------------------------- in
 
     def recv(self, min_envs: int, timeout_s: float | None = None) -> tuple[Ready, list[int]]:
-        """Wait until at least `min_envs` copies are ready, and take the lanes that are, and the numbers of the copies.
+        """Wait until at least `min_envs` copies are ready. Returns the lanes that are, and the numbers of their copies.
 
-        Raises `EnvironmentFailed`, `WorkerLost` and `NoWorkers`; then lanes that are ready stay so for the next call.
+        Raises `EnvironmentFailed`, `WorkerLost` and `NoWorkers`. If it raises, the next call can still take lanes that are
+        ready.
         """
         sent = self._sent
         hub = self._parts.hub
@@ -183,7 +186,7 @@ class SendRecv:
             hub.wait(timeout_s, together=False)
 
     def recv_all(self, timeout_s: float | None = None) -> Ready:
-        """Wait until every lane is ready, and take them. Raises as `recv`; then nothing is waited for any more."""
+        """Wait until every lane is ready, and take them. Raises what `recv` raises, after giving up on all lanes."""
         sent = self._sent
         hub = self._parts.hub
         timeout_s = self.timeout_s if timeout_s is None else timeout_s
@@ -213,7 +216,10 @@ class SendRecv:
         return self._sent.take_some(lanes)
 
     def look(self, timeout_s: float) -> None:
-        """Note what has come of the lanes that are under way. Never waits. Raises `EnvironmentFailed` and `NoWorkers`."""
+        """Record the results and losses of lanes that are under way. Never waits.
+
+        Raises `EnvironmentFailed` and `NoWorkers`.
+        """
         self._take_results()
         self._parts.hub.raise_failure()
         if not self._sent.all_ready:
@@ -221,7 +227,7 @@ class SendRecv:
             self._handle_losses()
 
     def abandon(self) -> None:
-        """Nothing is waited for any more. The caller knows of the lanes that were lost meanwhile."""
+        """Stop waiting for all lanes. Lanes that were lost meanwhile count as reported."""
         steps = [lane for lane in self._sent.under_way if self._sent.sent[lane].asked is Asked.STEP]
         self._to_raise.clear()
         self._parts.hub.forget(self._sent.clear())
@@ -257,7 +263,7 @@ class SendRecv:
             self._all_were_reset = bool(parts.ever_reset.all())
         if parts.autoreset == "Disabled":
             over = parts.batch.over
-            # Of a loss that is not reported, the caller learns by the result of this step.
+            # Lanes with an unreported loss are left out, because the result of this step reports it.
             if ended := [
                 n for n in parts.layout.copies_of(lane for lane in lanes if lane not in lost_lanes.unreported) if over[n]
             ]:
@@ -278,17 +284,17 @@ class SendRecv:
         return AskedReset(tuple(chosen), tuple(seeds[n] for n in copies), packed(of_lane))
 
     def _reset_instead(self, lane: int, reset: AskedReset, last_observations: Mapping[int, Any]) -> None:
-        """The lane was lost: its new copies are reset before it comes back."""
+        """Reset the new copies of a lane that was lost, before it comes back."""
         self._sent.reset_instead(lane, reset, self._watched.look(self._parts.hub.now()), last_observations)
         self._parts.hub.send_order(lane, reset.order())
 
     def _take_results(self) -> None:
-        """Note which lanes are done."""
+        """Record which lanes are done."""
         came = self._parts.hub.take()
         self._sent.ready({lane: self._stored(lane, one) if isinstance(one, Stepped) else one for lane, one in came.items()})
 
     def _stored(self, lane: int, answer: Stepped) -> bytes:
-        """Write results that came as a message to the batch. Packed infos."""
+        """Write the results that arrived as a message to the batch. Returns the packed infos."""
         parts = self._parts
         asked = self._sent.sent[lane].asked
         parts.batch.store(lane, answer)
@@ -298,7 +304,7 @@ class SendRecv:
         return bytes(answer.infos.data)
 
     def _give_up_late(self, timeout_s: float) -> None:
-        """Give up the workers that take too long. Raises `NoWorkers`."""
+        """Treat the workers that take too long as lost. Raises `NoWorkers` if a lane had no worker all that time."""
         now = self._watched.look(self._parts.hub.now())
         for lane in self._sent.overdue(now, timeout_s):
             try:
@@ -308,7 +314,7 @@ class SendRecv:
                 raise
 
     def _handle_losses(self) -> None:
-        """What becomes of the lanes that were lost while they were under way."""
+        """Handle the lanes that were lost while they were under way."""
         parts = self._parts
         sent = self._sent
         parts.lost_lanes.add(parts.hub.coordinator.take_lost())
@@ -321,12 +327,12 @@ class SendRecv:
                 case AfterLoss.RAISE:
                     self._to_raise[lane] = parts.lost_lanes.unreported[lane]
                     if asked is not Asked.CALL or parts.on_worker_loss == "raise":
-                        parts.lost_lanes.report([lane])  # otherwise the next step reports it too: the caller may continue
+                        parts.lost_lanes.report([lane])  # otherwise the caller may continue, and the next step reports it
                     sent.drop(lane)
                 case AfterLoss.RESET_AGAIN:
                     assert isinstance(asked, AskedReset)
                     if len(asked.copies) == len(copies):
-                        parts.lost_lanes.forget([lane])  # else the next step reports the copies that were not reset
+                        parts.lost_lanes.forget([lane])  # otherwise the next step reports the copies that were not reset
                     self._reset_instead(lane, asked, {})
                 case AfterLoss.RESET_NEW_COPIES:
                     self._warn(lane, parts.lost_lanes.report([lane])[lane])

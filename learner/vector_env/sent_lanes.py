@@ -1,7 +1,7 @@
-"""Bookkeeping of lanes that were asked for something and have not come back. Pure.
+"""Bookkeeping of lanes that were sent an order and have not come back. Pure.
 
-Rule: what was asked of a lane comes back exactly once: with its results, as lost, or in an error. Until then the lane takes
-no other order, so that nothing overwrites its results.
+Rule: a lane that was sent an order comes back exactly once: with its results, as lost, or in an error. Until then the lane
+gets no other order, so that nothing overwrites its results.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from millrace.protocol.arrays import Bytes
 from millrace.protocol.messages import Returned
 
 Infos = dict[str, Any]
-"""What the environment tells beside a row."""
-LONGEST_GAP_S = 0.5  # a caller that looks less often was busy, or its process was stopped
+"""The info that an environment returns alongside a row."""
+LONGEST_GAP_S = 0.5  # a caller that looks less often is busy, or its process was stopped
 
 
 @dataclass(frozen=True)
@@ -28,59 +28,59 @@ class AskedReset:
     """The reset that a lane was asked for, to be repeated if its worker is lost."""
 
     copies: tuple[int, ...]
-    """numbered in the lane"""
+    """the copies to reset, numbered within the lane"""
     seeds: tuple[int | None, ...]
     options: Bytes
 
     def order(self) -> MakeOrder:
-        """Makes the order for it."""
+        """The order for this reset."""
         return reset_order(self.copies, self.seeds, self.options)
 
 
 class Asked(Enum):
-    """What else a lane was asked for."""
+    """The other orders that a lane can be sent, which are not repeated."""
 
     STEP = 0
     CALL = 1
 
 
 class Sent(NamedTuple):
-    """What was asked of a lane, or of several alike."""
+    """The order that one or more lanes were sent, and when."""
 
     asked: AskedReset | Asked
     since_s: float
     attempts: int = 1
-    """how often a reset was sent"""
+    """how many times the reset has been sent"""
     last_observations: Mapping[int, Any] | None = None
-    """by row: those with which the episodes of lost copies end, while their new copies are reset"""
+    """by row, the final observations of the episodes of lost copies, while their new copies are reset"""
 
 
 class Ready(NamedTuple):
     """The lanes that come back together. Their observations, rewards and episode ends are in the batch."""
 
     results: Mapping[int, bytes | Returned]
-    """by lane, in ascending order: packed infos, or what a call returned"""
+    """by lane, in ascending order: packed infos, or the results of a call"""
     losses: Mapping[int, Infos]
-    """by row: infos of those that come back truncated, because their worker was lost"""
+    """by row: the infos of rows that come back truncated because their worker was lost"""
 
 
 class AfterLoss(Enum):
-    """What to do about a lane that was lost before it came back."""
+    """How to handle a lane that was lost before it came back."""
 
     RAISE = 0
     """the caller gets an error"""
     RESET_AGAIN = 1
     """new copies get the same reset"""
     RESET_NEW_COPIES = 2
-    """the lane comes back truncated, together with the first observations of new copies, as SameStep says"""
+    """the lane comes back truncated, together with the first observations of new copies, as SameStep requires"""
     COME_BACK = 3
-    """the lane comes back truncated, at its newest observations"""
+    """the lane comes back truncated at its newest observations"""
 
 
 def after_loss(
     sent: Sent, autoreset: Literal["NextStep", "SameStep", "Disabled"], on_worker_loss: Literal["truncate", "raise"]
 ) -> AfterLoss:
-    """What to do about a lane that was sent this, and whose worker is lost."""
+    """How to handle a lane that was sent this order, and whose worker is lost."""
     if on_worker_loss == "raise" or sent.asked is Asked.CALL:
         return AfterLoss.RAISE
     if sent.asked is not Asked.STEP:
@@ -94,9 +94,9 @@ class SentLanes:
     def __init__(self, layout: BatchLayout) -> None:
         self._layout = layout
         self.sent: dict[int, Sent] = {}
-        """by lane: what the lanes that have not come back were asked for"""
-        self._results: dict[int, bytes | Returned] = {}  # of those that are ready
-        self._losses: dict[int, Infos] = {}  # by row, of those that are ready
+        """the orders of the lanes that have not come back, by lane"""
+        self._results: dict[int, bytes | Returned] = {}  # results of the lanes that are ready, by lane
+        self._losses: dict[int, Infos] = {}  # infos of lost rows in the lanes that are ready, by row
 
     @property
     def all_ready(self) -> bool:
@@ -109,7 +109,7 @@ class SentLanes:
 
     @property
     def under_way(self) -> list[int]:
-        """Lanes that are not ready."""
+        """The lanes that were sent an order and are not ready."""
         return [lane for lane in self.sent if lane not in self._results]
 
     @property
@@ -127,39 +127,39 @@ class SentLanes:
         return [lane for lane in lanes if lane in self.sent] if self.sent else []
 
     def send(self, lanes: Iterable[int], sent: Sent) -> None:
-        """These lanes were sent an order. Raises `ValueError` if an earlier one of theirs has not come back."""
+        """Record that these lanes were sent an order. Raises `ValueError` if one has not come back from an earlier order."""
         if early := self.among(lanes):
             raise ValueError(f"lanes {early}: expected some that have come back, got some that have not")
         self.sent |= dict.fromkeys(lanes, sent)
 
     def reset_instead(self, lane: int, reset: AskedReset, now: float, last_observations: Mapping[int, Any]) -> None:
-        """The lane was lost: its new copies are reset before it comes back."""
+        """Record that the lane was lost, and that its new copies are reset before it comes back."""
         sent = self.sent[lane]
         again = 1 if sent.asked is Asked.STEP else sent.attempts + 1
         self.sent[lane] = Sent(reset, now, again, last_observations or sent.last_observations)
 
     def start_again(self, now: float) -> None:
-        """From now on, every lane that is under way has its whole time again."""
+        """Restart the clock of every lane that is under way, so that each has its whole time again."""
         self.sent = {lane: sent._replace(since_s=now) for lane, sent in self.sent.items()}
 
     def ready(self, results: Mapping[int, bytes | Returned]) -> None:
-        """These lanes have their results."""
+        """Record the results of these lanes, which are now ready."""
         self._results |= results
         for lane in results:
             for row, last in (self.sent[lane].last_observations or {}).items():
                 self._losses[row] = {"worker_lost": True, "final_obs": last, "final_info": {"worker_lost": True}}
 
     def ready_as_lost(self, lane: int) -> None:
-        """The lane comes back truncated, and is reset by the caller or by its next step."""
+        """Record that the lane is ready and comes back truncated. The caller or its next step resets it."""
         self._results[lane] = b""
         self._losses |= {row: {"worker_lost": True} for row in self._layout.rows_of(self._layout.copies(lane))}
 
     def drop(self, lane: int) -> None:
-        """The lane does not come back: the caller gets an error that names it."""
+        """Forget a lane that does not come back, because the caller gets an error that names it."""
         del self.sent[lane]
 
     def clear(self) -> list[int]:
-        """Nothing is waited for any more. Returns the lanes that were under way."""
+        """Forget all lanes. Returns those that were under way."""
         dropped = self.under_way
         self.sent = {}
         self._results = {}
@@ -167,11 +167,11 @@ class SentLanes:
         return dropped
 
     def overdue(self, now: float, timeout_s: float) -> list[int]:
-        """Lanes that have been under way for longer than `timeout_s`."""
+        """The lanes that have been under way for longer than `timeout_s`."""
         return [lane for lane in self.under_way if now - self.sent[lane].since_s > timeout_s]
 
     def take(self) -> Ready:
-        """The lanes that are ready. They have come back now."""
+        """Take the lanes that are ready. From now on they count as having come back."""
         ready = Ready(dict(sorted(self._results.items())), self._losses)
         self._results = {}
         self._losses = {}
@@ -202,9 +202,9 @@ class SentLanes:
 
 
 class WatchedTime:
-    """A clock for what a worker may take: of a longer time in which nobody looked, only `LONGEST_GAP_S` counts.
+    """A clock for the timeouts of workers. If nobody looked for longer than `LONGEST_GAP_S`, only that much time counts.
 
-    So a learner that computed for a minute, or was stopped together with its workers, gives up nobody for that.
+    So if the learner computed for a minute, or was stopped together with its workers, no worker is treated as lost for that.
     """
 
     def __init__(self, now: float) -> None:

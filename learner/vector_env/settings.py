@@ -20,19 +20,19 @@ from millrace.protocol.errors import UsageError, safe_repr
 from millrace.protocol.machine.cpu_cores import usable_cores
 
 ObservationMode = Literal["same", "different"] | tuple[Space[Any], Space[Any]]
-"""gymnasium's. A tuple has the observation spaces of the batch and of a single copy."""
+"""Gymnasium's `observation_mode`. A tuple has the observation spaces of the batch and of a single copy."""
 
 
 @dataclass(frozen=True)
 class VectorEnvSettings:
-    """The arguments of `millrace.make_vec`, with the same meanings and defaults. Raises `UsageError` for wrong ones."""
+    """The arguments of `millrace.make_vec`, with the same meanings and defaults. Raises `UsageError` for invalid ones."""
 
     env: EnvLike | EnvSpec | Sequence[EnvLike]
     num_envs: int | None = None
     workers: int | None = None
     lanes: int | None = None
     listen: BindSettings = field(default_factory=BindSettings)
-    """The address for workers that are started elsewhere, and its keys. An empty address means local workers."""
+    """The address at which to listen for workers that are started elsewhere, and its keys. Empty for local workers."""
     transport: Literal["ipc", "tcp", "inproc"] = "ipc"
     shared_memory: bool = True
     autoreset_mode: AutoresetMode | str = "NextStep"
@@ -40,11 +40,11 @@ class VectorEnvSettings:
     on_worker_loss: Literal["truncate", "raise"] = "truncate"
     timeout_s: float = 60.0
     worker_timeout_s: float = 5.0
-    """A worker elsewhere is lost if it is silent for this long while the learner listens."""
+    """A worker elsewhere is lost if it is silent for this many seconds while the learner listens."""
     call_timeouts: CallTimeouts = field(default_factory=CallTimeouts)
     """How long a call of the environment may take before its worker is ended."""
     max_env_failures: int = 3
-    """Number of deaths of workers in the environment's code that `make_vec` survives, as `FailureCount` counts them."""
+    """How many times workers may die in the environment's code before `make_vec` raises. See `FailureCount`."""
     copy: bool = True
     render_mode: str | None = None
     kwargs: dict[str, Scalar] = field(default_factory=dict)
@@ -52,11 +52,11 @@ class VectorEnvSettings:
     wrappers: Sequence[WrapperLike] = ()
     """Wrappers of every env copy, the innermost first."""
     single_lanes: int = 0
-    """Number of further copies for evaluations, after the others: each is a separate lane, which `ZmqVectorEnv.step_async`
-    steps.
+    """Number of additional copies for evaluations, which follow the others. Each is a lane of its own, which can be stepped
+    alone with `ZmqVectorEnv.step_async`.
     """
     evaluates: bool = False
-    """Whether all copies play evaluations."""
+    """Whether all copies are for evaluations."""
 
     def __post_init__(self) -> None:
         if not self.timeout_s > 0:  # also true for NaN
@@ -71,7 +71,7 @@ class VectorEnvSettings:
 
     @property
     def envs(self) -> list[EnvLike | EnvSpec]:
-        """The environment of each copy: `num_envs` times the same one, or the given list."""
+        """The environment of each copy: the same one `num_envs` times, or the given list."""
         if isinstance(self.env, Sequence) and not isinstance(self.env, str):
             return list(self.env)
         try:
@@ -83,19 +83,19 @@ class VectorEnvSettings:
 
     @property
     def local_workers(self) -> int:
-        """Number of worker processes to start on this machine; 0 if workers are started elsewhere."""
+        """The number of worker processes to start on this machine; 0 if workers are started elsewhere."""
         if self.listen.bind:
             return 0
         return min(self.workers if self.workers is not None else usable_cores(), len(self.envs))
 
     @property
     def lane_count(self) -> int:
-        """Number of lanes: by default one for each local worker."""
+        """The number of lanes, by default one for each local worker."""
         return max(self.local_workers, 1) if self.lanes is None else self.lanes
 
     @property
     def lane_sizes(self) -> tuple[int, ...]:
-        """Number of copies of each lane."""
+        """The number of copies in each lane."""
         N = len(self.envs)
         lanes = self.lane_count
         return (*(N // lanes + (lane < N % lanes) for lane in range(lanes)), *[1] * self.single_lanes)

@@ -1,7 +1,8 @@
 """Steps through shared memory: which lanes are under way, and how this program and its workers wake each other.
 
-Rule: a lane's step is done when the number of its answer is that of its order. Until then nothing of the lane is read or
-written. A worker that was sent a message is woken too: it may sleep until its next step.
+Rule: a lane's step is done when the number of its answer equals the number of its order. Until then, this program neither
+reads nor writes the lane's memory. It also wakes a worker that it has sent a message, because the worker may be asleep until
+its next step.
 """
 
 from __future__ import annotations
@@ -20,33 +21,33 @@ class SharedSteps:
     def __init__(
         self, memory: SharedMemory, to_workers: Mapping[str, WakePipe], to_learner: WakePipe, spin_s: float = 0.0
     ) -> None:
-        """`to_workers`: the pipe that wakes each worker that inherited the memory, by its name. `to_learner` wakes us.
+        """`to_workers` are the pipes that wake the workers that inherited the memory, by name.
 
-        `spin_s`: how long to wait awake before sleeping.
+        `to_learner` is the pipe that wakes this process. `spin_s` is how many seconds to spin before sleeping.
         """
         self.memory = memory
         self.under_way: dict[int, int] = {}
-        """by lane: number of its order"""
+        """the number of the order of each lane whose step is under way, by lane"""
         self._to_workers = to_workers
         self._to_learner = to_learner
         self._spin_s = spin_s
         self.pipes: dict[int, WakePipe | None] = {}
-        """by lane: what wakes its worker, if that worker has the memory"""
+        """the pipe that wakes each lane's worker, by lane; None if that worker doesn't have the memory"""
         self._spin = SpinWait()
 
     def opened(self, lane: int, worker: str) -> None:
-        """The lane's copies are with the worker of this name."""
+        """Record that the worker of this name has the lane's copies."""
         self.pipes[lane] = self._to_workers.get(worker)
 
     def step(self, lanes: Iterable[int], *, together: bool) -> None:
-        """Step these lanes with the actions in the memory. `together`: they are waited for together."""
+        """Step these lanes with the actions in the memory. `together` says that the caller waits for all of them."""
         self.under_way |= self.memory.order(lanes, wake=not together)
         for pipe in {self.pipes[lane] for lane in lanes}:
             assert pipe is not None
             pipe.wake()
 
     def done(self) -> dict[int, bytes | None]:
-        """By lane: packed infos of the steps under way that are done; None if they come as a message."""
+        """The packed infos of the steps that are done, by lane; None if they are sent as a message."""
         memory = self.memory
         return {lane: memory.infos(lane) for lane, number in self.under_way.items() if memory.answered(lane) == number}
 
@@ -55,17 +56,20 @@ class SharedSteps:
         return self.memory.answered(lane) == self.under_way[lane]
 
     def worker_left(self, lane: int) -> None:
-        """The lane's worker is gone. A step that is not done will not be."""
+        """Record that the lane's worker is gone. If the lane's step is not done, it never will be."""
         self.pipes.pop(lane, None)
         if lane in self.under_way and not self.is_done(lane):
             del self.under_way[lane]
 
     def lanes_move(self) -> None:
-        """Lanes may go to other workers."""
+        """Forget which worker has which lane, because lanes may move to other workers."""
         self.pipes.clear()
 
     def spin(self, *, together: bool) -> bool:
-        """Wait awake, for a short time, until all lanes that are under way are done, or else one of them. False: in vain."""
+        """Spin for a short time until all lanes that are under way are done or, unless `together`, until one of them is.
+
+        Returns whether they are.
+        """
         if not self._spin_s:
             return False
         waiting = list(self.under_way)
@@ -78,7 +82,10 @@ class SharedSteps:
         return self._spin.wait(all_done if together else lambda: any(map(self.is_done, waiting)), self._spin_s)
 
     def sleep(self, link: LearnerLink, timeout_s: float, *, together: bool) -> bool:
-        """Sleep until a worker wakes us. `together`: messages wake us too. True if a message may have arrived."""
+        """Sleep until a worker wakes this process, at most for `timeout_s`. Returns whether a message may have arrived.
+
+        Unless `together`, the arrival of a message wakes it, too.
+        """
         if together:
             return not self._to_learner.wait(timeout_s)
         arrived = link.poll_beside([self._to_learner.read_fd], timeout_s)
@@ -86,11 +93,11 @@ class SharedSteps:
         return arrived
 
     def wake_for_message(self, peer: bytes) -> None:
-        """A message was sent to the worker with this routing id."""
+        """Wake the worker with this routing id, because a message was sent to it."""
         if (pipe := self._to_workers.get(worker_name(peer).decode(errors="replace"))) is not None:
             pipe.wake(WakeReason.MESSAGE)
 
     def wake_all(self) -> None:
-        """Every worker was sent a message."""
+        """Wake all workers, because a message was sent to each."""
         for pipe in self._to_workers.values():
             pipe.wake(WakeReason.MESSAGE)

@@ -1,6 +1,6 @@
-"""A vector environment as data: its env copies and lanes from the settings, its spaces as workers described them. Pure.
+"""A vector environment as data: its env copies and lanes follow from the settings, its spaces from a worker's description.
 
-Rule: the observations of all copies have the same shapes and dtypes, because they share arrays; all have the same actions.
+Rule: the observations of all copies have the same shapes and dtypes, because they share arrays; so do the actions. Pure.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class VectorEnvDescription:
     metadata: dict[str, Any]
     render_mode: str | None
     spec: Any
-    """gymnasium's `EnvSpec` if all copies have the same registered id, else None"""
+    """gymnasium's `EnvSpec` if all copies have the same registered id; otherwise None"""
 
 
 @dataclass(frozen=True)
@@ -47,15 +47,15 @@ class RequestedCopies:
     envs: tuple[EnvSpec, ...]
     """the different environments, each listed once"""
     copies: tuple[int, ...]
-    """index in `envs` for each copy"""
+    """for each copy, the index of its environment in `envs`"""
     lanes: tuple[int, ...]
-    """how many copies each lane has"""
+    """the number of copies of each lane"""
     autoreset: Literal["NextStep", "SameStep", "Disabled"]
     render_mode: str | None
     call_timeouts: CallTimeouts
     learner_timeout_s: float
     evaluation_copies: int
-    """number of copies, the last ones, that play evaluations"""
+    """how many of the copies, the last ones, play evaluations"""
 
     @property
     def to_describe(self) -> Unknown:
@@ -64,7 +64,7 @@ class RequestedCopies:
 
     @property
     def wait(self) -> WaitSpec:
-        """What the workers are welcomed by, before their spaces are known."""
+        """The spec that welcomes the workers before the spaces of their copies are known."""
         return WaitSpec(self.call_timeouts, learner_timeout_s=self.learner_timeout_s)
 
     def description(self, env: DescribedEnv) -> VectorEnvDescription:
@@ -89,14 +89,15 @@ class RequestedCopies:
 
 
 def _identity(spec: EnvSpec) -> tuple[str, PickledCallable | None, str]:
-    """Equal for specs that make the same environment; the wrappers of all are the same."""
+    """A key that is equal for specs that make the same environment. Wrappers are left out, because all have the same."""
     return spec.id, spec.factory, repr(spec.kwargs)
 
 
 def requested_copies(settings: VectorEnvSettings, learner_timeout_s: float = math.inf) -> RequestedCopies:
     """The env copies that the settings ask for.
 
-    `learner_timeout_s`: a worker that hears nothing from the learner for this long joins again. Raises `UsageError`.
+    A worker that hears nothing from the learner for `learner_timeout_s` joins again. Raises `UsageError` for settings that
+    don't fit together.
     """
     envs = settings.envs
     lanes = settings.lane_count
@@ -130,8 +131,8 @@ def observation_spaces(
 ) -> tuple[Space[Any], Space[Any]]:
     """The observation spaces of a single row and of the batch.
 
-    `first`: observation and action space of copy 0. `copies`: None for one that its client did not describe. `seats`: of
-    each. Raises `EnvironmentFailed` for a copy that does not fit.
+    `first` are the observation and the action space of copy 0. `copies` has None for a copy that its client did not
+    describe. `seats` is the number of seats of each copy. Raises `EnvironmentFailed` for a copy that does not fit.
     """
     observation, action = first
     single = observation if isinstance(mode, str) else mode[1]

@@ -1,6 +1,6 @@
-"""Arguments of `reset` and `step`: checked, and brought into one form. Pure.
+"""Checks the arguments of `reset` and `step`, and converts them to one form. Pure.
 
-The errors are of the types that gymnasium's own vector environments raise.
+The errors have the same types as those that gymnasium's own vector environments raise.
 """
 
 from __future__ import annotations
@@ -37,14 +37,14 @@ def seed_list(seed: int | Sequence[int | None] | None, num_envs: int) -> list[in
 
 
 Options = dict[str, Any] | list[dict[str, Any] | None] | None
-"""Options of a reset: the same for all env copies, or a list with those of each."""
+"""Options of a reset: the same for all env copies, or a list with the options of each."""
 
 
 def take_reset_mask(options: Options, num_envs: int) -> tuple[Bools, Options]:
     """The env copies to reset, and the options without the mask. Without a mask all copies are reset.
 
-    Raises `TypeError` for a mask that isn't a bool array, `ValueError` for a wrong shape, a mask without True, and a list of
-    another length.
+    Raises `TypeError` for a mask that isn't a bool array, and `ValueError` for a mask of a wrong shape or without True and
+    for a list of options of a wrong length.
     """
     if isinstance(options, list) and len(options) != num_envs:
         raise ValueError(f"options: expected one for each of {num_envs} copies, got {len(options)}")
@@ -61,9 +61,9 @@ def take_reset_mask(options: Options, num_envs: int) -> tuple[Bools, Options]:
 def reset_arguments(
     env_ids: Any, seed: int | Sequence[int | None] | None, options: Options, num_envs: int
 ) -> tuple[list[int], list[int | None], Options]:
-    """The copies to reset, the seed of each copy there is, and the options without a mask.
+    """The copies to reset, a seed for every copy there is, and the options without the mask.
 
-    Raises as `seed_list`, `take_reset_mask` and `numbered`, and `ValueError` if both `env_ids` and a mask choose copies.
+    Raises what `seed_list`, `take_reset_mask` and `numbered` raise, and `ValueError` if there are both `env_ids` and a mask.
     """
     mask, options_without = take_reset_mask(options, num_envs)
     if env_ids is None:
@@ -77,7 +77,7 @@ def reset_arguments(
 
 
 def numbered(env_ids: Any, num_envs: int) -> list[int]:
-    """The copies that `env_ids` names; None names all. Raises `TypeError` for what are not whole numbers."""
+    """The copies that `env_ids` names, or all if it is None. Raises `TypeError` for anything but whole numbers."""
     if env_ids is None:
         return list(range(num_envs))
     array = np.asarray(env_ids)
@@ -91,7 +91,7 @@ def action_arrays(
 ) -> tuple[list[Array], bool]:
     """A batch of actions as arrays [rows, *leaf], and whether shared memory can hold them without rounding.
 
-    `read` takes the actions apart into one value for each of `leaves`. Raises `TypeError` for what are not numbers,
+    `read` splits the actions into one value for each of `leaves`. Raises `TypeError` for actions that aren't numbers, and
     `ValueError` for a wrong number of actions.
     """
     arrays = []

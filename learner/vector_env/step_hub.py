@@ -1,8 +1,8 @@
-"""The hub of a vector environment: a shell round its coordinator and shared memory.
+"""The hub of a vector environment: a shell around its coordinator and its shared memory.
 
-Rule: a lane is asked by a message, or to step through shared memory; what comes of it is taken lane by lane. A worker that
-does not answer in time is given up, and killed if it is a child process of this one. Workers that have been silent for too
-long are removed only while the hub listens: the caller may take as long as it likes between two waits.
+Rule: a lane gets its orders as messages, or steps through shared memory; results are taken lane by lane. A worker that does
+not answer in time is treated as lost, and killed if it is a child process of this one. Workers that have been silent for too
+long are removed only while the hub listens, so the caller may take as long as it likes between two waits.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ from millrace.protocol.wire.learner_link import LearnerLink
 
 log = logging.getLogger("millrace.learner")
 
-POLL_S = 0.05  # between two checks whether a child process has ended
-LISTEN_EVERY_S = 0.5  # interval of answers to heartbeats while steps go through shared memory
+POLL_S = 0.05  # interval at which to check whether a child process has ended
+LISTEN_EVERY_S = 0.5  # interval at which heartbeats are answered while steps go through shared memory
 PATIENCE_S = 10.0  # how long a lost lane waits for a restarted worker (at most half the timeout) before it goes to a worker
 # that already has lanes
-BUSY_S = 1.0  # how long closing waits for a step under way: the step may hang, and its result is not used
+BUSY_S = 1.0  # how long closing waits for a step under way: no longer, because the step may hang, and nobody uses its result
 
 
 class StepHub:
-    """What a vector environment has to do with workers: it asks lanes, and looks what has come of that."""
+    """A vector environment's connection to its workers: sends orders to lanes, and takes their results."""
 
     def __init__(
         self,
@@ -48,62 +48,63 @@ class StepHub:
         worker_timeout_s: float = math.inf,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """`worker_timeout_s`: a worker that is silent for longer while the hub listens is given up; infinite where the end
-        of a process is known otherwise.
+        """A worker that is silent for longer than `worker_timeout_s` while the hub listens is treated as lost.
+
+        The timeout is infinite if this program learns of the end of worker processes in another way.
         """
         self.shared = shared
         self.now = clock
-        """time by the hub's clock"""
+        """returns the time of the hub's clock"""
         self.while_waiting: Callable[[], None] = lambda: None
-        """called now and then while the hub waits; what it raises ends the wait"""
+        """called now and then while the hub waits; an exception that it raises ends the wait"""
         self.on_death: Callable[[Failed], None] = lambda event: None
-        """called when a worker's process has ended in its environment: `make_vec` only tells of the lost copies"""
+        """called when a worker's process has ended in code of its environment; by default, only the lost copies are reported"""
         self.status_of_run: Callable[[float], Status] | None = None
-        """the status of the run that acts on these copies: `millrace status` gets its figures, and the workers here"""
+        """returns the status of the run that acts on these copies, to which `status` adds the workers of this hub"""
         self._link = link
         self.coordinator = OrderCoordinator(spec, first_session, worker_timeout_s)
-        self._under_way: dict[int, int] = {}  # lane -> number of its order through shared memory
+        self._under_way: dict[int, int] = {}  # by lane, the number of its step through shared memory
         if shared is not None:
             self._under_way = self.coordinator.shared_orders = shared.under_way
         self._processes = processes
-        self._waiting_orders: dict[int, MakeOrder] = {}  # lane -> an order that is sent as soon as the lane is placed
-        self._waiting_since_s: dict[int, float] = {}  # of these lanes
-        self._newest_tickets: dict[int, int] = {}  # lane -> ticket of its newest order, if its answer is wanted
-        self._infos_to_come: set[int] = set()  # lanes whose step is done, and whose infos come as a message
+        self._waiting_orders: dict[int, MakeOrder] = {}  # by lane, an order to send as soon as the lane has a worker
+        self._waiting_since_s: dict[int, float] = {}  # by lane, since when such an order has waited
+        self._newest_tickets: dict[int, int] = {}  # by lane, the ticket of its newest order, if the answer is still wanted
+        self._infos_to_come: set[int] = set()  # lanes whose step is done, and whose infos arrive later as a message
         self._patience_s = PATIENCE_S
         self._listen_due_s = 0.0
-        self._failure: Failed | None = None  # the first since `raise_failure`
-        # To lose a worker costs the user's episodes. So a worker has its whole timeout to be heard again, not only the
-        # server's short grace: after a long suspension even its connection must be made anew.
+        self._failure: Failed | None = None  # the first failure since the last `raise_failure`
+        # Losing a worker costs the user episodes. So after this process was away, a worker has its whole timeout to be heard
+        # again, not only the server's short grace: after a long suspension, it must even reconnect.
         settings = ServerSettings(grace_s=worker_timeout_s, log_tracebacks=False)
         self._server = MemberServer(link, self.coordinator, self, processes, settings, clock)
 
     def take_over(self, waiting: Membership[Member]) -> None:
-        """The vector environment begins for the workers that wait for it."""
+        """Take over the workers that wait for the vector environment, which begins for them."""
         self._server.send(self.coordinator.take_over(waiting, self.now()))
 
     @property
     def address(self) -> str:
-        """The address that workers connect to."""
+        """The address to which workers connect."""
         return self._link.address
 
     # ---------------------------------------------------------------- asking
 
     def send_order(self, lane: int, make: MakeOrder) -> None:
-        """Send an order to this lane, as soon as it has a worker. `take` returns what has come of it."""
+        """Send an order to this lane as soon as it has a worker. `take` returns the result."""
         self._waiting_orders[lane] = make
         self._waiting_since_s[lane] = self.now()
         self._send_waiting_orders()
 
     def send_steps(self, lanes: Sequence[int], *, together: bool) -> None:
-        """Step these lanes with the actions that are in shared memory. `together`: they are waited for together."""
+        """Step these lanes with the actions in shared memory. `together` says that the caller waits for all of them."""
         assert self.shared is not None
         self.shared.step(lanes, together=together)
 
     def can_share(self, lane: int) -> bool:
-        """Whether a step of this lane may go through shared memory: its worker has the memory, and has no other order.
+        """Whether a step of this lane may go through shared memory: its worker has the memory, and the lane has no order.
 
-        It has one if the wait for the answer was interrupted. The worker might execute it after the step.
+        The lane still has an order if the wait for its answer was interrupted. The worker might execute it after the step.
         """
         shared = self.shared
         coordinator = self.coordinator
@@ -117,10 +118,10 @@ class StepHub:
         return shared.pipes[lane] is not None
 
     def take(self) -> dict[int, Answer | bytes]:
-        """What has come of the newest orders, by lane: the answer that came as a message, or the packed infos of a step that
-        went through shared memory. It is forgotten here. A lane is not in it if nothing has come yet, or the lane is lost.
+        """Take the results of the newest orders, by lane: answers that arrived as messages, and packed infos of steps
+        through shared memory. A lane without a result yet, or that is lost, is left out.
         """
-        newest = self._newest_tickets  # another answer is of an earlier order
+        newest = self._newest_tickets  # an answer with another ticket belongs to an earlier order
         answers: dict[int, Answer | bytes] = {
             lane: answer for lane, answer in self.coordinator.answers.items() if answer.ticket == newest.get(lane)
         }
@@ -131,7 +132,7 @@ class StepHub:
         return answers
 
     def _long_infos(self, lane: int) -> bytes | None:
-        """The infos of a lane's step that are too long for the shared memory. None: they are still to come."""
+        """The infos of a lane's step that are too long for the shared memory; None if they have not arrived yet."""
         infos = self.coordinator.infos.get(lane)
         if infos is None and not self.coordinator.lanes[lane].started:
             return b""  # its worker is gone, and the lane is in `OrderCoordinator.take_lost`
@@ -140,12 +141,12 @@ class StepHub:
         return infos
 
     def is_ordered(self, lane: int) -> bool:
-        """Whether the lane has an order that is not answered, or waits for a worker to take it."""
+        """Whether the lane has an order that has not been answered, or that waits for a worker."""
         waits = lane in self._waiting_orders or lane in self._under_way
         return waits or self._newest_tickets.get(lane) in self.coordinator.orders
 
     def forget(self, lanes: Iterable[int]) -> None:
-        """The results of the last orders of these lanes were taken, or are not wanted any more."""
+        """Forget the last orders of these lanes, whose results were taken or are no longer wanted."""
         for lane in lanes:
             if self._under_way.pop(lane, None) is None or self.coordinator.infos or self._infos_to_come:
                 self.coordinator.forget(lane)
@@ -156,15 +157,15 @@ class StepHub:
     # ---------------------------------------------------------------- waiting
 
     def listen_if_due(self) -> None:
-        """Send the orders that can be sent, and read the messages that have come, if some may matter."""
+        """Send the orders that can be sent, and read the messages that have arrived if some may matter."""
         self._send_waiting_orders()
         if self._waiting_orders or self.coordinator.orders or self.now() > self._listen_due_s:
             self._turn(0.0)
 
     def wait(self, timeout_s: float, *, together: bool) -> None:
-        """Wait for a short time at most, until a lane may have a result; `together`: until all may.
+        """Wait, at most for a short time, until a lane may have a result or, if `together`, until all may have one.
 
-        `timeout_s`: how long a worker may take.
+        `timeout_s` is how many seconds a worker may take.
         """
         self._patience_s = min(PATIENCE_S, timeout_s / 2)
         self._send_waiting_orders()
@@ -180,7 +181,10 @@ class StepHub:
             self._turn(0.0)
 
     def give_up(self, lane: int, timeout_s: float) -> None:
-        """Give up the worker of a lane that took longer than this. Raises `NoWorkers` if the lane had none all the time."""
+        """Treat the worker of a lane that took longer than `timeout_s` as lost.
+
+        Raises `NoWorkers` if the lane had no worker all that time.
+        """
         if lane in self._waiting_orders:
             raise self.no_workers(timeout_s)
         member = self.coordinator.owner(lane)
@@ -205,22 +209,22 @@ class StepHub:
         self._server.send(self.coordinator.rebalance())
 
     def wait_for(self, workers: int, timeout_s: float) -> None:
-        """Wait until this number of `workers` have joined. Raises `NoWorkers`."""
+        """Wait until this number of `workers` have joined. Raises `NoWorkers` after `timeout_s`."""
         self._server.wait_for(workers, timeout_s, lambda: self._turn(POLL_S))
 
     def no_workers(self, timeout_s: float) -> NoWorkers:
-        """The error when no worker has been there for this long."""
+        """The error to raise when there has been no worker for this long."""
         return self._server.no_workers(1, timeout_s)
 
     def raise_failure(self) -> None:
-        """Raise `EnvironmentFailed` if an environment has raised since the last call."""
+        """Raise `EnvironmentFailed` if an environment has failed since the last call."""
         failure = self._failure
         self._failure = None
         if failure is not None:
             raise failure.exception()
 
     def close(self, timeout_s: float) -> None:
-        """Ask every worker to leave, wait a moment for their Goodbye, and end those that are ours."""
+        """Ask every worker to leave, wait up to `timeout_s` for their Goodbyes, and end this program's worker processes."""
         busy = bool(self.coordinator.orders or (self.shared is not None and self.shared.memory.unanswered_orders()))
         deadline_s = self.now() + (min(BUSY_S, timeout_s) if busy else timeout_s)
         self._server.send(self.coordinator.drain("the vector environment was closed"))
@@ -237,7 +241,7 @@ class StepHub:
         return status(self.coordinator, now, self.status_of_run)
 
     def happened(self, event: Event) -> None:
-        """A worker may have failed, or left: its lanes have no worker."""
+        """Handle an event: a worker may have failed, or left its lanes without a worker."""
         match event:
             case WorkerProcessFailed(spare=False):
                 self.on_death(event)
@@ -251,7 +255,7 @@ class StepHub:
                 pass
 
     def sent(self, peer: bytes) -> None:
-        """A worker that waits for steps through shared memory must be woken to read a message."""
+        """Wake the receiver of a message, which may be asleep until its next step through shared memory."""
         if self.shared is not None:
             self.shared.wake_for_message(peer)
 
@@ -273,7 +277,7 @@ class StepHub:
         if not self._waiting_orders:
             return
         ours = min(self._processes.expected, self._processes.left(collecting=False))
-        awaited = len(self.coordinator.membership.active()) < ours  # one of ours has yet to join
+        awaited = len(self.coordinator.membership.active()) < ours  # a process that this program started has yet to join
         now = self.now()
         for lane, make in list(self._waiting_orders.items()):
             if self.coordinator.place(lane, awaited and now - self._waiting_since_s[lane] < self._patience_s):

@@ -108,7 +108,7 @@ class SharedChannels:
     # ---------------------------------------------------------------- saving
 
     def saved(self, used: int) -> tuple[Bytes, Ints]:
-        """The distinct channels [M, H, W] of the first `used` slots, and for each slot the indices [used, C] of its channels.
+        """The distinct channels [M, H, W] of the first `used` slots, and the indices [used, C] of each slot's channels.
 
         Channels are in order of first occurrence. So the result depends on nothing but the images, and equal buffers give
         equal saved states.
