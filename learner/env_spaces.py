@@ -1,4 +1,4 @@
-"""The spaces and the time limit of an environment, as a run needs them. Pure; imports no torch."""
+"""The spaces and the time limit of an environment, in the form that a run needs. Pure; imports no torch."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ class EnvSpaces(NamedTuple):
     observation: tuple[Leaf, ...]
     action: ActionSpec
     max_episode_steps: int | None
-    """Time limit of an episode in env steps; None if there is none, or it is not known."""
+    """The time limit of an episode in env steps; None if there is none, or if it is not known."""
     masked: bool = False
     """Whether the run uses action masks. A mask in an observation isn't part of `observation`."""
     seats: tuple[str, ...] = ()
-    """The names of its agents, whose spaces these are; empty if it is gymnasium's."""
+    """The names of its agents, each of which has these spaces; empty for a gymnasium environment."""
     takes_turns: bool = False
     """Whether a seat may have to wait for others between two of its actions."""
     critic: tuple[Leaf, ...] = ()
-    """Further arrays of an observation, which only the critic sees."""
+    """Additional arrays of an observation, which only the critic sees."""
 
     @staticmethod
     def of_description(
@@ -36,7 +36,8 @@ class EnvSpaces(NamedTuple):
     ) -> EnvSpaces:
         """The spaces that a worker described.
 
-        Raises `UsageError` if a policy can't use them. `critic_keys`: keys of a Dict observation that only the critic sees.
+        `critic_keys` are keys of a Dict observation that only the critic sees. Raises `UsageError` if a policy can't use
+        these spaces.
         """
         observation = env.observation_space
         action = action_spec(env.action_space)
@@ -70,5 +71,5 @@ class EnvSpaces(NamedTuple):
 
     @staticmethod
     def of_policy(policy: PolicySpec, seats: tuple[str, ...] = ()) -> EnvSpaces:
-        """The spaces that a policy was made for."""
+        """The spaces for which a policy was made."""
         return EnvSpaces(policy.observation, policy.action, None, seats=seats, critic=policy.critic)

@@ -1,7 +1,7 @@
-"""What settings and public functions start in extras. The core imports an extra only when it is used.
+"""The objects in extras that settings and public functions start. The core imports an extra only when it is used.
 
-Rule: each entry is `module:name`, and the caller says which type of the core the object has. The core has similar tables for
-the other contributions of extras: commands (`millrace/cli/commands.py`), kinds of env copies
+Rule: each entry is `module:name`, and the caller declares which type of the core the object has. The core has similar tables
+for the other contributions of extras: commands (`millrace/cli/commands.py`), kinds of env copies
 (`protocol/envs/kinds_of_copies.py`) and environments (`protocol/env_spec.py`). It names extras nowhere else.
 """
 
@@ -25,16 +25,16 @@ STARTED_BY = {
     "metrics_bind": "millrace.extras.monitoring.prometheus:metrics_server",
     "tensorboard": "millrace.extras.monitoring.tensorboard:TensorBoardCallback",
 }
-"""setting, or public function -> `module:name`"""
+"""The `module:name` of the object that each setting or public function starts."""
 
 
 class Packages(NamedTuple):
-    """Packages of a setting that `pip install .` doesn't install."""
+    """Packages that a setting needs and that `pip install .` doesn't install."""
 
     modules: tuple[str, ...]
-    """as Python imports them"""
+    """the modules to import"""
     install: str
-    """as pip takes them"""
+    """the arguments of `pip install`"""
 
 
 MINARI = Packages(("minari", "h5py", "PIL"), "'minari[hdf5]' pillow")
@@ -47,7 +47,7 @@ NEEDED_BY = {
 
 
 def check_packages(config: Config) -> None:
-    """Raise `UsageError` if a setting needs a package that is not installed. Imports nothing, so it is quick."""
+    """Raise `UsageError` if a setting needs a package that is not installed. Quick, because it imports nothing."""
     for setting, (modules, install) in NEEDED_BY.items():
         missing = [module for module in modules if find_spec(module) is None]
         if getattr(config, setting) and missing:
@@ -56,5 +56,5 @@ def check_packages(config: Config) -> None:
 
 
 def started_by(setting: str) -> Any:
-    """Import the object that this setting starts, and return it."""
+    """Import and return the object that this setting or public function starts."""
     return resolve_name(STARTED_BY[setting])

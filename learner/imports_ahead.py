@@ -1,4 +1,4 @@
-"""Imports PyTorch and other modules of a run in a second thread, while workers start and describe the environment."""
+"""Imports PyTorch and the other modules of a run in a second thread, while workers start and describe the environment."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ class ImportsAhead:
     """The imports of one run, which begin at once."""
 
     def __init__(self, algo: str) -> None:
-        # The module of a user-defined algorithm was imported for its settings.
+        # The module of a user-defined algorithm has already been imported, for its settings.
         self._modules = (*MODULES, ALGORITHMS[algo].partition(":")[0]) if algo in ALGORITHMS else MODULES
         self._error: BaseException | None = None
-        # Not a daemon: a thread that the interpreter ends in the middle of importing PyTorch can crash the process.
+        # It isn't a daemon, because ending a thread in the middle of importing PyTorch can crash the process.
         self._thread = threading.Thread(target=self._import, name=THREAD)
         self._thread.start()
 
     def wait(self, check_interrupt: Callable[[], None]) -> None:
-        """Wait until everything is imported. Raises what an import raised, or what `check_interrupt` raises meanwhile."""
+        """Wait until everything is imported. Raises the exception of an import, or that of `check_interrupt`."""
         while self._thread.is_alive():
             self._thread.join(POLL_S)
             check_interrupt()
@@ -44,9 +44,9 @@ class ImportsAhead:
 
 
 def exit_if_importing(exit_code: int) -> None:
-    """End this process at once if an import is still running: the interpreter would wait for it, for seconds.
+    """End this process at once if an import is still running, because the interpreter would wait for it for seconds.
 
-    Call it last: nothing is cleaned up after it.
+    Call this last: if it ends the process, nothing else is cleaned up.
     """
     if any(thread.name == THREAD for thread in threading.enumerate()):
         logging.shutdown()

@@ -1,11 +1,11 @@
-"""SIGINT, SIGTERM and SIGHUP of a learner: the first ends the run, within the grace time if there is one.
+"""Handles SIGINT, SIGTERM and SIGHUP in a learner: the first one ends the run, within the grace time if there is one.
 
-Rule: the first signal lets the current update end; `time_is_up` says when it must be given up, so that the rest of the
-grace time is enough to save. A second SIGINT (Ctrl-C) ends the run at once. If there is a grace time, SIGTERM and SIGHUP may
-come again and change nothing: they often go to a process and to its group, and the time is limited already. SIGHUP says that
-the terminal is gone. A learner that was told to ignore it (`nohup`) continues to ignore it.
+Rule: after the first signal, the current update may still finish; `time_is_up` says when it must be abandoned, so that the
+rest of the grace time is enough to save. A second SIGINT (Ctrl-C) ends the run at once. If there is a grace time, further
+SIGTERMs and SIGHUPs change nothing, because they are often sent both to a process and to its group, and the time is limited
+anyway. SIGHUP means that the terminal is gone. A learner that was started to ignore it (`nohup`) goes on ignoring it.
 
-Rule: where there is nothing to save, a signal ends the program too, with the same exit code (`stopped_by_signals`).
+Rule: where there is nothing to save, a signal ends the program as well, with the same exit code (`stopped_by_signals`).
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from types import FrameType, TracebackType
 from typing import Any, Self
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-FOR_SAVING = 0.5  # the part of the grace time that an update must leave
-SAVE_TAKES = 1.5  # factor: saving takes at most this times the longest so far
+FOR_SAVING = 0.5  # the share of the grace time that an update must leave for saving
+SAVE_TAKES = 1.5  # the time allowed for saving, as a multiple of the longest save so far
 
-_stopped = False  # whether `Stopped` was raised: other code, such as an import or a finalizer, may have swallowed it
+_stopped = False  # whether `Stopped` was raised, because other code, such as an import or a finalizer, may have swallowed it
 Handler = Callable[[int, FrameType | None], None] | signal.Handlers
 
 
@@ -36,10 +36,10 @@ class Stopped(KeyboardInterrupt):
 
 @contextmanager
 def stopped_by_signals() -> Iterator[None]:
-    """While it is entered, the first signal raises `Stopped`.
+    """Inside this context, the first signal raises `Stopped`.
 
-    Later ones are ignored, because they would only cut the clean-up short. Blocked signals are delivered on entry. After the
-    exit, signals are ignored: at its end, Python would remove any other handler.
+    Later signals are ignored, because they would only cut the clean-up short. Blocked signals are delivered on entry. After
+    the exit, signals stay ignored, because Python would remove any other handler when the interpreter ends.
     """
     global _stopped
 
@@ -59,23 +59,23 @@ def stopped_by_signals() -> Iterator[None]:
 
 
 def _set(handler: Handler) -> dict[int, Any]:
-    """Set the handler of the signals that are not ignored. Returns those before."""
+    """Set the handler of the signals, except of SIGHUP if it is ignored. Returns the previous handlers."""
     heeded = [each for each in SIGNALS if each != signal.SIGHUP or signal.getsignal(each) != signal.SIG_IGN]
     return {each: signal.signal(each, handler) for each in heeded}
 
 
 class Interrupts:
-    """Counts signals while it is entered, and restores the handlers afterwards. Does nothing outside the main thread."""
+    """Notes signals inside the context, and restores the handlers afterwards. Does nothing outside the main thread."""
 
     def __init__(self, grace_s: float = 0.0) -> None:
-        """`grace_s`: seconds from the first signal to the end of the process; 0: any number."""
+        """`grace_s` is the number of seconds from the first signal to the end of the process; 0 means no limit."""
         self._grace_s = grace_s or math.inf
         self._end_s = math.inf
         self.received = False
         self._handlers_before: dict[int, Any] = {}
 
     def __enter__(self) -> Self:
-        with suppress(ValueError):  # not in the main thread, which handles signals itself
+        with suppress(ValueError):  # raised outside the main thread, where no handler can be set
             self._handlers_before = _set(self._note)
         if _stopped:
             self._note(0, None)
@@ -86,11 +86,11 @@ class Interrupts:
             signal.signal(number, handler)
 
     def at_most(self, seconds: float) -> float:
-        """These seconds, or fewer if the grace time ends before: how long to wait for something."""
+        """How long to wait for something: `seconds`, or less if the grace time ends sooner."""
         return max(0.0, min(seconds, self._end_s - monotonic()))
 
     def time_is_up(self, save_s: float) -> bool:
-        """Whether the current update must be given up. `save_s`: how long the longest checkpoint took."""
+        """Whether the current update must be abandoned. `save_s` is the longest time that a checkpoint took so far."""
         for_saving_s = max(FOR_SAVING * self._grace_s, SAVE_TAKES * save_s)
         return self.received and self._end_s < math.inf and monotonic() > self._end_s - for_saving_s
 
@@ -100,4 +100,4 @@ class Interrupts:
             self._end_s = monotonic() + self._grace_s
             for each, handler in self._handlers_before.items():
                 if each == signal.SIGINT or math.isinf(self._grace_s):
-                    signal.signal(each, handler)  # a second one has its effect without this class
+                    signal.signal(each, handler)  # a second signal goes to the handler that was set before

@@ -1,7 +1,7 @@
 """Makes the hub of a run from its settings, for millrace's training and for your own loop.
 
-Imports no torch. This file doesn't know who starts worker processes: the launchers in `millrace` pass in `WorkerProcesses`,
-with the lobby.
+It imports no torch. This file doesn't know who starts worker processes: the launchers in `millrace` pass in a
+`WorkerProcesses`, along with the lobby.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ def open_hub(
     past: PastRollouts | None = None,
     opponents: OpponentPool | None = None,
 ) -> Hub:
-    """The hub of a run, for the workers in this lobby, and for those that join later. It takes the lobby's place.
+    """Open the hub of a run, which takes over the lobby's workers and serves those that join later.
 
-    An update takes one rollout for each lane. `check_interrupt` is called while the hub waits: what it
-    raises ends the wait. `observer` is called each time the hub has listened. `past`: from the checkpoint of a resumed run.
-    `opponents`: those of a run with teams.
+    An update uses one rollout of each lane. `check_interrupt` is called while the hub waits, and an exception that it raises
+    ends the wait. `observer` is called each time the hub has listened. `past` is from the checkpoint of a resumed run.
+    `opponents` are those of a run with teams.
     """
     past = past or PastRollouts(Ledger(), ())
     rounds = Rounds(config.max_lag, past.rounds.next, past.rounds.versions)
@@ -63,7 +63,7 @@ def open_hub(
 
 
 def lobby_settings(config: RolloutConfig, progress: RunProgress = NO_PROGRESS) -> LobbySettings:
-    """The settings that matter before the run. `progress`: how far it is."""
+    """The settings that matter before the run begins. `progress` says how far a resumed run has got."""
     return LobbySettings(
         wait=WaitSpec(config.call_timeouts(), config.heartbeat_s()),
         worker_timeout_s=config.worker_timeout_s,

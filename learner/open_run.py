@@ -1,6 +1,6 @@
-"""Assembles a run: algorithm, hub, and everything that happens between two updates.
+"""Assembles a run: the algorithm, the hub, and everything that happens between two updates.
 
-Imports PyTorch. `learner/run_setup.py` describes the parts that must exist before. In a resumed run, nothing is written
+This file imports PyTorch. `learner/run_setup.py` has the parts that must exist before. For a resumed run, nothing is written
 before all checks have passed.
 """
 
@@ -55,14 +55,14 @@ log = logging.getLogger("millrace.learner")
 
 
 def open_run(setup: RunSetup, lobby: Lobby, watch: Watch, observer: HubObserver) -> OpenRun:
-    """Open the run of this setup, with the workers in the lobby. Its folder is ready. Raises `MillraceError`.
+    """Open the run of this setup, with the workers in the lobby. Its folder must be ready. Raises `MillraceError`.
 
-    `watch`: the callbacks of the run, or a function to call after each update. `observer` is called each time the hub has
-    listened. In a resumed run, nothing is written before all checks have passed.
+    `watch` are the callbacks of the run, or a function to call after each update. `observer` is called each time the hub has
+    listened. For a resumed run, nothing is written before all checks have passed.
     """
     callbacks = Callbacks.of(watch).with_named(setup.config.callbacks)
     if setup.config.tensorboard:
-        callbacks.add(started_by("tensorboard")(setup.folder))  # last, so that it gets what the others log
+        callbacks.add(started_by("tensorboard")(setup.folder))  # last, so that it gets the numbers that the others log
     if line := unused_setting(setup.config):
         log.warning("%s", line)
     with naming_run(setup.folder.shown if setup.resumed else None):
@@ -121,7 +121,7 @@ def _why_no_attributes(vector: str) -> str:
 
 
 def _opponent_pool(config: Config, spec: RunSpec, state: PoolState) -> OpponentPool | None:
-    """The opponents of the run, if the policy does not play all teams."""
+    """The opponents of the run; None if the policy plays all agents itself."""
     if not spec.teams:
         return None
     settings = PoolSettings(
@@ -140,9 +140,9 @@ def _use_threads(setup: RunSetup, policy: PolicySpec, processes: WorkerProcesses
     """Let PyTorch use the run's number of threads. Returns the setup with that number."""
     config = setup.config
     if config.torch_threads is None and config.shards > 1:
-        config = msgspec.structs.replace(config, torch_threads=1)  # the processes of a machine share its cores
+        config = msgspec.structs.replace(config, torch_threads=1)  # because several processes share a machine's cores
     elif config.torch_threads is None:
-        # Another number changes the last bits, so the run keeps it, wherever it is resumed or repeated.
+        # Another number of threads changes the last bits of results, so the run keeps this one wherever it is resumed.
         chosen = threads(policy, minibatch_rows(config), config.max_lag, processes.expected)
         config = msgspec.structs.replace(config, torch_threads=chosen.number)
         if chosen.line:
@@ -160,9 +160,9 @@ def _use_threads(setup: RunSetup, policy: PolicySpec, processes: WorkerProcesses
 
 
 def _new_algorithm(setup: RunSetup, spec: RunSpec) -> tuple[Algorithm, PriorData | None]:
-    """An algorithm that starts from another run, if the settings say so, and has its prior data.
+    """Make the algorithm of a run, and its prior data if there are any.
 
-    A resumed run has its own start.
+    The algorithm of a new run starts from another run if the settings say so; that of a resumed run is restored later.
     """
     config = setup.config
     folder = setup.folder
@@ -190,7 +190,7 @@ def _new_algorithm(setup: RunSetup, spec: RunSpec) -> tuple[Algorithm, PriorData
 
 @dataclass(frozen=True)
 class _InterruptiblePrior:
-    """Prior data whose reading `check` may end: it is called after each episode, and its exceptions pass through."""
+    """Prior data that calls `check` after it has read each episode, so that an exception of `check` can end the reading."""
 
     data: PriorData
     check: Callable[[], None]

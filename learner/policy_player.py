@@ -1,7 +1,7 @@
-"""A learner that doesn't train: it has workers play episodes with the policy of a run folder.
+"""A learner that doesn't train, but has workers play episodes with the policy of a run folder.
 
-Rule: the policy is published once, as version 1; a policy that plays against it, as version 0. The learner's process runs no
-    environment code. Timeouts and the number of allowed failures are those of a training run.
+Rule: the policy is published once, as version 1; a policy that plays against it is published as version 0. The learner's
+process runs no environment code. Timeouts and the number of allowed failures are those of a training run.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from millrace.protocol.specs import SCORE, ActionSpec, Leaf, PolicySpec, RunSpec
 
 RIVAL = 0
 POLICY = 1
-"""The versions of the weights."""
+"""The versions under which the rival's and the policy's weights are published."""
 
 
 class SavedPolicy(NamedTuple):
@@ -44,24 +44,24 @@ class SavedPolicy(NamedTuple):
     parameters: Floats
     buffers: Floats
     facts: tuple[str, ...] = ()
-    """names of the numbers that the run logs of each episode"""
+    """the names of the numbers that the run logs for each episode"""
     masked: bool = False
     """whether the environment says which actions are allowed"""
     seats: tuple[str, ...] = ()
-    """the names of its agents"""
+    """the names of the environment's agents"""
     teams: tuple[tuple[int, ...], ...] = ()
-    """the seats of each team, if it has met opponents"""
+    """the seats of each team, if the policy was trained against opponents"""
     against: StoredPolicy | None = None
-    """plays the other teams"""
+    """the policy that plays the other teams"""
 
 
 def saved_policy(
     run: Path, which: Which = "final", *, env: EnvLike | None = None, wrappers: Sequence[WrapperLike] | None = None
 ) -> SavedPolicy:
-    """Read a policy of a run folder, and find its environment and wrappers by the names that the run remembers.
+    """Read a policy of a run folder, and find its environment and wrappers by the names that the run has saved.
 
-    `env`, `wrappers`: take these instead. Raises `UsageError`, with a one-line message, if it cannot be read, or they cannot
-    be found.
+    `env` and `wrappers` override them. Raises `UsageError`, with a one-line message, if the policy cannot be read, or if the
+    environment or a wrapper cannot be found.
     """
     card, parameters, buffers = RunFolder.open_policy(run).read_policy(which)
     refuse_modules_in(run, (*([card.env] if env is None else []), *(card.wrappers if wrappers is None else [])))
@@ -82,10 +82,11 @@ class PolicyPlayer:
         settings: RolloutConfig,
         described: DescribedEnv | None = None,
     ) -> None:
-        """`check_interrupt` is called while it waits: what it raises ends the wait. `settings`: timeouts and failures.
+        """`settings` has the timeouts and the number of allowed failures.
 
-        `watch` is called several times a second with how far it is, as text. `described`: the environment, if a worker has
-        described it. Raises `UsageError` if one policy cannot play against the other.
+        `check_interrupt` is called while this waits, and an exception that it raises ends the wait. `watch` is called
+        several times a second with a text that says how far the episodes have got. `described` is the environment, if a
+        worker has already described it. Raises `UsageError` if one policy cannot play against the other.
         """
         self.policy = policy
         if policy.against is not None:
@@ -110,11 +111,14 @@ class PolicyPlayer:
 
     @property
     def workers(self) -> int:
-        """Number of workers that have joined since the first `play`."""
+        """The number of workers that are connected, once `play` has been called."""
         return 0 if self._hub is None else len(self._hub.snapshot().roles)
 
     def describe(self, render_mode: str | None = None) -> DescribedEnv:
-        """Have a worker describe the environment of evaluations, before the first `play`. Raises `UserFacingError`."""
+        """Have a worker describe the environment of evaluations. Call this before the first `play`.
+
+        Raises `UserFacingError` if that fails.
+        """
         if self._described is not None:
             return self._described
         unknown = Unknown(self.policy.env.for_evaluation(), render_mode=render_mode)
@@ -128,11 +132,11 @@ class PolicyPlayer:
         bound: str = "at most",
         before: tuple[int, int] = (0, 0),
     ) -> list[PlayedEpisode]:
-        """Play these episodes. Returns them in the order of the seeds. Raises `RunError` if that is not possible.
+        """Play the episodes of this plan. Returns them in the order of the seeds. Raises `RunError` if that is not possible.
 
-        Against another policy, both sample their actions, because two greedy ones would repeat the same few games.
+        Against another policy, both policies sample their actions, because two greedy ones would repeat the same few games.
 
-        `bound` and `before` are those of `EvaluationPlan.how_far`, which makes the text that `watch` gets.
+        `bound` and `before` are arguments of `EvaluationPlan.how_far`, which makes the text for `watch`.
         """
         if self._hub is None:
             self._hub = self._published()
@@ -149,7 +153,7 @@ class PolicyPlayer:
 
     def _published(self) -> Hub:
         policy = self.policy
-        # One for each worker of this program, because only then its failures count.
+        # One lane for each worker of this program, because the failures of a worker without a lane don't count.
         lanes = max(1, self._lobby.processes.expected)
         settings = msgspec.structs.replace(self._settings, lanes=lanes)
         run = RunSpec(
@@ -162,7 +166,7 @@ class PolicyPlayer:
             facts=policy.facts,
             masked=policy.masked,
             seats=policy.seats,
-            takes_turns=bool(policy.seats),  # may be False
+            takes_turns=bool(policy.seats),  # with several agents, they may take turns
             call_timeouts=settings.call_timeouts(),
             heartbeat_s=settings.heartbeat_s(),
         )
@@ -179,7 +183,7 @@ class PolicyPlayer:
 
 
 def _check_rival(policy: SavedPolicy, against: StoredPolicy) -> None:
-    """Raises `UsageError` unless this policy can play against the other one."""
+    """Raise `UsageError` unless this policy can play against the other one."""
     rival = against.card
     if len(policy.seats) < 2:
         raise UsageError(f"against: expected an environment of several agents, got {policy.env.id}")
@@ -198,7 +202,7 @@ def _check_rival(policy: SavedPolicy, against: StoredPolicy) -> None:
 
 
 def _in_words(compared: Any) -> str:
-    """Leaves by path, dtype and shape; all else as it is."""
+    """A compared value in words: leaves as path, dtype and shape, action spaces as kind and size, the rest as it is."""
     match compared:
         case tuple((Leaf(), *_)):
             return ", ".join(f"{leaf.path or 'one array'} {leaf.dtype}{list(leaf.shape)}" for leaf in compared)
@@ -210,5 +214,5 @@ def _in_words(compared: Any) -> str:
 
 
 def useful_workers(workers: int, episodes: int, copies: int) -> int:
-    """At most this number of workers: no more than there are tickets."""
+    """The number of workers that can be used: `workers`, but at most one for each ticket."""
     return min(workers, math.ceil(episodes / copies))

@@ -1,9 +1,8 @@
-"""Finds the calls of the pickle in a checkpoint before torch's loader makes them.
+"""Checks the calls in a checkpoint's pickle before torch's loader makes them. Pure.
 
-Pure: bytes in. Rule: a pickle may contain only what torch.save writes for tensors and plain data. torch's loader for
-untrusted files (`weights_only`) doesn't run their code, but calls `bytearray` with any length, and copies a container or a
-text as often as the file says, so a few bytes could fill the memory. Here the pickle is interpreted without making its
-objects.
+Rule: a pickle may contain only what torch.save writes for tensors and plain data. torch's loader for untrusted files
+(`weights_only`) doesn't run their code, but it calls `bytearray` with any length, and copies a container or a text as many
+times as the file says, so a few bytes could fill the memory. This file interprets the pickle without making its objects.
 """
 
 from __future__ import annotations
@@ -15,18 +14,19 @@ VALUES = {"NONE", "NEWTRUE", "NEWFALSE", "BININT", "BININT1", "BININT2", "LONG1"
 CONTAINERS = {"EMPTY_LIST", "EMPTY_DICT"}
 TUPLES = {"EMPTY_TUPLE": 0, "TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3}
 ADD = {"APPEND": 1, "SETITEM": 2}
-"""Opcodes, as pickletools explains them, and how many items of the stack they take. torch.save writes protocol 2."""
+"""The opcodes that are allowed, by the names of pickletools, and how many items they pop from the stack. torch.save writes
+protocol 2."""
 
 REBUILD = {f"torch._utils {name}" for name in ("_rebuild_tensor_v2", "_rebuild_tensor_v3", "_rebuild_parameter")}
-"""They make a view of a storage, whose size is checked once it exists."""
-HOOKS = "collections OrderedDict"  # of a tensor: it has none
-BYTES = "_codecs encode"  # a bytes object is written as text
+"""Functions that make a view of a storage. torch checks the size of the view when it makes it."""
+HOOKS = "collections OrderedDict"  # the empty dict of a tensor's hooks
+BYTES = "_codecs encode"  # makes a bytes object, which is written as text
 CALLED = REBUILD | {HOOKS, BYTES}
-TYPES = ("torch ", "torch.storage ")  # how the names of storages and dtypes begin, which nobody calls
+TYPES = ("torch ", "torch.storage ")  # how the names of storage types and dtypes begin, which aren't called
 
 
 class Unfit(Exception):
-    """The pickle contains something else. The text says what."""
+    """The pickle contains something that isn't allowed. The message says what."""
 
 
 class _Function(NamedTuple):
@@ -34,7 +34,10 @@ class _Function(NamedTuple):
 
 
 def rehearse(content: bytes) -> None:
-    """Follow a pickle to its end. Raises `Unfit`, or what `pickletools` and an empty stack raise for damaged bytes."""
+    """Interpret a pickle to its end. Raises `Unfit` for anything that isn't allowed.
+
+    Damaged bytes raise other exceptions, from `pickletools` or from an empty stack.
+    """
     stack = list[object]()
     marks = list[int]()
     notes = dict[int, object]()
@@ -61,7 +64,7 @@ def rehearse(content: bytes) -> None:
                 notes[note] = stack[-1]
             case "BINGET" | "LONG_BINGET", int(note):
                 stack.append(notes[note])
-            case "BINPERSID", _:  # a storage: torch reads what is in the file
+            case "BINPERSID", _:  # a storage, whose content torch reads from elsewhere in the file
                 stack[-1] = None
             case "GLOBAL", str(name) if name in CALLED or name.startswith(TYPES):
                 stack.append(_Function(name))
@@ -78,7 +81,7 @@ def rehearse(content: bytes) -> None:
 
 
 def _gather(stack: list[object], first: int) -> None:
-    """Make a tuple of the items on the stack from this index on."""
+    """Replace the items on the stack, from this index on, with a tuple of them."""
     stack[first:] = [tuple(stack[first:])]
 
 

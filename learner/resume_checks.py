@@ -1,7 +1,7 @@
-"""Checks before a run is resumed: that the settings and the environment still fit its weights and state.
+"""Checks, before a run is resumed, that the settings and the environment still fit its weights and state.
 
 Rule: all checks are made before anything is written into the run folder, so a refused resume changes nothing. A launcher
-gets a `Resumption`, which only `unless_finished` makes, so no launcher can skip the check.
+needs a `Resumption`, which only `unless_finished` makes, so no launcher can skip the checks.
 """
 
 from __future__ import annotations
@@ -30,32 +30,32 @@ class Resumption(NamedTuple):
 
     run: Path
     differences: tuple[str, ...]
-    """Lines about what will be different."""
+    """Lines for the user about what will be different."""
 
 
 def unless_finished(config: Config, resume: Path | None, train: Callable[[Resumption | None], Path]) -> Path:
-    """Check the run to `resume`, if there is one, then train. Returns the run folder.
+    """Check the run to `resume`, if there is one, then call `train`. Returns the run folder.
 
-    A run that is finished returns at once: then no worker is needed. Raises `UsageError` if there is no such run, or if it
-    cannot be resumed with these settings, and what `train` raises.
+    For a run that is finished, returns at once, so that no worker is started. Raises `UsageError` if there is no such run or
+    it cannot be resumed with these settings, and whatever `train` raises.
     """
     if resume is None:
         if config.start_from:
-            policy_to_start_from(config)  # so that a wrong folder is found before anything starts
+            policy_to_start_from(config)  # so that a wrong folder is reported before anything starts
         return train(None)
     lines = check_settings(config, resume)
     return resume if _is_finished(config, RunFolder.open(resume)) else train(Resumption(resume, tuple(lines)))
 
 
 def policy_to_start_from(config: Config) -> StoredPolicy:
-    """The policy that a new run starts from. Raises `UsageError`."""
+    """The policy from which a new run starts. Raises `UsageError` if it can't be read."""
     return RunFolder.open_policy(Path(config.start_from)).read_policy("best" if config.from_parts == "best" else "final")
 
 
 def check_settings(config: Config, run: Path) -> list[str]:
     """Check that the run in this folder can be resumed with these settings. Returns lines about what will be different.
 
-    Raises `UsageError`, which names the fixed settings that differ, or if this isn't a run folder.
+    Raises `UsageError` if this isn't a run folder, or if fixed settings differ, which it names.
     """
     RunFolder.open(run)
     before = _with_present_names(config_of_run(run, config.algo), config)
@@ -74,7 +74,7 @@ def check_settings(config: Config, run: Path) -> list[str]:
 
 
 def check_spaces(run: Path, made_for: EnvSpaces, now: EnvSpaces) -> None:
-    """Check that the environment has the spaces and agents that the policy was made for. Raises `UsageError` if not."""
+    """Raise `UsageError` unless the environment has the spaces and agents for which the policy was made."""
     for what, expected, got in (
         ("agents", (made_for.seats,), (now.seats,)),
         ("observations", made_for.observation, now.observation),
@@ -88,7 +88,7 @@ def check_spaces(run: Path, made_for: EnvSpaces, now: EnvSpaces) -> None:
 
 
 def first_difference(expected: Iterable[object], got: Iterable[object]) -> tuple[str, str] | None:
-    """The first two that differ, or else the two counts, as text in one line; None if all are equal."""
+    """The first two items that differ, or two different counts, as one line of text each; None if all are equal."""
     expected = [*expected]
     got = [*got]
     for one, other in zip(expected, got, strict=False):
@@ -98,7 +98,7 @@ def first_difference(expected: Iterable[object], got: Iterable[object]) -> tuple
 
 
 def _with_present_names(before: Config, now: Config) -> Config:
-    """The settings of a run, with the names that its environment and wrappers have now, if they were moved to a module."""
+    """The settings of a run, with the current names of its environment and wrappers if these were moved to a module."""
     wrappers_moved = len(before.wrappers) == len(now.wrappers) and all(map(moved, before.wrappers, now.wrappers))
     return msgspec.structs.replace(
         before,
@@ -108,7 +108,7 @@ def _with_present_names(before: Config, now: Config) -> Config:
 
 
 def _is_finished(config: Config, folder: RunFolder) -> bool:
-    """Whether the run has nothing left to do: it ended for a reason that is also true with this configuration."""
+    """Whether the run has nothing left to do, because the reason for which it ended holds with this configuration, too."""
     summary = folder.summary()
     if summary is None or summary.evaluation is None:
         return False
@@ -143,7 +143,7 @@ def _differences(before: Config, config: Config, changed: Sequence[Change]) -> l
 
 @contextmanager
 def naming_run(run: Path | None) -> Iterator[None]:
-    """Let errors name the run that is resumed, because its settings may be wrong in its folder; None: a new run."""
+    """Let errors name the run that is resumed, because the wrong setting may be in its folder. None for a new run."""
     try:
         yield
     except UsageError as error:

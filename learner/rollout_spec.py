@@ -1,6 +1,6 @@
-"""The specification that `Welcome` brings to the workers of a run, for millrace's training and for your own loop.
+"""Makes the specification of a run that `Welcome` sends to workers, for millrace's training and for your own loop.
 
-Imports no torch.
+It imports no torch.
 """
 
 from __future__ import annotations
@@ -28,10 +28,11 @@ def rollout_spec(
     teams: tuple[tuple[int, ...], ...] = (),
     scripted: tuple[str, ...] = (),
 ) -> RunSpec:
-    """The specification that `Welcome` carries. Raises `UsageError` if it cannot be sent, or settings and policy do not fit.
+    """The specification that `Welcome` sends to workers.
 
-    `rollout_steps`: T, the env steps of a rollout. `extras`: further arrays of each, which the user's own policy returns.
-    `spaces`: those of the environment. `teams`, `scripted`: of a run with opponents.
+    `rollout_steps` is T, the number of steps of a rollout. `extras` are additional arrays of a rollout, which the user's own
+    policy returns. `spaces` are those of the environment. `teams` and `scripted` are those of a run with opponents. Raises
+    `UsageError` if the specification cannot be sent, or if settings, environment and policy do not fit together.
     """
     masked, seats = spaces.masked, spaces.seats
     if masked and not has_masks(config.vector):
@@ -71,7 +72,10 @@ def rollout_spec(
 
 
 def _check_weights_can_be_sent(env: str, policy: PolicySpec, config: RolloutConfig) -> None:
-    """Also a space of few arrays may make a policy too large to allocate: a `Discrete` of 2**53 values."""
+    """Raise `UsageError` if the policy's weights don't fit into a message.
+
+    Even a space of few arrays, such as a `Discrete` of 2**53 values, may make a policy too large to allocate.
+    """
     size = acting_size(policy) * (4 if config.acting_dtype == "float32" else 2)
     if size > MAX_FRAME_BYTES:
         raise UsageError(

@@ -1,4 +1,4 @@
-"""An open run, whose learner listens to its workers. `open_run.py` makes it; `whole_run.py` trains it to its end."""
+"""An open run, whose learner listens to its workers. `open_run.py` opens it; `whole_run.py` trains it to its end."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ class OpenRun:
     setup: RunSetup
     parts: RunParts
     files: RunFiles
-    """writes"""
+    """writes the files of the run"""
     audience: Audience
-    """tells"""
+    """reports the progress of the run"""
     evaluations: Evaluations
-    """evaluates"""
+    """evaluates the policy"""
     prior: PriorData | None = None
-    """The data that the run learns from besides its own, if there are any."""
+    """the dataset that the run learns from besides its own rollouts, if there is one"""
 
     def check_time(self) -> None:
-        """Raises `Interrupted` if the grace time of an interrupted run is up."""
+        """Raise `Interrupted` if the grace time of an interrupted run is up."""
         if self.setup.interrupts.time_is_up(self.files.longest_save_s):
             raise Interrupted(self.setup.folder.shown)

@@ -1,7 +1,7 @@
-"""The line that sums up a run: its state, its progress, its return. Reads little of a run folder.
+"""The line that sums up a run: its state, its progress and its return. For this, only a few files of a run folder are read.
 
-Rule: a folder that can't be read also has a line, which says why. Nothing records that a run died, so this is inferred: no
-    process trains it, and it has no results.
+Rule: a folder that can't be read gets a line, too, which says why. Nothing records that a run died, so this is inferred if
+no process trains the run and it has no results.
 """
 
 from __future__ import annotations
@@ -35,46 +35,46 @@ from millrace.protocol.errors import UsageError
 from millrace.protocol.progress import RunProgress
 
 RunCondition = Literal["training", "finished", "interrupted", "dead", "unreadable"]
-MOST_RUNS = 1_000  # of a folder
-MOST_REASON = 40  # characters
+MOST_RUNS = 1_000  # the most runs that are listed
+MOST_REASON = 40  # the most characters of a reason
 STARTED = re.compile(r"-(\d{8}-\d{6})(?:-\d{1,9})?")
 
 
 class RunLine(NamedTuple):
-    """One run, in short."""
+    """The main facts about one run."""
 
     path: Path
     state: RunCondition
     owner: Owner | None = None
-    """who trains it"""
+    """the process that trains it, if there is one"""
     env: str = ""
     algo: str = ""
     seed: int = 0
     started: str = ""
     progress: RunProgress = RunProgress()
-    """how far it is"""
+    """how far it has got"""
     summary: Summary | None = None
     problem: str = ""
-    """why it cannot be read"""
+    """why it cannot be read; empty if it can"""
 
     @property
     def name(self) -> str:
-        """The name of its folder, safe to show."""
+        """The name of the run's folder, safe to show."""
         return one_line(self.path.resolve().name, MAX_NAME)
 
     @property
     def begins(self) -> bool:
-        """Whether it trains, but its progress isn't known: its folder has no numbers before the first update."""
+        """Whether the run trains but its progress isn't known, because there are no numbers before the first update."""
         return self.state == "training" and not (self.progress.updates or self.progress.env_steps_made)
 
     @property
     def has_numbers(self) -> bool:
-        """Whether its progress is known. A power failure may destroy the file that has it."""
+        """Whether the run's progress is known. A power failure may have destroyed the file that has it."""
         return not self.begins and (self.summary is not None or self.progress.at_s > 0.0)
 
     @property
     def done(self) -> str:
-        """How much of it is done, or why it ended early."""
+        """How much of the run is done, or why it ended early."""
         if self.begins:
             return "before its first update"
         if not self.has_numbers:
@@ -86,12 +86,15 @@ class RunLine(NamedTuple):
 
     @property
     def left_s(self) -> float | None:
-        """Seconds of training that are left, at the speed so far; None if that is not known."""
+        """Seconds of training that are left at the speed so far; None if that is not known."""
         return self.progress.left_s if self.state == "training" else None
 
 
 def find_runs(folders: Iterable[Path]) -> list[Path]:
-    """The run folders among these and directly in them, the newest first. Raises `UsageError` if one isn't a folder."""
+    """The run folders among these folders, and directly inside them, the newest first.
+
+    Raises `UsageError` if one of `folders` can't be read as a folder.
+    """
     runs: dict[Path, None] = {}
     for folder in folders:
         try:
@@ -103,7 +106,7 @@ def find_runs(folders: Iterable[Path]) -> list[Path]:
 
 
 def read_line(path: Path, now: float) -> RunLine:
-    """Read a run folder. `now` is wall-clock time."""
+    """Read the main facts about the run in a folder. `now` is wall-clock time."""
     try:
         check_format(path)
         config = read_config(path)
@@ -134,7 +137,7 @@ def read_line(path: Path, now: float) -> RunLine:
 
 
 def headline(line: RunLine) -> str:
-    """One sentence: how the run ended, or that it died, and how to continue it. Of one that trains, how far it is."""
+    """A sentence about the run: how far it has got, how it ended, or that it died; and how to continue it."""
     resume = f"continue it with: {one_line(resume_command(line.path, elsewhere=False))}"
     match line.state:
         case "training" if line.begins:
@@ -172,7 +175,7 @@ def algorithm_label(algo: str) -> str:
 
 
 def _started(path: Path) -> str:
-    """When it began: as its folder's name says, or else as old as its run.json."""
+    """When the run began, according to the name of its folder or, if that has no time, to the age of its run.json."""
     stamp = STARTED.search(path.name)
     try:
         began = time.strptime(stamp[1], "%Y%m%d-%H%M%S") if stamp else time.localtime((path / RUN_FILE).lstat().st_mtime)

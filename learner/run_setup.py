@@ -1,8 +1,9 @@
 """The parts of a run that exist before PyTorch is imported: its folder, the described environment, and its interrupts.
 
-The order is: bind the link; make or open the run folder; start the workers (a launcher does that); let one of them describe
-the environment, while another thread imports PyTorch (`known_environment`); open the `Run` (`learner/open_run.py`), which
-takes over the workers; train. This file does not know who the workers are, and the learner runs no code of the environment.
+A run is set up in this order: bind the link; make or open the run folder; start the workers (a launcher does that); let one
+of them describe the environment, while another thread imports PyTorch (`known_environment`); open the run
+(`learner/open_run.py`), which takes over the workers; train. This file does not know who starts the workers, and the learner
+runs no code of the environment.
 """
 
 from __future__ import annotations
@@ -45,39 +46,39 @@ log = logging.getLogger("millrace.learner")
 
 
 def stopped(resumed: Path | None) -> KeyboardInterrupt:
-    """The exception if the user stops the program before it trains. `resumed`: the run that it was to resume, if any."""
+    """The exception to raise if the user stops the program before it trains. `resumed` is the run to resume, if any."""
     return KeyboardInterrupt() if resumed is None else Interrupted(resumed)
 
 
 @dataclass(frozen=True)
 class KnownEnvironment:
-    """What a run must know of its environment before it begins."""
+    """What a run must know about its environment before it begins."""
 
     env: EnvSpec
     spaces: EnvSpaces
     described: DescribedEnv
-    """The environment that a worker described."""
+    """A worker's description of the environment."""
     evaluation_limit: int | None
-    """Env steps after which an episode of an evaluation is truncated, if it is."""
+    """The number of env steps after which an evaluation episode is truncated; None without a limit."""
 
 
 @dataclass(frozen=True)
 class RunSetup:
-    """The parts of a run that exist before the `Run`."""
+    """The parts of a run that exist before the `OpenRun`."""
 
     config: Config
     known: KnownEnvironment
     folder: RunFolder
     resumed: bool
     interrupts: Interrupts
-    """Entered: signals are noted from now on."""
+    """Must be entered, so that signals are noted."""
     elsewhere: bool = False
-    """Whether its workers are started elsewhere, and not by this program."""
+    """Whether the workers are started elsewhere, and not by this program."""
     learners: Learners | None = None
-    """The processes that share the updates, in a run with shards."""
+    """The learner processes of a run with shards, which share the updates."""
 
     def announce(self, bound: Bound) -> None:
-        """Write into the lock of the run folder that `millrace status` may ask at this address, or why it can't."""
+        """Write to the lock of the run folder at which address `millrace status` can ask, or why it can't."""
         address = bound.link.address
         keyring = bound.keyring
         lock = self.folder.lock
@@ -93,12 +94,12 @@ class RunSetup:
             lock.announce(Listens(others, own_address(address), keys))
 
     def check_interrupt(self) -> None:
-        """Raises `KeyboardInterrupt` if the user has stopped the program, before there is anything to save."""
+        """Raise `KeyboardInterrupt` if the user has stopped the program. Call this while there is nothing to save."""
         if self.interrupts.received:
             raise stopped(self.folder.shown if self.resumed else None)
 
     def check_running(self) -> None:
-        """Raises `Interrupted` if the user has interrupted the run, and `RunTakenOver` if another process trains it."""
+        """Raise `Interrupted` if the user has interrupted the run, and `RunTakenOver` if another process trains it."""
         if self.interrupts.received:
             raise Interrupted(self.folder.shown)
         if self.folder.lock is not None:
@@ -107,9 +108,10 @@ class RunSetup:
 
 @contextmanager
 def run_folder(config: Config, resume: Resumption | None) -> Iterator[RunFolder]:
-    """A new run folder, or the folder of the run to `resume`, locked. A new one is removed if no `Run` can be made of it.
+    """Make a new run folder, or open that of the run to `resume`, and lock it. If the body raises, a new one is removed.
 
-    A page shows it meanwhile, if `config` says so. Raises `UsageError`, also if another process trains the run.
+    Inside the context, a page shows the run if `config` says so. A new folder is not removed once the run has begun. Raises
+    `UsageError` if the folder can't be used, or if another process trains the run.
     """
     folder = RunFolder.create(config) if resume is None else RunFolder.open(resume.run)
     folder.stay()
@@ -124,7 +126,7 @@ def run_folder(config: Config, resume: Resumption | None) -> Iterator[RunFolder]
 
 
 def _page_beside(config: Config, run: Path) -> AbstractContextManager[None]:
-    """Shows the run in a browser while it is entered, if that is wanted."""
+    """A context that shows the run in a browser, if `config` says so."""
     if not config.dashboard:
         return nullcontext()
     page: AbstractContextManager[None] = started_by("dashboard")(run)
@@ -136,7 +138,7 @@ def _spaces(config: Config, env: DescribedEnv) -> EnvSpaces:
 
 
 def check_evaluation_spaces(config: Config, training: DescribedEnv, evaluation: DescribedEnv) -> None:
-    """Raises `UsageError` if an environment with `eval_env_kwargs` has other spaces than one without them."""
+    """Raise `UsageError` if the environment has other spaces or agents with `eval_env_kwargs` than without them."""
     expected, got = (
         EnvSpaces.of_description(env, config.action_masks, config.critic_keys) for env in (training, evaluation)
     )
@@ -156,11 +158,11 @@ def named_environment(config: Config) -> EnvSpec:
 
 
 def known_environment(config: Config, env: EnvSpec, resume: Resumption | None, lobby: Lobby) -> KnownEnvironment:
-    """The environment, as a worker in the lobby describes it. Meanwhile another thread imports PyTorch.
+    """Let a worker in the lobby describe the environment. Meanwhile, another thread imports PyTorch.
 
     For a run to `resume`, only an environment with the spaces of the run's policy is accepted. Raises `UsageError` if there
-    is no such environment, or no policy for it; `RunError` if no worker describes it in time; and `KeyboardInterrupt` if
-    the user stops the program.
+    is no such environment, or if no policy can use it; `RunError` if no worker describes it in time; and
+    `KeyboardInterrupt` if the user stops the program.
     """
     imports = ImportsAhead(config.algo)
     with Interrupts() as interrupts:
@@ -180,7 +182,7 @@ def known_environment(config: Config, env: EnvSpec, resume: Resumption | None, l
             lobby.listen()
 
         evaluation = lobby.describe(Unknown(env.for_evaluation()), check_interrupt) if env.eval_kwargs else None
-        # The training's comes last, because its copy is kept for the first lane.
+        # The training environment is described last, because its copy is then kept for the first lane.
         described = lobby.describe(Unknown(env, config.vector, accept=accept), check_interrupt)
         if evaluation is None:
             evaluation = described
@@ -200,7 +202,7 @@ def known_environment(config: Config, env: EnvSpec, resume: Resumption | None, l
 
 
 def prometheus_observer(config: Config) -> AbstractContextManager[HubObserver]:
-    """Serves metrics at `config.metrics_bind` while it is entered; without an address it imports no HTTP server."""
+    """A context that serves metrics at `config.metrics_bind`. Without an address, no HTTP server is imported."""
     if not config.metrics_bind:
         return nullcontext(lambda hub: None)
     server: AbstractContextManager[HubObserver] = started_by("metrics_bind")(config)

@@ -1,4 +1,4 @@
-"""The specification of a training run for its workers: its policy is the one that the algorithm trains."""
+"""Makes the specification of a training run for its workers. Its policy is the one that the algorithm trains."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from millrace.protocol.specs import SCORE, PolicySpec, RunSpec
 
 
 def run_spec(config: Config, env: EnvSpec, spaces: EnvSpaces) -> RunSpec:
-    """The specification that `Welcome` carries. Raises `UsageError` if algorithm, settings and spaces do not fit together.
+    """The specification that `Welcome` sends to workers. `spaces` are those of `env`.
 
-    `spaces` are those of `env`.
+    Raises `UsageError` if algorithm, settings and spaces do not fit together.
     """
     policy = _policy_spec(config, spaces)
     if algorithm_class(config.algo).whole_episodes:
@@ -37,7 +37,7 @@ def run_spec(config: Config, env: EnvSpec, spaces: EnvSpaces) -> RunSpec:
 
 
 def _teams(config: Config, seats: tuple[str, ...]) -> tuple[tuple[int, ...], ...]:
-    """The seats of each team, if the run has opponents. Raises `UsageError`."""
+    """The seats of each team; empty without opponents. Raises `UsageError` if settings and agents don't fit together."""
     if not (config.self_play or config.opponents):
         if config.teams:
             raise UsageError("teams: expected none without opponents; give self_play, or opponents")
@@ -69,7 +69,7 @@ def _policy_spec(config: Config, spaces: EnvSpaces) -> PolicySpec:
 
 
 def _check_room_for_whole_episodes(config: Config, max_episode_steps: int | None) -> None:
-    """A rollout must hold the longest episode and the row before it that resets the env copy."""
+    """Raise `UsageError` unless a rollout holds the longest episode and the row before it, which resets the env copy."""
     steps = config.algorithm.rollout_steps
     if max_episode_steps is not None and steps <= max_episode_steps:
         raise UsageError(

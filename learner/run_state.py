@@ -1,7 +1,7 @@
 """The state of a run: the content of a checkpoint besides the algorithm's own state, and how it is restored.
 
-A run that is resumed takes all of it (`restore`). A new run may take a part of another run's (`start_from`): only numbers,
-for a policy that its own settings describe. Modules that the other folder names are not imported.
+A resumed run restores all of it (`restore`). A new run may take over a part of another run's state (`start_from`), but only
+numbers, for a policy that its own settings describe. Modules that the other run folder names are not imported.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ from millrace.protocol.specs import PolicySpec
 log = logging.getLogger("millrace.learner")
 
 MISFITS = (LookupError, ValueError, TypeError, AttributeError, ArithmeticError, RuntimeError, MemoryError, BadMessage)
-"""Exceptions from loading a state of another form."""
-POLICIES = ("best_policy", "pending_policy", "opponent_policies")  # of a `RunState`; a checkpoint has them as tensors
+"""The exceptions that loading a state of another form may raise."""
+POLICIES = ("best_policy", "pending_policy", "opponent_policies")  # fields of `RunState` that checkpoints store as tensors
 RECORDS: dict[str, type[msgspec.Struct]] = {"lanes": LanePast, "acting": Weights}
-"""Of a `RunState`; a checkpoint has them as bytes."""
+"""The fields of `RunState` that checkpoints store as bytes, and the type of their records."""
 BESIDES = {"policy": "", "critic": ", critic", "all": ", critic, optimizers"}
 
 
@@ -53,35 +53,35 @@ class RunState(msgspec.Struct, kw_only=True):
     """The next incarnation of each lane."""
     rounds: RoundsState = RoundsState()
     lanes: Any = ()
-    """The past of each lane, `LanePast`."""
+    """The past of each lane, a sequence of `LanePast`."""
     acting: Any = ()
-    """The weights of open rounds, without the newest, `Weights`."""
+    """The weights that act in open rounds, without the newest, a sequence of `Weights`."""
     episodes: list[Episode] = []
     """The episodes of the `EpisodeWindow`."""
     facts: list[str] = []
-    """Names of the facts of these episodes."""
+    """The names of the facts of these episodes."""
     env_attributes: AttributesState = msgspec.field(default_factory=AttributesState)
-    """Attributes of env copies that callbacks set."""
+    """The attributes that callbacks have set on env copies."""
     best: tuple[Real, Natural] | None = None
-    """Mean return and env steps of the best evaluation."""
+    """The mean return of the best evaluation, and the env steps of its policy."""
     best_policy: Any = None
     """Parameters [P] and buffers of the best policy, both float32."""
     newest_evaluation: Evaluation | None = None
     evaluated: EvaluatedPolicy = EvaluatedPolicy()
-    """The policy that `newest_evaluation` is of."""
+    """The policy that `newest_evaluation` evaluated."""
     pending: EvaluatedPolicy | None = None
-    """Of the evaluation beside training that has no result yet."""
+    """The policy that is being evaluated alongside training, if there is one."""
     pending_policy: Any = None
-    """Its parameters [P] and buffers, both float32."""
+    """Parameters [P] and buffers of that policy, both float32."""
     opponents: PoolState = msgspec.field(default_factory=PoolState)
     """The opponents of self-play, and the ratings."""
     opponent_policies: Any = None
-    """Parameters [n, P] and buffers [n, B] of its snapshots, both float32."""
+    """Parameters [n, P] and buffers [n, B] of the n snapshots among the opponents, both float32."""
     next_evaluation: Natural = 0
-    """Env steps at which the next evaluation is due; 0 if that is not known."""
+    """The env steps at which the next evaluation is due; 0 if that is not known."""
 
     def checkpoint_content(self, algorithm: Algorithm) -> dict[str, Any]:
-        """The content of a checkpoint: plain data and tensors."""
+        """The content of a checkpoint of this state and of the algorithm, as plain data and tensors."""
         import torch
 
         policies = {name: getattr(self, name) for name in POLICIES}
@@ -96,14 +96,14 @@ class RunState(msgspec.Struct, kw_only=True):
 
 
 def restore(folder: RunFolder, algorithm: Algorithm) -> RunState:
-    """Load the newest undamaged checkpoint into the algorithm.
+    """Load the newest undamaged checkpoint into the algorithm. Returns the state of the run.
 
-    Raises `CheckpointError` if there is none or it does not fit.
+    Raises `CheckpointError` if there is no such checkpoint, or if it does not fit.
     """
     newest = _newest(folder.path)
     try:
         state = msgspec.convert(newest.state["past"], RunState)
-        EnvAttributes(state.env_attributes), EpisodeWindow(state.episodes, state.facts)  # they raise for an invalid state
+        EnvAttributes(state.env_attributes), EpisodeWindow(state.episodes, state.facts)  # both raise for an invalid state
         for name in POLICIES:
             if (policy := newest.state.get(name)) is not None:
                 setattr(state, name, tuple(array.numpy() for array in policy))
@@ -121,7 +121,7 @@ def restore(folder: RunFolder, algorithm: Algorithm) -> RunState:
 
 
 def _check_policies(state: RunState, own: tuple[Floats, Floats]) -> None:
-    """Raise `ValueError` unless each policy that the state mentions exists and is as large as the run's `own`."""
+    """Raise `ValueError` unless each policy that the state mentions exists and has the size of the run's `own` weights."""
     snapshots = len(state.opponents.snapshots)
     for name, is_there, rows in (
         ("best_policy", state.best is not None, ()),
@@ -137,7 +137,7 @@ def _check_policies(state: RunState, own: tuple[Floats, Floats]) -> None:
 def start_from(config: Config, policy: PolicySpec, algorithm: Algorithm) -> str:
     """Let a new algorithm start from the run or the policy that `config.start_from` names. Returns a line that says so.
 
-    `policy` is the one to train. Raises `UserFacingError` if the other one is different, or cannot be read.
+    `policy` is the policy to train. Raises `UserFacingError` if the other run's policy doesn't fit it or cannot be read.
     """
     card, parameters, buffers = policy_to_start_from(config)
     parts = config.from_parts
@@ -171,7 +171,7 @@ def start_from(config: Config, policy: PolicySpec, algorithm: Algorithm) -> str:
 
 
 def _of_policy_alone(config: Config, policy: PolicySpec, parameters: Floats, buffers: Floats) -> dict[str, Any]:
-    """`Start.state` for only a policy. Its statistics weigh as much as all observations of the new run will."""
+    """The `Start.state` if only a policy is known. Its statistics weigh as much as all observations of the new run will."""
     import torch
 
     state: dict[str, Any] = {"parameters": torch.from_numpy(parameters)}
@@ -183,7 +183,7 @@ def _of_policy_alone(config: Config, policy: PolicySpec, parameters: Floats, buf
 
 
 def _newest(run: Path) -> checkpoint.Checkpoint:
-    """The newest undamaged checkpoint. Raises `CheckpointError`."""
+    """The newest undamaged checkpoint; logs a warning for each newer, damaged one. Raises `CheckpointError`."""
     newest, warnings = checkpoint.newest(run)
     for line in warnings:
         log.warning("%s", line)

@@ -1,9 +1,9 @@
-"""Standard output and error of a program: failed writes never end it.
+"""Standard output and standard error whose failed writes never end the program.
 
-Rule: a program opens what was closed at its start (`prepare_streams`), before it opens any file: otherwise a file would get
-    number 1 or 2, and the output of libraries would go into it. Then `never_fails` replaces a stream. Output that a full
-    disk, a closed pipe or a closed terminal refuses is dropped, and counted; a character that the encoding lacks is escaped.
-    Each write is attempted, so a disk that has space again gets the next line.
+Rule: before it opens any file, a program opens standard streams that were closed at its start (`prepare_streams`).
+Otherwise, a file would get number 1 or 2, and the output of libraries would go into it. Then `never_fails` replaces a
+stream. Output that cannot be written, because of a full disk, a closed pipe or a closed terminal, is dropped and counted; a
+character that the encoding lacks is escaped. Each write is attempted, so once a disk has space again, it gets the next line.
 """
 
 from __future__ import annotations
@@ -17,26 +17,26 @@ from typing import Literal, TextIO
 
 
 def prepare_streams() -> None:
-    """Open closed ones of standard input, output and error on a device that accepts everything and returns nothing.
+    """Open the null device in place of each of standard input, output and error that is closed.
 
-    From now on characters that the encoding of output or error lacks are escaped.
+    From now on, characters that the encoding of standard output or error lacks are escaped.
     """
     for number in (0, 1, 2):
         try:
             os.fstat(number)
         except OSError:
-            os.open(os.devnull, os.O_RDWR)  # gets the lowest free number: this one
+            os.open(os.devnull, os.O_RDWR)  # gets the lowest free number, which is this one
     for number, name in ((1, "stdout"), (2, "stderr")):
         stream = getattr(sys, name)
         if stream is None:
             setattr(sys, name, _writer(number, "utf-8"))
-        elif isinstance(stream, io.TextIOWrapper):  # not a stream of a notebook
+        elif isinstance(stream, io.TextIOWrapper):  # unlike the stream of a notebook
             stream.reconfigure(errors="backslashreplace")
 
 
 @contextmanager
 def unfailing(name: Literal["stdout", "stderr"]) -> Iterator[None]:
-    """Until it ends, `sys.stdout` or `sys.stderr` never fails."""
+    """Inside this context, writes to `sys.stdout` or `sys.stderr` never fail."""
     before: TextIO = getattr(sys, name)
     stream = never_fails(before)
     setattr(sys, name, stream)
@@ -48,29 +48,29 @@ def unfailing(name: Literal["stdout", "stderr"]) -> Iterator[None]:
 
 
 def never_fails(stream: TextIO) -> TextIO:
-    """A stream that writes where `stream` writes and never raises. One without a file descriptor is returned as it is."""
+    """A stream that writes where `stream` does but never raises. A stream without a file descriptor is returned as it is."""
     try:
         number = stream.fileno()
         stream.flush()
-    except (OSError, ValueError):  # a stream of a test or a notebook
+    except (OSError, ValueError):  # the stream belongs to a test or a notebook
         return stream
     return _writer(number, getattr(stream, "encoding", None) or "utf-8")
 
 
 def _writer(number: int, encoding: str) -> TextIO:
-    binary = io.BufferedWriter(DroppingFile(number))  # type: ignore[type-var]  # the type wants what no writer calls
+    binary = io.BufferedWriter(DroppingFile(number))  # type: ignore[type-var]  # the type asks for methods nobody calls
     return io.TextIOWrapper(binary, encoding, "backslashreplace", line_buffering=True)
 
 
 class DroppingFile(io.RawIOBase):
-    """Writes to a file descriptor, which it does not close. Drops output that the descriptor refuses."""
+    """Writes to a file descriptor, which it does not close. Drops output that cannot be written."""
 
     def __init__(self, number: int) -> None:
         self.dropped_bytes = 0
         self._number = number
 
     def writable(self) -> bool:
-        """True."""
+        """Always True."""
         return True
 
     def fileno(self) -> int:
@@ -78,11 +78,11 @@ class DroppingFile(io.RawIOBase):
         return self._number
 
     def isatty(self) -> bool:
-        """Whether it is a terminal."""
+        """Whether the file is a terminal."""
         return os.isatty(self._number)
 
     def write(self, content: bytes) -> int:  # type: ignore[override]  # a buffer, as io.BufferedWriter passes it
-        """Write all of it, or drop the rest."""
+        """Write as much of `content` as possible, and drop the rest. Always returns its whole length."""
         done = 0
         try:
             while done < len(content):

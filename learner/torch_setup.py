@@ -1,9 +1,11 @@
-"""The device of PyTorch, its defaults, and how many threads PyTorch and numpy have while this process learns or acts.
+"""The device and the defaults of PyTorch, and the number of threads that PyTorch and numpy use while this process learns or
+acts.
 
-Rules: a run has PyTorch's initial defaults: float32, the CPU, gradients. The calling program's own choices don't change its
-bits. The numbers of threads do not depend on who imported the two first: a script, a notebook or the command line. numpy's
-matrices are so small that more threads of its BLAS gain nothing, and beside other busy processes they wait for one another:
-an update takes up to thirty times as long. Afterwards the calling program has its threads and defaults back.
+Rules: a run has PyTorch's initial defaults: float32, the CPU, gradients on. So the calling program's own choices don't
+change its results. Nor do the numbers of threads depend on who imported PyTorch and numpy first: a script, a notebook or the
+command line. numpy's matrices are so small that more threads of its BLAS gain nothing, and alongside other busy processes
+they would wait for one another, so that an update takes up to thirty times as long. Afterwards, the calling program gets its
+threads and defaults back.
 """
 
 from __future__ import annotations
@@ -25,20 +27,20 @@ from millrace.protocol.specs import PolicySpec
 
 MANY_WEIGHTS = 1 << 18  # 512 x 512
 WORTH_A_THREAD = 1 << 25
-"""Multiply-adds of a forward pass that make a thread worthwhile. With the backward pass, a core takes 2 to 5 ms for them."""
+"""How many multiply-adds of a forward pass make a thread worthwhile. With the backward pass, a core takes 2 to 5 ms."""
 
 
 _lock = Lock()
 _inside: list[list[ExitStack]] = []
-"""For each `one_thread` that was entered and not left, in this order: what restores the numbers of threads before it."""
+"""For each `one_thread` that was entered and not left, in order: the stack that restores the previous numbers of threads."""
 
 
 @contextmanager
 def one_thread(*, uses_torch: bool = True) -> Iterator[None]:
-    """One thread for numpy's BLAS, and for PyTorch until `torch.set_num_threads` is called; later as many as before.
+    """Inside this context, numpy's BLAS has one thread, and so has PyTorch until you call `torch.set_num_threads`.
 
-    PyTorch has its own defaults meanwhile; it is imported only if it `uses_torch`. Threads of the program may leave in
-    another order than they entered.
+    PyTorch also has its initial defaults; it is imported only if `uses_torch`. On exit, the numbers of threads and the
+    defaults are restored. Threads of the program may leave the context in another order than they entered it.
     """
     own = [ExitStack()]
     with _lock:
@@ -62,7 +64,7 @@ def one_thread(*, uses_torch: bool = True) -> Iterator[None]:
         with _lock:
             later = _inside[_inside.index(own) + 1 :]
             _inside.remove(own)
-            if later:  # the next to leave restores what was before this one, too
+            if later:  # leave it to the context that was entered next to restore the numbers from before this one
                 own[0].callback(later[0][0].close)
                 later[0][0] = own[0]
             else:
@@ -70,7 +72,7 @@ def one_thread(*, uses_torch: bool = True) -> Iterator[None]:
 
 
 def torch_device(config: Config) -> str:
-    """The device in the settings: cpu or cuda. Raises `UsageError` if there is no such device."""
+    """The device that the settings name or imply: cpu or cuda. Raises `UsageError` if there is no such device."""
     import torch
 
     if config.device == "cuda" and not torch.cuda.is_available():
@@ -79,22 +81,22 @@ def torch_device(config: Config) -> str:
 
 
 class ThreadChoice(NamedTuple):
-    """How many threads PyTorch gets, where the settings name no number."""
+    """The number of PyTorch's threads, chosen because the settings give none."""
 
     number: int
     line: str
-    """What was chosen and why, for the user; empty if nobody would expect another number"""
+    """a line for the user that says what was chosen and why; empty if nobody would expect another number"""
 
 
 def threads(policy: PolicySpec, rows: int, max_lag: int, workers: int) -> ThreadChoice:
-    """The number of threads, by the work of a pass of a minibatch of `rows`. `workers`: worker processes on this machine.
+    """The number of threads for the passes of minibatches of `rows` rows. `workers` is the number of local worker processes.
 
-    The threads wait for one another at the end of each operation. So a thread that has little to do gains nothing, and
-    loses much while another process keeps its core busy: each gets at least `WORTH_A_THREAD`. Networks of small layers have
-    one, because numpy computes most of their passes.
+    Threads wait for one another at the end of each operation. So a thread that has little to do gains nothing, and costs
+    much time if another process keeps its core busy; therefore each thread gets at least `WORTH_A_THREAD`. Networks of small
+    layers get one thread, because numpy computes most of their passes.
 
-    If workers collect meanwhile, they use the cores that are left, but only if those are more than half: where updates take
-    longer than collecting, workers wait for most of the time, and their cores with them.
+    If workers collect during updates, one core for each of them is left out, but only if this leaves more than half of the
+    cores. Otherwise updates would take longer than collecting, and workers, with their cores, would wait most of the time.
     """
     largest = max(math.prod(field.shape) for fields in parameter_layout(policy) for field in fields)
     if not policy.needs_torch and largest < MANY_WEIGHTS:
@@ -111,10 +113,10 @@ def threads(policy: PolicySpec, rows: int, max_lag: int, workers: int) -> Thread
 
 
 def updates_use_all_cores(config: Config) -> bool:
-    """Whether updates use all cores while workers collect; then the workers of this machine should have a lower priority.
+    """Whether updates use all cores while workers collect, so that local workers should have a lower priority.
 
-    Each operation of an update ends when its slowest thread has ended. If a worker holds the core of one, all wait. Updates
-    with one thread leave the workers a core, and there workers decide the speed: a lower priority would cost it. Updates on
-    a GPU leave them all cores.
+    Each operation of an update ends when its slowest thread has finished, so if a worker occupies the core of one thread,
+    all threads wait. Updates with one thread leave cores to the workers, whose speed then limits that of the run, so a lower
+    priority would slow it down. Updates on a GPU leave all cores to the workers.
     """
     return config.max_lag > 0 and 1 < usable_cores() <= (config.torch_threads or 1) and torch_device(config) == "cpu"

@@ -1,14 +1,14 @@
 """The training loop. Everything else is called from here; `hub.gather` is the only place that waits for rollouts.
 
-An evaluation belongs to one version: it comes after that version's checkpoint, and before the next rollouts are collected.
-With `eval_workers` it is played beside training: see `evaluations.py`.
+An evaluation belongs to one version of the weights. It is played after that version's checkpoint was written, and before the
+next rollouts are collected. With `eval_workers` it runs alongside training: see `evaluations.py`.
 
 With `max_lag` 0 the learner publishes weights, gathers rollouts and learns, one after the other. With `max_lag` 1 the
-workers already collect the next rollouts while the learner learns. The loop is the same: only the number of tickets differs.
+workers already collect the next rollouts while the learner learns. The loop is the same; only the number of tickets differs.
 
-Rule: whatever ends the run, the state after the last whole update is saved first, and the run fails if the disk refuses it.
-An update is taken back if it raises, or makes weights that are not finite or that no worker could act with, or returns
-metrics that aren't numbers; so is one whose rollouts a callback does not accept.
+Rule: whatever ends the run, the state after the last whole update is saved first, and the run fails if it can't be saved. An
+update is undone if it raises, if it makes weights that are not finite or with which no worker could act, if it returns
+metrics that aren't numbers, or if a callback doesn't accept its rollouts.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ ADVICE = "try a lower learning_rate, or normalize_observations"
 def train(run: OpenRun, workers: int, cores: CrowdedCores) -> str:
     """Train until the tally gives a reason to stop. Returns that reason.
 
-    `workers`: number of workers to wait for before the first rollout. `cores` watches the updates.
+    `workers` is the number of workers to wait for before the first rollout. `cores` watches the updates.
 
     If the run cannot continue (no worker is left, the environment raised too often, the user interrupted the run, a loss is
-    not finite, the user's code raised), the state after the last whole update is saved. Then the error is raised.
+    not finite, the user's code raised), the state after the last whole update is saved, and then the error is raised.
     """
     algorithm = run.parts.algorithm
     policy = run.parts.spec.policy
@@ -48,7 +48,7 @@ def train(run: OpenRun, workers: int, cores: CrowdedCores) -> str:
     evaluations = run.evaluations
 
     def pulse() -> None:
-        """Between gradient steps. What it raises takes the update back."""
+        """Called between gradient steps. If it raises, the update is undone."""
         hub.pulse()
         run.check_time()
 
@@ -59,7 +59,7 @@ def train(run: OpenRun, workers: int, cores: CrowdedCores) -> str:
         hub.publish(state.version, *weights, deal=deal, env_attributes=attributes, env_steps=state.env_steps)
 
     def tell(metrics: Row | None) -> None:
-        """Tell the metrics of an evaluation, if one has ended, and save its result."""
+        """Report the metrics of an evaluation, if one has ended, and save its result."""
         if metrics is not None:
             audience.evaluated(metrics)
             files.save()
@@ -70,7 +70,7 @@ def train(run: OpenRun, workers: int, cores: CrowdedCores) -> str:
         audience.start()
         tell(evaluations.begin_again(audience.env_attributes(), audience.show_now))
         publish(acting_weights(algorithm, policy))
-        if tally.evaluation_is_due():  # the run was interrupted before it
+        if tally.evaluation_is_due():  # if the run was interrupted before this evaluation
             tell(evaluations.evaluate_when_due(audience.show_now))
         while (reason := tally.stop_reason()) is None:
             arrived = hub.gather(audience.show_now)
@@ -99,19 +99,19 @@ def train(run: OpenRun, workers: int, cores: CrowdedCores) -> str:
         tell(evaluations.end_pending(audience.show_now))
         if evaluations.conclude(audience.show_now):
             audience.evaluated()
-        files.save_unless_saved()  # the final policy may be the best
+        files.save_unless_saved()  # needed if the final policy turned out to be the best
     except BaseException as error:
         files.save_after_error(error)
         raise
     hub.drain(reason)
-    files.confirm_saved()  # before the summary: with one, a run counts as finished
+    files.confirm_saved()  # before the summary, because a run with a summary counts as finished
     audience.finish(reason)
     return reason
 
 
 @contextmanager
 def _whole_update(algorithm: Algorithm, hub: Hub, arrived: list[AcceptedRollout]) -> Iterator[None]:
-    """An update of the rollouts that have arrived. If the body raises, it is taken back."""
+    """A context for an update with the rollouts that have arrived. If the body raises, the update is undone."""
     algorithm.remember()
     try:
         yield

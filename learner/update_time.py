@@ -1,7 +1,7 @@
-"""How long an update takes on this machine: of an algorithm with its settings, and batches that somebody collects.
+"""Measures how long an algorithm's update takes on this machine, with its settings, on batches that the caller collects.
 
-Rule: the algorithm is made and used as in a run, with as many threads, on the same device. An algorithm with a replay buffer
-makes its gradient steps from the first update on, and has a buffer that is just large enough.
+Rule: the algorithm is made and used just as in a run, with as many threads and on the same device. An algorithm with a
+replay buffer takes its gradient steps from the first update on, and has a small buffer.
 """
 
 from __future__ import annotations
@@ -24,27 +24,28 @@ from millrace.protocol.machine.core_delay import CoreDelay
 from millrace.protocol.rollout import Batch
 from millrace.protocol.specs import PolicySpec
 
-SMALL_REPLAY = 20_000  # transitions
+SMALL_REPLAY = 20_000  # the largest capacity of the replay buffer, in transitions
 LEAST_UPDATES = 2
-AT_MOST = 4.0  # times the seconds; then no further update is begun
+AT_MOST = 4.0  # no update is begun after this many times the given seconds
 
 
 class UpdateTime(NamedTuple):
-    """What updates take."""
+    """The time that updates take."""
 
     per_step_s: float
-    """median time of an update if a core is free, divided by the env steps of its batch"""
+    """the median time of an update, without delays by other processes, divided by the env steps of its batch"""
     cores: float
-    """CPU time of an update, divided by its time"""
+    """the median CPU time of an update, divided by its time"""
 
 
 def update_time(
     config: Config, policy: PolicySpec, collect: Callable[[Floats, Floats], Batch], seconds: float, workers: int
 ) -> UpdateTime:
-    """Learn from batches for about so many seconds. `collect`: takes weights and buffers. `workers`: of this machine.
+    """Learn from batches for about this many seconds, and measure the updates.
 
-    The first update, which begins to use memory and an empty replay buffer, is not counted if there are others. Raises
-    `MillraceError`.
+    `collect` is called with parameters and buffers, and returns a batch. `workers` is the number of workers on this machine.
+    The first update, which allocates memory and has an almost empty replay buffer, is not counted if there are others.
+    Raises `MillraceError`.
     """
     algorithm_config = _from_the_first_step_on(config.algorithm)
     with one_thread():

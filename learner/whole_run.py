@@ -1,6 +1,6 @@
-"""Trains a run to its end, whatever the end is: tells the workers, the callbacks and the user of it.
+"""Trains a run to its end, and tells the workers, the callbacks and the user how it ended.
 
-Rule: of several errors, the one that ended the run is raised. What fails while the others are told is a line of the log.
+Rule: of several errors, the one that ended the run is raised. Errors that occur while others are told are only logged.
 """
 
 from __future__ import annotations
@@ -51,13 +51,13 @@ def train_to_the_end(run: OpenRun, workers: int) -> None:
 
 
 def _watched_cores(run: OpenRun) -> CrowdedCores:
-    """Those that the updates need."""
+    """A watch over the cores that updates need, with the number of PyTorch's threads if these compute the updates."""
     config = run.setup.config
     return CrowdedCores((config.torch_threads or 1) if torch_device(config) == "cpu" else 0)
 
 
 def _learn_from_prior(run: OpenRun, prior: PriorData) -> None:
-    """Make the gradient steps before the first rollouts, with checkpoints when it is time, and at an interrupt."""
+    """Take the gradient steps that precede the first rollouts. Writes checkpoints when they are due, and at an interrupt."""
     algorithm = run.parts.algorithm
 
     def pulse() -> None:
@@ -68,7 +68,7 @@ def _learn_from_prior(run: OpenRun, prior: PriorData) -> None:
     try:
         if getattr(run.setup.config.algorithm, "clone_epochs", 0):
             run.audience.cloned(started_by("clone_epochs")(algorithm, prior.batches(), pulse))
-            run.parts.tally.state.next_evaluation = 0  # one is due, if the run makes any
+            run.parts.tally.state.next_evaluation = 0  # so that an evaluation is due, if the run makes any
         algorithm.learn_from_prior(pulse)
     except Interrupted:
         run.files.save()
@@ -77,7 +77,7 @@ def _learn_from_prior(run: OpenRun, prior: PriorData) -> None:
 
 
 def _tell_of_error(end: Callable[[], None]) -> None:
-    """Tell the callbacks. One of them may raise again, but the error of the run is what counts."""
+    """Call `end`, which tells the callbacks. If it raises, only log that, because the error of the run is what counts."""
     try:
         end()
     except Exception as later:
@@ -85,6 +85,6 @@ def _tell_of_error(end: Callable[[], None]) -> None:
 
 
 def _why(error: BaseException) -> str:
-    """One line that says why the run ended. The error may come from a user's code, and say anything."""
+    """One line that says why the run ended. The error may have been raised by the user's code, with any text."""
     text = first_line(error, type(error).__name__)
     return one_line(text if isinstance(error, MillraceError) else f"{type(error).__name__}: {text}")

@@ -1,1 +1,1 @@
-"""The check of a user's own algorithm: `millrace.testing.check_algorithm`."""
+"""The check of a user-defined algorithm, `millrace.testing.check_algorithm`."""

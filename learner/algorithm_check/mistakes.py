@@ -1,7 +1,7 @@
-"""What is wrong with an algorithm: each rule of `Algorithm` is one function here, which yields mistakes.
+"""Finds mistakes in an algorithm. Each rule of `Algorithm` is one function here, which yields the mistakes that it finds.
 
-A mistake is one line. Every rule gets its own objects, made with the same seed, and copies of the same batches. So one
-broken rule does not hide another. The rules run in this process, on toy batches, with one PyTorch thread.
+A mistake is one line of text. Every rule gets its own objects, made with the same seed, and copies of the same batches, so
+one broken rule does not hide another. The rules run in this process, on toy batches, with one PyTorch thread.
 """
 
 from __future__ import annotations
@@ -44,20 +44,20 @@ from millrace.protocol.policy.own_encoder import describe_encoder
 from millrace.protocol.rollout import Batch
 from millrace.protocol.specs import PolicySpec
 
-MOST_STEPS = 64  # of a rollout here
-MOST_WARM_UP = 24  # updates before the first gradient step: an algorithm may fill a replay buffer first
-MORE_UPDATES = 3  # after the first gradient step
+MOST_STEPS = 64  # the most steps of a rollout in this check
+MOST_WARM_UP = 24  # the most updates before the first gradient step, because an algorithm may fill a replay buffer first
+MORE_UPDATES = 3  # number of updates after the first gradient step
 TOTAL_STEPS = 20_000  # env steps of the toy run, for schedules
-LEARNING_STEPS = 40_000  # env steps in which the identity environment must be learned
-LEARNED = 0.5  # of the way from random actions to perfect ones
-MEASURED_BATCHES = 5
+LEARNING_STEPS = 40_000  # env steps within which the identity environment must be learned
+LEARNED = 0.5  # the mean reward to reach, as a fraction of the way from random actions to perfect ones
+MEASURED_BATCHES = 5  # number of batches over which the mean reward is measured
 SEED = 3
 
 Pulse = Callable[[], None]
 
 
 class StoppedByPulse(Exception):
-    """What a pulse raises here."""
+    """The exception that `_stopping` pulses raise."""
 
 
 class Subject(NamedTuple):
@@ -68,10 +68,10 @@ class Subject(NamedTuple):
     policy: PolicySpec
     steps: int
     batches: tuple[Batch, ...]
-    """The last `MORE_UPDATES` of them are learned from with gradient steps."""
+    """The algorithm takes gradient steps on the last `MORE_UPDATES` of them."""
 
     def new(self, total_steps: int = TOTAL_STEPS) -> Algorithm:
-        """A new object. The global random numbers begin at the same point for each."""
+        """Make a new object. The global random generators have the same state for each."""
         _seed_everything(0)
         return self.algorithm(self.config, self.policy, total_steps=total_steps, seed=SEED)
 
@@ -81,7 +81,7 @@ class Subject(NamedTuple):
 
 
 def mistakes(algorithm: type, settings: dict[str, Any], *, learns: bool) -> Iterator[str]:
-    """All mistakes that are found, one line each. `learns`: also try whether it learns the identity environment."""
+    """Yield all mistakes that are found, one line each. If `learns`, also check that it learns the identity environment."""
     with _undisturbed():
         try:
             subject = _subject(algorithm, settings)
@@ -131,7 +131,7 @@ def _subject(algorithm: type, settings: dict[str, Any]) -> Subject:
 
 
 def _with_batches(subject: Subject, made: list[str]) -> Subject:
-    """The subject with batches that its own policy collected. Adds mistakes about gradient steps to `made`."""
+    """The subject with batches that its own policy collected. Appends mistakes about gradient steps to `made`."""
     algorithm = subject.new()
     generator = np.random.default_rng(1)
     batches: list[Batch] = []
@@ -159,7 +159,7 @@ def _with_batches(subject: Subject, made: list[str]) -> Subject:
 
 
 def weights_have_the_policy_s_shape(subject: Subject) -> Iterator[str]:
-    """Float32, as many as the policy has, and finite."""
+    """Check that weights are float32 and finite, and that there are as many as the policy has."""
     weights: Any = subject.new().weights()
     if wrong := [*wrong_weights(weights, subject.policy)]:
         yield from wrong
@@ -170,7 +170,7 @@ def weights_have_the_policy_s_shape(subject: Subject) -> Iterator[str]:
 
 
 def weights_are_copies(subject: Subject) -> Iterator[str]:
-    """A worker may still be sent weights while the next update changes those of the learner."""
+    """Check that `weights` returns copies, because they may still be on the way to workers during the next update."""
     algorithm = subject.new()
     given = algorithm.weights()
     kept = _weights(algorithm)
@@ -186,7 +186,7 @@ def weights_are_copies(subject: Subject) -> Iterator[str]:
 
 
 def metrics_are_finite_numbers(subject: Subject) -> Iterator[str]:
-    """Names and floats, as they are logged."""
+    """Check that metrics are names and finite floats, which can be logged."""
     algorithm = subject.new()
     for batch in subject.copies():
         metrics: Any = algorithm.update(batch, _no_pulse)
@@ -203,7 +203,7 @@ def metrics_are_finite_numbers(subject: Subject) -> Iterator[str]:
 
 
 def an_update_changes_no_batch(subject: Subject) -> Iterator[str]:
-    """The recorder counts the batch after the update."""
+    """Check that an update leaves its batch unchanged, because other code, such as the recorder, uses the batch later."""
     algorithm = subject.new()
     changed = set[str]()
     for batch, kept in zip(subject.copies(), subject.batches, strict=True):
@@ -216,7 +216,7 @@ def an_update_changes_no_batch(subject: Subject) -> Iterator[str]:
 
 
 def rows_that_are_not_valid_change_nothing(subject: Subject) -> Iterator[str]:
-    """They are the steps in which a finished copy is reset."""
+    """Check that invalid rows, the steps in which a finished copy is reset, change neither weights nor metrics."""
     one = subject.new()
     other = subject.new()
     generator = np.random.default_rng(2)
@@ -233,7 +233,10 @@ def rows_that_are_not_valid_change_nothing(subject: Subject) -> Iterator[str]:
 
 
 def what_is_carried_passes_through_rows_that_are_not_valid(subject: Subject) -> Iterator[str]:
-    """With several agents, a seat may wait between two of its rows. Replay may draw others then, so it is not compared."""
+    """Check that rows in which a seat waits, between two of its own rows, change no metric of an actor-critic.
+
+    Algorithms with a replay buffer are not compared, because they may draw other rows then.
+    """
     if not issubclass(subject.algorithm, ActorCritic):
         return
     batch = subject.copies()[-1]
@@ -248,7 +251,7 @@ def what_is_carried_passes_through_rows_that_are_not_valid(subject: Subject) -> 
 
 
 def the_same_seed_and_batches_give_the_same_bits(subject: Subject) -> Iterator[str]:
-    """Whatever the global random numbers of torch, numpy and Python are."""
+    """Check that results are reproducible, whatever the global random generators of torch, numpy and Python give."""
     results = [_learned(subject, global_seed) for global_seed in (0, 0, 1)]
     if first_difference(results[0], results[1]) is not None:
         yield "update: the same seed and batches give other weights or metrics each time; all random numbers must be seeded"
@@ -257,7 +260,7 @@ def the_same_seed_and_batches_give_the_same_bits(subject: Subject) -> Iterator[s
 
 
 def a_saved_state_goes_on_as_if_nothing_had_happened(subject: Subject) -> Iterator[str]:
-    """Save, load into a new object, and learn on: bit for bit as the one that was saved."""
+    """Check that a new object that loads a saved state goes on learning as the saved one does, bit for bit."""
     *first, second, third = subject.copies()
     saved = subject.new()
     restored = subject.new()
@@ -297,7 +300,7 @@ def a_saved_state_goes_on_as_if_nothing_had_happened(subject: Subject) -> Iterat
 
 
 def an_update_can_be_taken_back(subject: Subject) -> Iterator[str]:
-    """`roll_back` after a whole update and after one that stopped in the middle, and then the update that follows."""
+    """Check `roll_back` after a whole update and after one that stopped in the middle, and the update that follows."""
     *first, second, third = subject.copies()
     disturbed = subject.new()
     undisturbed = subject.new()
@@ -331,7 +334,11 @@ def an_update_can_be_taken_back(subject: Subject) -> Iterator[str]:
 
 
 def numbers_that_are_not_finite_are_raised(subject: Subject) -> Iterator[str]:
-    """Rewards of NaN make the loss NaN, whatever it is. Rewards that are too large may do so."""
+    """Check that an update raises if its loss isn't finite.
+
+    Rewards of NaN make any loss NaN, so the update must raise. Rewards that are too large may do the same; the update must
+    raise or give finite numbers.
+    """
     for reward in (math.nan, 3e38):
         algorithm = subject.new()
         *first, last = subject.copies()
@@ -353,7 +360,10 @@ def numbers_that_are_not_finite_are_raised(subject: Subject) -> Iterator[str]:
 
 
 def learns_the_identity_environment(subject: Subject) -> Iterator[str]:
-    """The right action is what is observed. Random actions get a quarter of the reward of right ones."""
+    """Check that the algorithm learns the identity environment, in which the right action is the one that is observed.
+
+    Random choices get a quarter of the reward of right ones.
+    """
     algorithm = subject.new(LEARNING_STEPS)
     generator = np.random.default_rng(4)
     env_steps = 0
@@ -416,7 +426,7 @@ def _weights(algorithm: Algorithm) -> Any:
 
 
 def _learned(subject: Subject, global_seed: int) -> Any:
-    """The weights and metrics after all batches."""
+    """The weights and metrics after learning from all batches."""
     _seed_everything(global_seed)
     algorithm = subject.algorithm(subject.config, subject.policy, total_steps=TOTAL_STEPS, seed=SEED)
     metrics = [algorithm.update(batch, _no_pulse) for batch in subject.copies()]
@@ -431,7 +441,7 @@ def _seed_everything(seed: int) -> None:
 
 @contextmanager
 def _undisturbed() -> Iterator[None]:
-    """One thread; afterwards the number of threads and all global random numbers are what they were."""
+    """Use one PyTorch thread. Afterwards, restore the number of threads and all global random generators."""
     of_torch = torch.get_rng_state()
     of_numpy = np.random.get_state()
     of_python = random.getstate()
@@ -445,7 +455,7 @@ def _undisturbed() -> Iterator[None]:
 
 
 def _not_plain(state: object, where: str = "") -> str:
-    """Where a state has something that a checkpoint does not take; empty if nowhere."""
+    """The place of the first object in a state that a checkpoint can't hold; empty if there is none."""
     match state:
         case dict():
             return next((why for key, value in state.items() if (why := _not_plain(value, f"{where}[{key!r}]"))), "")

@@ -1,4 +1,4 @@
-"""Whether two states are the same, bit for bit: tensors, arrays, numbers, text, and lists and dicts of these. Pure."""
+"""Compares two states bit for bit: tensors, arrays, numbers, text, and lists and dicts of these. Pure."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch
 
 
 def first_difference(left: Any, right: Any, where: str = "") -> str | None:
-    """Where two states differ first, as `['optimizer']['lr']`; None if they are the same. NaN is the same as NaN."""
+    """The first place where two states differ, such as `['optimizer']['lr']`; None if they are equal. NaN equals NaN."""
     match left, right:
         case dict(), dict() if left.keys() == right.keys():
             pairs = [(left[key], right[key], f"{where}[{key!r}]") for key in left]

@@ -1,7 +1,7 @@
-"""Batches for the check of an algorithm, made in this process: noise with ends of both kinds, and the identity environment.
+"""Batches for the check of an algorithm, made in this process: random ones, and those of the identity environment.
 
-Both keep the row format (`millrace.protocol.rollout`). Rows that are not valid hold rewards that an algorithm must not use.
-Pure: weights and a generator in, a batch out.
+Both follow the row format (`millrace.protocol.rollout`), with both terminated and truncated episodes in the random ones.
+Rows that are not valid hold rewards that an algorithm must not use. Pure: weights and a generator in, a batch out.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ OBSERVATION = (Leaf("", "box", (CHOICES,), "float32"),)
 CHOICE = ActionSpec("discrete", (), "int64", (CHOICES,), (0,))
 NUMBERS = ActionSpec("box", (2,), "float32", low=(-1.0,) * 2, high=(1.0,) * 2)
 ACTIONS = (CHOICE, NUMBERS, mixed([((0,), CHOICE), ((1,), NUMBERS)]))
-"""The action spaces that an algorithm is tried with; the first that it can use is taken"""
+"""The action spaces to try with an algorithm, in order. The check uses the first one that the algorithm supports."""
 LANES = 2
 COPIES = 4
-GARBAGE_REWARD = 50.0  # on rows that are not valid
+GARBAGE_REWARD = 50.0  # the reward of rows that are not valid, which must not be used
 
 
 class ToyActor(NamedTuple):
@@ -38,7 +38,10 @@ class ToyActor(NamedTuple):
 
 
 def noise_batch(acting: ToyActor, steps: int, generator: np.random.Generator, fresh: bool) -> Batch:
-    """Random observations and rewards; an episode ends on one of seven rows. `fresh`: the lanes begin here."""
+    """A batch of random observations and rewards, in which an episode ends on one row in seven.
+
+    `fresh` says that the lanes begin with this batch.
+    """
     columns = LANES * COPIES
     obs = generator.normal(1, 2, (steps + 1, columns, CHOICES)).astype(np.float32)
     ended = generator.random((steps, columns)) < 1 / 7
@@ -52,10 +55,10 @@ def noise_batch(acting: ToyActor, steps: int, generator: np.random.Generator, fr
 
 
 def identity_batch(acting: ToyActor, steps: int, generator: np.random.Generator) -> tuple[Batch, float]:
-    """The identity environment: the right action is what is observed. Also returns the mean reward.
+    """A batch of the identity environment, in which the right action is the one that is observed, and its mean reward.
 
-    Each episode has one step. A choice gets 1 if it is the right one, numbers get minus their squared distance; both are
-    added up for a Dict or Tuple.
+    Each episode has one step. A discrete action gets 1 if it is the right one. Numbers get minus their squared distance from
+    the observation. Both rewards are added up for a Dict or Tuple.
     """
     columns = LANES * COPIES
     choice = generator.integers(0, CHOICES, (steps + 1, columns))
@@ -78,9 +81,10 @@ def identity_batch(acting: ToyActor, steps: int, generator: np.random.Generator)
 
 
 def with_other_invalid_rows(batch: Batch, generator: np.random.Generator) -> Batch:
-    """The same batch with other finite values on rows that are not valid. An observation is that of the row before, too.
+    """The same batch with other finite values on rows that are not valid.
 
-    So it stays, except after a termination, from which nothing bootstraps.
+    Their observations stay, because they also belong to the previous row, which bootstraps from them. Only after a
+    termination, where nothing bootstraps, are they changed, too.
     """
     other = generator.permutation(batch.action.reshape(-1, *batch.action.shape[2:])).reshape(batch.action.shape)
     if batch.action.dtype == np.int64:
@@ -97,9 +101,9 @@ def with_other_invalid_rows(batch: Batch, generator: np.random.Generator) -> Bat
 
 
 def with_waiting_seats(batch: Batch) -> Batch:
-    """The same rows as those of an environment whose seats wait for one step before the outcome of each action comes.
+    """The same rows, as if seats had to wait for one step before the outcome of each action is known.
 
-    Row t becomes two: in the first the seat waits. A step that resets comes first, and then the seat acts and waits.
+    Each row becomes two, in the first of which the seat waits. Where a row only resets, the reset is the first of the two.
     """
     T, columns = batch.valid.shape
     waits = np.zeros_like(batch.valid)
@@ -130,7 +134,7 @@ def with_waiting_seats(batch: Batch) -> Batch:
 
 
 def _for_each(rows: Bools, array: Array) -> Bools:
-    """What is said of rows [T, N], as it is broadcast to an array [T, N, …]."""
+    """A mask of rows [T, N], reshaped so that it broadcasts to an array [T, N, …]."""
     return rows.reshape(*rows.shape, *[1] * (array.ndim - 2))
 
 
@@ -140,7 +144,7 @@ def with_rewards(batch: Batch, reward: float) -> Batch:
 
 
 class _OtherColumns(NamedTuple):
-    """What a row says besides observation and action. [T, ΣN] each."""
+    """The columns of a batch besides observations and actions, [T, ΣN] each."""
 
     reward: Floats
     terminated: Bools

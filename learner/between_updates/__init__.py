@@ -1,1 +1,1 @@
-"""Everything that a run does between two updates: it counts, writes files, reports and evaluates."""
+"""Everything that a run does between two updates: counting, writing files, reporting and evaluating."""

@@ -1,7 +1,8 @@
-"""Reports how far a run is to its callbacks (the terminal is one of them), `millrace status` and Prometheus.
+"""Reports the progress of a run to its callbacks (the terminal is one of them), to `millrace status` and to Prometheus.
 
-Rule: numbers are counted, and in a row of the metrics, before they are reported. Numbers that callbacks log are added to the
-row of the newest update, even if one of them raises. `on_checkpoint` follows a checkpoint, so its requests may not be in it.
+Rule: numbers are counted, and written to a row of the metrics, before they are reported. Numbers that callbacks log are
+added to the row of the newest update, even if one of the callbacks raises. `on_checkpoint` is called after a checkpoint was
+written, so callbacks can't make requests there: the checkpoint would lack them.
 """
 
 from __future__ import annotations
@@ -25,14 +26,14 @@ from millrace.protocol.logs.notices import log_notice
 
 log = logging.getLogger("millrace.learner")
 
-SHOW_EVERY_S = 0.2  # progress between two updates
+SHOW_EVERY_S = 0.2  # least interval at which progress between two updates is shown
 
 
 class Audience:
     """Everything that watches one run."""
 
     def __init__(self, run: RunParts, callbacks: Callbacks, files: RunFiles, requests: Requests) -> None:
-        """`requests`: the requests of callbacks."""
+        """`requests` are the requests that callbacks make."""
         self._config = run.config
         self._hub = run.hub
         self._tally = run.tally
@@ -41,15 +42,15 @@ class Audience:
         self._files = files
         self._requests = requests
         self._settings = msgspec.to_builtins(run.config)
-        self._update: dict[str, Any] = {}  # facts of the last update: fields of `Progress`
+        self._update: dict[str, Any] = {}  # fields of `Progress` about the last update
         self._workers_alive = 0
         self._shown_s = 0.0
-        self._said_missing = False  # whether missing facts were looked for in the first episodes
+        self._said_missing = False  # whether the first episodes were checked for missing facts
         self._finished = False
         files.on_saved = self.checkpoint_written
 
     def start(self) -> None:
-        """Tell callbacks that the run begins, or is resumed, and workers have joined."""
+        """Tell callbacks that the run begins, or is resumed, and that workers have joined."""
         self._workers_alive = self._hub.workers_alive()
         self._callbacks.on_start(self.progress())
 
@@ -62,7 +63,7 @@ class Audience:
         self._files.write_row(self.progress(), metrics)
 
     def show_now(self) -> None:
-        """Show now and then how far an evaluation is, or what a long wait is for."""
+        """Show, now and then, how far an evaluation has got, or what a long wait is for."""
         now = time.monotonic()
         if now - self._shown_s >= SHOW_EVERY_S:
             self._shown_s = now
@@ -73,7 +74,7 @@ class Audience:
             self._callbacks.meanwhile(progress)
 
     def gathered(self, rollouts: Sequence[AcceptedRollout]) -> bool:
-        """Report that these rollouts have arrived. True if an update should use them: no callback ends the run."""
+        """Report that these rollouts have arrived. Returns whether an update should use them: no callback ended the run."""
         began_s = time.monotonic()
         if self._callbacks.wants("on_rollouts"):
             progress = msgspec.structs.replace(
@@ -87,7 +88,7 @@ class Audience:
         return True
 
     def updated(self, metrics: Mapping[str, float]) -> None:
-        """Report the last counted update, which was published."""
+        """Report the last update that was counted and published."""
         self._say_missing_facts()
         self._workers_alive = self._hub.workers_alive()
         snapshot = self._hub.snapshot()
@@ -100,7 +101,7 @@ class Audience:
             self._write_logged()
 
     def evaluated(self, metrics: Row | None = None) -> None:
-        """Report an evaluation. Without `metrics`, its update's row gets only numbers that callbacks log."""
+        """Report an evaluation. Without `metrics`, only the numbers that callbacks log are added to its update's row."""
         progress = self.progress()
         if metrics is not None:
             self._write_row(progress, metrics)
@@ -119,9 +120,10 @@ class Audience:
                 self._requests.closed = ""
 
     def finish(self, reason: str, *, cut_short: bool = False) -> None:
-        """Report the end of the run, and write its summary. Does nothing the second time.
+        """Report the end of the run, and write its summary. Does nothing when called again.
 
-        `cut_short`: an error or an interrupt ended the run. Otherwise raises `RunError` if the summary cannot be written.
+        `cut_short` says that an error or an interrupt ended the run. Otherwise, raises `RunError` if the summary cannot be
+        written.
         """
         if not self._finished:
             self._files.write_summary(reason, cut_short=cut_short)
@@ -134,7 +136,7 @@ class Audience:
         self._callbacks.on_end(msgspec.structs.replace(self.progress(), stop_reason=reason, cut_short=cut_short))
 
     def env_attributes(self) -> Array | None:
-        """The attributes of env copies that callbacks have set, for the weights of this version."""
+        """The attributes of env copies that callbacks have set, for the weights of the newest version."""
         return self._requests.attributes.table(self._state.version)
 
     def progress(self) -> Progress:
@@ -144,7 +146,7 @@ class Audience:
     # ---------------------------------------------------------------- inside
 
     def _progress(self, snapshot: HubSnapshot, collected: int = 0) -> Progress:
-        """`collected`: env steps that wait for the next update, if the learner waits for it."""
+        """The progress at this snapshot. `collected` are the env steps already made for the next update."""
         state = self._state
         tally = self._tally
         wall_s = self._tally.wall_s(snapshot)
@@ -189,7 +191,7 @@ class Audience:
             self._files.write_row(self.progress(), logged)
 
     def _say_missing_facts(self) -> None:
-        """Warn once about facts that no episode had: perhaps they have another name."""
+        """Warn once about facts that no episode had, because the user may have named them wrongly."""
         window = self._tally.window
         if window.full and not self._said_missing:
             self._said_missing = True

@@ -1,4 +1,4 @@
-"""Notices updates that wait for cores, and says so once.
+"""Warns, once, if updates spend their time waiting for CPU cores.
 
 The threads of PyTorch wait for one another at the end of each operation. If other processes keep the cores busy, an update
 with several threads may take many times as long as with one, and nothing else shows why.
@@ -14,20 +14,20 @@ from contextlib import contextmanager
 log = logging.getLogger("millrace.learner")
 
 LONG_S = 10.0
-SHARE = 0.5  # of an update's time in which at least one thread should compute
+SHARE = 0.5  # the least CPU time of an update, as a share of its duration, at which it isn't called slow
 
 
 class CrowdedCores:
     """Watches the updates of one run."""
 
     def __init__(self, threads: int) -> None:
-        """`threads`: number of PyTorch's threads, if they compute the updates; 0 if a GPU does."""
+        """`threads` is the number of PyTorch's threads if they compute the updates; 0 if a GPU does."""
         self._threads = threads
         self._said = False
 
     @contextmanager
     def watching(self) -> Iterator[None]:
-        """Enter this for an update."""
+        """A context in which to make an update. Warns at the end if the update waited for cores."""
         began_s = time.monotonic()
         cpu_began_s = time.process_time()
         yield
@@ -35,9 +35,9 @@ class CrowdedCores:
             log.warning("%s", line)
 
     def updated(self, took_s: float, computed_s: float) -> str:
-        """Take the duration of an update, in which all threads of this process together computed for `computed_s`.
+        """Check an update that took `took_s`, in which all threads of this process together computed for `computed_s`.
 
-        Returns a line for the log; empty if there is nothing to say.
+        Returns a line for the log; empty if there is nothing to warn about.
         """
         if self._said or self._threads < 2 or took_s < LONG_S or computed_s > SHARE * took_s:
             return ""

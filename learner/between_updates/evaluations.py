@@ -1,12 +1,12 @@
-"""Evaluations of one run: each version at most once, the best policy kept, and that one evaluated again at the end.
+"""The evaluations of one run. Each version is evaluated at most once, and the best policy again at the end.
 
-A number that decided something isn't a measurement of it: the highest of several evaluations is biased upwards, and so is
-one that ended the run, because it reached the target or because a callback saw it. So for the best policy, and for the final
-policy of such a run, the summary reports a second evaluation, on other episodes.
+A return by which a policy was selected is a biased measurement of that policy: the highest of several evaluations is biased
+upwards, and so is an evaluation that ended the run, because it reached the target or because a callback saw it. So for the
+best policy, and for the final policy of such a run, the summary reports a second evaluation, on other episodes.
 
-Rule: without `eval_workers`, training waits for each evaluation. With them, an evaluation is beside training: its result
-counts when the next one is due, or at the end, and is awaited there. So the course of a run doesn't depend on speed. The
-evaluated policy is kept until then.
+Rule: without `eval_workers`, training waits for each evaluation. With them, evaluations run alongside training: the result
+of one counts when the next one is due, or at the end, and the run waits for it there. So the course of a run doesn't depend
+on speed. The evaluated policy is kept until then.
 """
 
 from __future__ import annotations
@@ -31,25 +31,26 @@ class Evaluations:
     """Greedy evaluations of the newest policy, and the best policy so far."""
 
     def __init__(self, run: RunParts, time_limit: int | None) -> None:
-        """`time_limit`: env steps after which an episode of an evaluation is truncated, if any."""
+        """`time_limit` is the number of env steps after which an evaluation episode is truncated; None without a limit."""
         self.confirmed: Best | None = None
-        """The best policy and its second evaluation, after `conclude`."""
+        """The best policy and its second evaluation. Set by `conclude`."""
         self.final: Evaluation | None = None
-        """The evaluation of the final policy to report, after `conclude`."""
+        """The evaluation of the final policy that is reported. Set by `conclude`."""
         self.ended_by: Evaluation | None = None
-        """The one that ended the run, if it was of the final policy. Then `final` is a second one, on other episodes."""
+        """The evaluation that ended the run, if it was one of the final policy. Then `final` is a second one, on other
+        episodes."""
         self._run = run
         self._config = run.config
         self._time_limit = time_limit
         self._tally = run.tally
         self._state = run.tally.state
-        self.write_best()  # the folder may have a later one, which was lost
+        self.write_best()  # the folder may have that of a later update, which a resumed run has lost
 
     def begin_again(self, env_attributes: Array | None, watch: Callable[[], None]) -> Row | None:
-        """Begin again the evaluation that was beside training when the run was interrupted, and publish its weights.
+        """Restart the evaluation that was running alongside training when the run was interrupted. Publishes its weights.
 
-        Without `eval_workers`, as the run may be resumed, it is also ended here. Returns its metrics then. `env_attributes`:
-        those of the newest weights, which may be the same, and are sent once.
+        If the run was resumed without `eval_workers`, this also waits for the evaluation and returns its metrics.
+        `env_attributes` are those of the newest weights; if these are the ones to evaluate, they are sent only once.
         """
         if (pending := self._state.pending) is None:
             return None
@@ -59,10 +60,10 @@ class Evaluations:
         return None if self._config.eval_workers else self.end_pending(watch)
 
     def evaluate_when_due(self, watch: Callable[[], None]) -> Row | None:
-        """Make the evaluation that is due, of the newest policy.
+        """Evaluate the newest policy, because an evaluation is due. Returns the metrics of the evaluation.
 
-        Returns its metrics. With `eval_workers`, begin it, and return those of the previous one: None for the first. `watch`
-        is called several times a second during an evaluation.
+        With `eval_workers`, only begins the evaluation, and returns the metrics of the previous one, or None for the first.
+        `watch` is called several times a second while this waits.
         """
         if not self._config.eval_workers:
             evaluation = self._evaluate_newest(evaluation_size(self._config), watch)
@@ -78,7 +79,10 @@ class Evaluations:
         return metrics
 
     def end_pending(self, watch: Callable[[], None]) -> Row | None:
-        """Wait for the evaluation beside training, if there is one. Returns its metrics, and which policy it played."""
+        """Wait for the evaluation that runs alongside training, if there is one.
+
+        Returns its metrics, which include the env steps of the policy that was evaluated.
+        """
         state = self._state
         pending = state.pending
         policy = state.pending_policy
@@ -91,9 +95,9 @@ class Evaluations:
         return evaluation.metrics() | {EVALUATED_AT_KEY: pending.env_steps}
 
     def conclude(self, watch: Callable[[], None]) -> bool:
-        """Evaluate the final policy. If the run kept a best policy, evaluate that one too, on other episodes: `confirmed`.
+        """Evaluate the final policy and, if the run kept a best policy, evaluate that again on other episodes.
 
-        Returns whether the final policy had no such evaluation before.
+        Sets `final` and `confirmed`. Returns whether the final policy was evaluated here for the first time.
         """
         state = self._state
         before = self.of_newest()
@@ -102,7 +106,7 @@ class Evaluations:
         if size != (usual := evaluation_size(self._config)):
             log_notice(log, _smaller(size, usual))
         evaluation = self._evaluate_newest(size, watch)
-        if self._config.eval_every or state.best is not None:  # best: of a run that was resumed with eval_every 0
+        if self._config.eval_every or state.best is not None:  # a run resumed with eval_every 0 may have a best policy
             self._keep_if_best(evaluation, state.env_steps, self._run.algorithm.weights)
         if ended and before is not None:
             found_again = self._evaluate(Purpose.CONFIRMATION, size, watch)
@@ -124,7 +128,7 @@ class Evaluations:
         folder.writes.write("best policy", lambda: folder.write_policy(spec, policy[0], policy[1], "best"))
 
     def to_report(self) -> Evaluation | None:
-        """The evaluation of the newest policy, also of a run that was cut short; None if it may have ended the run."""
+        """The evaluation to report, even for a run that was cut short; None if it may be the one that ended the run."""
         if self.final is not None:
             return self.final
         return self.of_newest() if self._tally.stop_reason() in (None, ALL_STEPS_DONE) else None
@@ -141,12 +145,12 @@ class Evaluations:
         chosen_by, env_steps = state.best
         if self.final is not None and self.ended_by is not None and env_steps == state.env_steps:
             return Best(env_steps=env_steps, chosen_by=chosen_by, evaluation=self.final)
-        self._run.hub.publish(state.version + 1, *state.best_policy, deal=False)  # no update has this number
+        self._run.hub.publish(state.version + 1, *state.best_policy, deal=False)  # a version that no update has used
         confirmed = self._evaluate(Purpose.CONFIRMATION, size, watch)
         return Best(env_steps=env_steps, chosen_by=chosen_by, evaluation=confirmed)
 
     def _evaluate_newest(self, size: EvaluationSize, watch: Callable[[], None]) -> Evaluation:
-        """Evaluate the newest policy; the same version is not evaluated twice."""
+        """Evaluate the newest policy, unless that was already done with the same number of episodes."""
         state = self._state
         evaluation = self.of_newest()
         if evaluation is None or evaluation.episodes != size.episodes:
@@ -155,7 +159,7 @@ class Evaluations:
         return evaluation
 
     def _record(self, evaluation: Evaluation, of: EvaluatedPolicy) -> None:
-        """Record this evaluation, of this policy, as the newest."""
+        """Record this evaluation, of the policy `of`, as the newest."""
         self._state.newest_evaluation = evaluation
         self._state.evaluated = of
         self._say(evaluation, of.env_steps)
@@ -169,7 +173,7 @@ class Evaluations:
         return self._end(watch)
 
     def _begin_beside(self) -> None:
-        """Begin to evaluate the weights that were last published, beside training."""
+        """Begin to evaluate the weights that were last published, alongside training."""
         self._run.hub.begin_evaluation(self._plan(Purpose.EVALUATION, evaluation_size(self._config)), beside=True)
 
     def _plan(self, purpose: Purpose, size: EvaluationSize) -> EvaluationPlan:
@@ -178,15 +182,15 @@ class Evaluations:
         return plan if pool is None else replace(plan, opponents=pool.yardsticks)
 
     def _end(self, watch: Callable[[], None]) -> Evaluation:
-        """Wait for the evaluation that was begun."""
+        """Wait for the pending evaluation, and return it."""
         played = self._run.hub.end_evaluation(lambda played, env_steps: watch())
         return evaluation_of(played, self._run.spec.facts)
 
     def _keep_if_best(self, evaluation: Evaluation, env_steps: int, policy: Callable[[], tuple[Floats, Floats]]) -> None:
-        """Keep the policy that this evaluation played, after this many env steps, if none was better.
+        """Keep the evaluated policy, which was reached after `env_steps`, as the best one, unless an earlier one was better.
 
-        A tie keeps the newer one, because it has learned more. If all returns are equal, as in a zero-sum game that the
-        policy plays against itself, there is no other criterion.
+        In a tie, the newer policy is kept, because it has learned for longer. If all returns are equal, as in a zero-sum
+        game that the policy plays against itself, there is no other criterion.
         """
         state = self._state
         if state.best is None or evaluation.return_mean >= state.best[0]:
@@ -196,7 +200,7 @@ class Evaluations:
 
 
 def _smaller(size: EvaluationSize, usual: EvaluationSize) -> str:
-    """Says that an evaluation is smaller than usual."""
+    """A line that says that an evaluation is smaller than usual, and why."""
     steps = f" and at most {size.max_steps:,} env steps" if size.max_steps < usual.max_steps else ""
     why = "because the training was short; --eval-episodes sets another number"
     return f"the evaluation has {size.episodes} episodes{steps}, {why}"

@@ -1,4 +1,4 @@
-"""Writes the files of a run: rows of metrics, checkpoints, policies, the summary. It makes them again if they are deleted.
+"""Writes the files of a run: rows of metrics, checkpoints, policies and the summary. Deleted files are written again.
 
 Rule: a checkpoint is written between two updates, never during one, and holds everything that the next update depends on.
 If the disk is full, the run logs a warning and continues; at its end, it fails if its last state can't be written.
@@ -37,16 +37,16 @@ class RunFiles:
     """The files of one run."""
 
     def __init__(self, run: RunParts, evaluations: Evaluations, attributes: EnvAttributes) -> None:
-        """Removes the rows of updates after the checkpoint of a resumed run. Raises `RunError`."""
+        """Removes the metrics of updates after the checkpoint of a resumed run. Raises `RunError` if that is impossible."""
         self._config, self._spec, self._folder, self._algorithm, self._hub, self._tally = run
         self._state = run.tally.state
         self._evaluations = evaluations
         self._attributes = attributes
         self.path = one_line(str(run.folder.shown))
         self.checkpoint = ""
-        """Path of the newest checkpoint that this process has written."""
+        """Path of the newest checkpoint that this process has written; empty if there is none."""
         self.longest_save_s = 0.0
-        """How long the longest checkpoint took to write, in this process."""
+        """The longest time, in seconds, that this process took to write a checkpoint."""
         self.on_saved: Callable[[], None] = lambda: None
         """Called after a checkpoint was written."""
         self._metrics = MetricsLog(run.folder.path, self._state.env_steps, self._state.version)
@@ -63,7 +63,7 @@ class RunFiles:
         writes.write("metrics", self._metrics.flush)
 
     def write_images(self, batch: Batch) -> None:
-        """Write the observations in the batch of the first update as pictures."""
+        """After the first update, write observations from its batch as pictures."""
         if self._state.version == 1:
             images = image_samples(batch.obs, self._spec.policy.seen)
             self._folder.writes.write("images", lambda: self._folder.write_images(images))
@@ -93,9 +93,9 @@ class RunFiles:
             self.save()
 
     def save_after_error(self, error: BaseException) -> None:
-        """Like `save_unless_saved` and `confirm_saved`, but logs errors of callbacks, because `error` ended the run.
+        """Like `save_unless_saved` and `confirm_saved`, but logs errors of callbacks, because `error` has ended the run.
 
-        Raises `RunError` if the disk refuses the state and `error` isn't a failure, such as Ctrl-C.
+        If the state can't be written, raises `RunError` only if `error` isn't a failure but, for example, Ctrl-C.
         """
         try:
             self.save_unless_saved()
@@ -111,9 +111,9 @@ class RunFiles:
             log.warning("%s", refused)
 
     def confirm_saved(self) -> None:
-        """The last save: retry refused writes for a while. Raises `RunError` if they stay refused.
+        """Retry failed writes for a while, because this is the last save. Raises `RunError` if they still fail.
 
-        Raises `RunTakenOver`, as `save` does.
+        Raises `RunTakenOver` if another process trains this run now.
         """
         self._confirm_lock()
         before = self._saved
@@ -122,13 +122,13 @@ class RunFiles:
             self.on_saved()
 
     def write_summary(self, reason: str, *, cut_short: bool) -> None:
-        """Write why the run ended, and its results. Raises `RunError` if the disk refuses that and it is not `cut_short`."""
+        """Write the results of the run, and why it ended. Unless `cut_short`, raises `RunError` if that is impossible."""
         self._folder.writes.write("summary", lambda: self._folder.write_summary(self._summary(reason, cut_short)))
         if not cut_short:
             self._folder.writes.confirm()
 
     def continues(self) -> str:
-        """One line that says where a resumed run continues, and which updates are lost."""
+        """One line that says where a resumed run continues, and how many updates are lost."""
         state = self._state
         lost = self._metrics.removed
         line = f"run {self._folder.shown} continues at {state.env_steps:,} env steps, after update {state.version:,}"
@@ -137,9 +137,9 @@ class RunFiles:
         return line
 
     def saved(self, *, elsewhere: bool) -> str:
-        """One line that says what can be resumed, and how; empty if nothing has been learned yet.
+        """One line that says how much is saved, and how to resume the run; empty if nothing has been learned yet.
 
-        `elsewhere`: see `resume_command`. A run whose environment was passed as a function can continue only in Python.
+        For `elsewhere`, see `resume_command`. A run whose environment was passed as a function can continue only in Python.
         """
         if not self._state.version:
             return ""
@@ -155,21 +155,21 @@ class RunFiles:
         return f"{newest}; continue with: {resume_command(folder, elsewhere=elsewhere)}"
 
     def close(self) -> None:
-        """Close the metrics. Also for a run that was cut short."""
+        """Close the metrics file. Call this even if the run was cut short."""
         self._metrics.close()
 
     # ---------------------------------------------------------------- inside
 
     def _make_folder_again(self) -> None:
-        """Make the run folder again if it was deleted or renamed. Raises `RunError` if that is not possible."""
+        """Recreate the run folder if it was deleted or renamed. Raises `RunError` if that is not possible."""
         if self._folder.is_gone():
             self._saved = self._saved_env_steps = self._policy_env_steps = None
-            self._schedule.saved(-math.inf)  # so that one is due now
+            self._schedule.saved(-math.inf)  # so that a checkpoint is due now
             log.warning("%s", self._folder.make_again(self._config))
             self._evaluations.write_best()
 
     def _write_state(self) -> None:
-        """Write the policy and a checkpoint. Raises `RunError` if the disk refuses one of them; the other one is written."""
+        """Write the policy and a checkpoint. If one of them can't be written, writes the other and raises `RunError`."""
         self._make_folder_again()
         spec = self._spec
         env_steps = self._state.env_steps
@@ -201,7 +201,7 @@ class RunFiles:
             self._folder.lock.confirm()
 
     def _position(self) -> tuple[object, ...]:
-        """The part of the state that changes while the run continues: version, evaluations, best policy, set attributes."""
+        """A value that changes whenever there is something new to save: an update, an evaluation or a set attribute."""
         state = self._state
         return state.version, state.next_evaluation, state.evaluated, state.best, self._attributes.changes
 

@@ -1,4 +1,4 @@
-"""The parts that every object between two updates works on. `open_run` makes them."""
+"""The parts of a run on which every object in this package works. `open_run` makes them."""
 
 from __future__ import annotations
 

@@ -1,11 +1,11 @@
-"""When a run stops, by its settings and numbers. Pure."""
+"""Decides when a run stops, by its settings and counts. Pure."""
 
 from __future__ import annotations
 
 from millrace.learner.config.config import Config
 from millrace.learner.run_folder.results import ALL_STEPS_DONE
 
-BY_THE_POLICY_OF = " by the policy of "  # follows the reason if training continued during the evaluation
+BY_THE_POLICY_OF = " by the policy of "  # is appended to the reason if training continued during the evaluation
 
 
 def reason_to_stop(
@@ -16,11 +16,11 @@ def reason_to_stop(
     training_return: float | None,
     evaluated_before: int | None = None,
 ) -> str | None:
-    """Why the run should end now, or None.
+    """Why the run should end now; None if it should continue.
 
-    `evaluation_return`: mean return of the newest greedy evaluation, if there was one. `training_return`: mean return of
-    the last episodes of training, if there were enough of them. `evaluated_before`: env steps of the evaluated policy, if
-    training continued meanwhile.
+    `evaluation_return` is the mean return of the newest greedy evaluation, and `training_return` that of the last training
+    episodes; each is None if there is none yet. `evaluated_before` are the env steps of the evaluated policy, if training
+    has continued since then.
     """
     target = config.target_return
     if target is not None and evaluation_return is not None and evaluation_return >= target:

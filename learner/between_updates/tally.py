@@ -1,8 +1,8 @@
-"""Counts what one run has made, and decides by the counts when it ends, and when an evaluation is due.
+"""Counts the env steps, updates and episodes of one run. The counts decide when it ends, and when an evaluation is due.
 
-Rule: no files and no sockets. A decision depends on counts alone, so that every run of these settings makes the same ones.
-The seconds of evaluations are a stage of their own and do not count as training. (`run_folder/checkpoint.py` says when a
-checkpoint is due.)
+Rule: decisions depend on counts alone, so every run with these settings makes the same ones. The seconds of evaluations are
+a stage of their own and do not count as training. `run_folder/checkpoint.py` says when a checkpoint is due. This file uses
+no files and no sockets.
 """
 
 from __future__ import annotations
@@ -31,19 +31,22 @@ class Tally:
         ended_by: Callable[[], str | None] = lambda: None,
         pool: OpponentPool | None = None,
     ) -> None:
-        """`state`: where the run stands. `ended_by`: why a callback has ended the run, or None. `pool`: of self-play."""
+        """`state` is the state of the run. `ended_by` returns why a callback has ended the run, or None.
+
+        `pool` are the opponents of self-play, if there are any.
+        """
         self.pool = pool
         self.state = state
-        """The evaluations change it, too. A checkpoint adds the state of other objects."""
+        """The state of the run. Evaluations change it, too, and a checkpoint adds the state of other objects."""
         self.window = EpisodeWindow.from_state(state.episodes, state.facts, spec.facts)
         self.new_episodes: tuple[Episode, ...] = ()
         """The episodes that ended in the rollouts of the last update."""
         due_at = state.env_steps + config.eval_every
         state.next_evaluation = min(state.next_evaluation or due_at, due_at)
         self.note = ""
-        """The newest evaluation as one line of text for the user."""
+        """A line for the user about the newest evaluation."""
         self.gathered_s = 0.0
-        """Seconds that callbacks and the dataset took for the rollouts of the next update."""
+        """Seconds that `on_rollouts` callbacks and the dataset took for the rollouts of the next update."""
         self._ended_by = ended_by
         self._config = config
         self._steps_per_update = spec.rollout_steps * config.envs
@@ -66,7 +69,7 @@ class Tally:
         return {} if self.pool is None else self.pool.metrics()
 
     def stop_reason(self) -> str | None:
-        """Why the run should end now, or None."""
+        """Why the run should end now; None if it should continue."""
         state = self.state
         newest = self.state.newest_evaluation
         return self._ended_by() or reason_to_stop(
@@ -78,7 +81,7 @@ class Tally:
         )
 
     def training_goes_on(self) -> bool:
-        """Whether the next rollouts may be collected now: no evaluation is due, and the run does not end."""
+        """Whether the next rollouts may be collected now, because no evaluation is due and the run does not end."""
         return not self.evaluation_is_due() and self.stop_reason() is None
 
     # ---------------------------------------------------------------- evaluations
@@ -89,7 +92,7 @@ class Tally:
         return bool(due) and self._ended_by() is None
 
     def evaluated(self) -> None:
-        """Count the evaluation that was due. The next one is due at the next multiple that hasn't been reached."""
+        """Count the evaluation that was due. The next one is due at the next multiple of `eval_every` not yet reached."""
         every = self._config.eval_every
         state = self.state
         state.next_evaluation += every * (1 + (state.env_steps - state.next_evaluation) // every)
@@ -97,14 +100,14 @@ class Tally:
     # ---------------------------------------------------------------- seconds
 
     def updated(self, seconds: float) -> None:
-        """Count an update that is published, this many seconds after its rollouts arrived.
+        """Count the time of an update, which was published this many seconds after its rollouts arrived.
 
-        They include the seconds that callbacks and the dataset took for the rollouts, which don't count as the update's own.
+        These seconds include the time that callbacks and the dataset took for the rollouts, which is subtracted.
         """
         self._update_s += seconds - self.gathered_s
 
     def stages(self, snapshot: HubSnapshot) -> dict[str, float]:
-        """Seconds in each stage: of the learner, and of all workers together, from their last heartbeats."""
+        """Seconds in each stage of the learner, and in each stage of all workers together, as of their last heartbeats."""
         other_s = snapshot.learn_s - self._update_s
         stages = {"learner_wait": snapshot.wait_s, "learner_update": self._update_s, "learner_other": other_s}
         stages |= {"learner_evaluate": snapshot.evaluate_s} if snapshot.evaluate_s else {}

@@ -1,1 +1,1 @@
-"""Callbacks: user code that a run calls between its steps."""
+"""Callbacks: the user's code that a run calls between its steps."""

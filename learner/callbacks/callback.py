@@ -1,7 +1,7 @@
-"""The base of a user's callbacks: the moments of a run at which it calls them.
+"""The base of a user's callbacks. Its methods are the moments of a run at which callbacks are called.
 
 Rule: a callback runs in the learner's process and thread, between two steps of the run, so the run waits for it. Workers
-may already collect the next rollouts meanwhile.
+may already be collecting the next rollouts meanwhile.
 """
 
 from __future__ import annotations
@@ -10,11 +10,11 @@ from millrace.learner.run_folder.progress import Progress
 
 
 class Callback:
-    """Your own code that a run calls. Write the methods that you need; the others cost nothing.
+    """Your own code that a run calls. Override the methods that you need; the others cost nothing.
 
     Each method gets a `Progress`. If it returns False, the run ends as if all steps were done: with a checkpoint, the final
-    evaluation and a summary. If it raises, the run ends too: the state after the last complete update is saved, then the
-    exception is raised. If a method returns anything else, the run continues.
+    evaluation and a summary. If it raises, the run ends, too: the state after the last complete update is saved, then the
+    exception is raised again. If it returns anything else, the run continues.
 
     >>> import millrace
     >>> class StopWhenGood(millrace.Callback):
@@ -26,28 +26,31 @@ class Callback:
     """
 
     def on_start(self, progress: Progress) -> object:
-        """The run begins, or is resumed (then `progress.updates` isn't 0): workers have joined, no rollout was collected."""
+        """Called when the run begins, or is resumed (then `progress.updates` isn't 0).
+
+        Workers have joined, and no rollout has been collected yet.
+        """
         return None
 
     def on_rollouts(self, progress: Progress) -> object:
-        """`progress.rollouts` have arrived, and the next update will use them. Their arrays are read-only.
+        """Called when rollouts have arrived that the next update will use: `progress.rollouts`.
 
-        Not called if an earlier callback has ended the run.
+        Their arrays are read-only. Not called if an earlier callback has ended the run.
         """
         return None
 
     def on_update(self, progress: Progress) -> object:
-        """An update was made, and its weights were sent. Its row of metrics is written."""
+        """Called after an update, when its weights have been sent and its row of metrics has been written."""
         return None
 
     def on_evaluation(self, progress: Progress) -> object:
-        """The policy was evaluated: `progress.evaluation`. Also called for the evaluation of the final policy."""
+        """Called after each evaluation, including that of the final policy, with the result in `progress.evaluation`."""
         return None
 
     def on_checkpoint(self, progress: Progress) -> object:
-        """A checkpoint was written: `progress.checkpoint`. The policy is saved beside it, in the run folder."""
+        """Called after a checkpoint was written to `progress.checkpoint`. The policy is saved, too, in the run folder."""
         return None
 
     def on_end(self, progress: Progress) -> object:
-        """The run has ended: `progress.stop_reason`. It is called once if `on_start` was called, also after an error."""
+        """Called once when the run has ended, even after an error, if `on_start` was called. See `progress.stop_reason`."""
         return None

@@ -1,8 +1,8 @@
-"""All callbacks of a run as one: it calls them in order, and remembers whether one of them ended the run.
+"""All callbacks of a run as one object. It calls them in order, and remembers whether one of them ended the run.
 
 Rule: exceptions of callbacks pass through, with a note that names the callback. `on_end` is called for every callback that
-was started, even if an earlier one raised. A function among the callbacks is called to show how far the run is: after each
-update and evaluation, several times a second during an evaluation or a long wait, and at the end.
+was started, even if an earlier one raised. A function among the callbacks is called to show the progress of the run: after
+each update and evaluation, several times a second during an evaluation or a long wait, and at the end.
 """
 
 from __future__ import annotations
@@ -28,24 +28,24 @@ class Callbacks:
     """The callbacks of one run."""
 
     def __init__(self, callbacks: Sequence[object] = ()) -> None:
-        """`callbacks`: objects with some of the methods of `Callback`, and functions. Raises `UsageError` for any other."""
+        """`callbacks` are functions, or objects with some of the methods of `Callback`. Raises `UsageError` for others."""
         self.stop_reason: str | None = None
-        """Why a callback ended the run, or None."""
+        """Why a callback ended the run; None if none did."""
         self._callbacks = [_checked(callback) for callback in callbacks]
-        self._started: list[object] = []  # those whose `on_start` was called, also if it raised
+        self._started: list[object] = []  # callbacks whose `on_start` was called, even if it raised
 
     @staticmethod
     def of(watch: Watch) -> Callbacks:
-        """The callbacks of a run, from its callbacks or one function."""
+        """The callbacks of a run, from a `Callbacks` object or a single function."""
         return watch if isinstance(watch, Callbacks) else Callbacks([watch])
 
     def with_named(self, names: Sequence[str]) -> Self:
-        """Add the callbacks of these names, `module:factory`. Raises `UsageError` if one cannot be made."""
+        """Add the callbacks with these names, `module:factory`. Raises `UsageError` if one cannot be made."""
         self._callbacks += [_checked(named_callback(name), name) for name in dict.fromkeys(names)]
         return self
 
     def add(self, callback: object) -> None:
-        """Add a callback, which is called after the others. Raises `UsageError`, as `Callbacks` does."""
+        """Add a callback, which is called after the others. Raises `UsageError` if it is no callback."""
         self._callbacks.append(_checked(callback))
 
     def wants(self, moment: str) -> bool:
@@ -53,39 +53,39 @@ class Callbacks:
         return any(_method(callback, moment) for callback in self._callbacks)
 
     def on_start(self, progress: Progress) -> None:
-        """The run begins, or is resumed."""
+        """Call `on_start` of all callbacks: the run begins, or is resumed."""
         for callback in self._callbacks:
             self._started.append(callback)
             self._call_one(callback, "on_start", progress)
 
     def on_rollouts(self, progress: Progress) -> bool:
-        """Rollouts have arrived. Returns whether an update should use them; if not, later callbacks are not called."""
+        """Call `on_rollouts` of the callbacks until one ends the run. Returns whether an update should use the rollouts."""
         for callback in self._callbacks:
             if self.stop_reason is None:
                 self._call_one(callback, "on_rollouts", progress)
         return self.stop_reason is None
 
     def on_update(self, progress: Progress) -> None:
-        """An update was made."""
+        """Show the progress, and call `on_update` of all callbacks."""
         self._show(progress)
         self._call("on_update", progress)
 
     def on_evaluation(self, progress: Progress) -> None:
-        """The policy was evaluated."""
+        """Show the progress, and call `on_evaluation` of all callbacks."""
         self._show(progress)
         self._call("on_evaluation", progress)
 
     def meanwhile(self, progress: Progress) -> None:
-        """An evaluation or a long wait continues; `progress.waiting` says how far it is, or what is awaited."""
+        """Show the progress of an evaluation or a long wait. `progress.waiting` says how far it is or what is awaited."""
         self._show(progress)
 
     def on_checkpoint(self, progress: Progress) -> None:
-        """A checkpoint was written. Nothing is called for one before `on_start`."""
+        """Call `on_checkpoint` of all callbacks, unless the checkpoint was written before `on_start`."""
         if self._started:
             self._call("on_checkpoint", progress)
 
     def on_end(self, progress: Progress) -> None:
-        """The run has ended. Raises the first callback's exception; those of others are logged."""
+        """Call `on_end` of all started callbacks. Raises the first exception of these; further ones are logged."""
         raised: BaseException | None = None
         calls = [self._show]
         calls += [lambda progress, each=each: _call(each, "on_end", progress) for each in self._started]  # type: ignore[misc]
@@ -116,7 +116,7 @@ Watch = Callbacks | Show
 
 
 def _ends_the_run(answer: object) -> bool:
-    return answer is False or (type(answer).__name__ == "bool" and not answer)  # numpy's bool too
+    return answer is False or (type(answer).__name__ == "bool" and not answer)  # the second case is numpy's bool
 
 
 def _call(callback: object, moment: str, progress: Progress) -> object:
@@ -127,13 +127,13 @@ def _call(callback: object, moment: str, progress: Progress) -> object:
         return method(progress)
     except BaseException as error:
         note = one_line(f"raised in {_name(callback, moment)}", 300)
-        if note not in getattr(error, "__notes__", ()):  # a function may raise the same error again when the run ends
+        if note not in getattr(error, "__notes__", ()):  # the same error may be raised again when the run ends
             error.add_note(note)
         raise
 
 
 def _method(callback: object, moment: str) -> Callable[[Progress], object] | None:
-    """The method of this callback, unless it is the empty one of `Callback`; for a function, `__call__`."""
+    """The method of a callback, unless it is the empty one of `Callback`. For `__call__`, a callback that is a function."""
     if moment == "__call__":
         return None if not callable(callback) or any(hasattr(callback, each) for each in MOMENTS) else callback
     found: Any = getattr(callback, moment, None)

@@ -1,6 +1,6 @@
-"""A callback by its name, `module:factory`: the module is imported, and the factory (or class) is called without arguments.
+"""Makes a callback from its name, `module:factory`: imports the module, and calls the factory (or class) without arguments.
 
-Rule: an error in the name is one line that quotes it. If user code raised, its traceback is the detail.
+Rule: an error in the name is one line that quotes the name. If the user's code raised, the traceback is the error's detail.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from millrace.protocol.own_module import own_callable, own_code_failed
 
 
 def named_callback(name: str) -> object:
-    """Make the callback of this name. Raises `UsageError`."""
+    """Make the callback with this name. Raises `UsageError` if it isn't found, or if the factory raises."""
     what = f"callback {name}"
     found = own_callable(name, what, "mine:EarlyStop")
     try:

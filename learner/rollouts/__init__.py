@@ -1,1 +1,1 @@
-"""Tickets, lanes and rollouts: what each worker collects and what became of it."""
+"""Tickets, lanes and rollouts: which worker collects what, and what has become of it."""

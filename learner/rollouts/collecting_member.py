@@ -1,4 +1,4 @@
-"""A worker as the learner of a run sees it. Plain data."""
+"""A worker that collects rollouts, as the learner of a run sees it. Plain data."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ class CollectingMember(Member):
     """A worker that collects rollouts and plays evaluations."""
 
     strikes: int = 0
-    """Number of the worker's rollouts and messages that could not be used."""
+    """The number of the worker's rollouts and messages that could not be used."""
     ended_steps: int = 0
-    """Env steps that its process made before this session, and those of its rollouts and evaluations that have arrived."""
+    """The env steps that its process made before this session, plus those of its rollouts and evaluations that arrived."""
 
     @property
     def steps_under_way(self) -> int:
@@ -25,8 +25,8 @@ class CollectingMember(Member):
         return 0 if self.heartbeat is None else max(0, self.heartbeat.steps - self.ended_steps)
 
     def record_heartbeat(self, heartbeat: Heartbeat) -> list[int]:
-        """Keep the heartbeat. Returns the tickets that were lost on the way."""
-        if self.has_counted or not heartbeat.tickets:  # it works on nothing that was asked for in this session
+        """Record a heartbeat. Returns the tickets that were lost on the way to the worker."""
+        if self.has_counted or not heartbeat.tickets:  # the worker has no unfinished work of this session
             self.ended_steps = heartbeat.steps
         return super().record_heartbeat(heartbeat)
 

@@ -1,17 +1,17 @@
 """The tickets of one evaluation: which episodes are still to be played, and who plays them. Pure.
 
-Rule: the seeds are cut into tickets of `copies` seeds, whatever the number of workers, so the result does not depend on that
-number. The workers that only evaluate play an evaluation beside training; all active workers, also those without a lane,
-play any other. A ticket whose worker is lost goes to another. The numbers of these tickets start at `FIRST_TICKET`, far
-above those of rollouts, and the ledger does not count them.
+Rule: the seeds are divided into tickets of `copies` seeds, whatever the number of workers, so the result does not depend on
+that number. If an evaluation runs alongside training, only the workers that do nothing but evaluate play it; otherwise all
+active workers do, including those without a lane. A ticket whose worker is lost goes to another worker. The numbers of these
+tickets start at `FIRST_TICKET`, far above those of rollouts, and the ledger does not count them.
 
-Rule: a worker that claims to play and never answers must not block the learner forever, and can't be told from a slow one.
-So if a worker takes long (`stall_watch.py` says when), `share` gives its ticket to a second worker as well. The seeds
-determine what is played, so it does not matter who answers first: the first answer counts. The late worker gets tickets only
-if nobody else can play, until it joins again.
+Rule: a worker that claims to play and never answers must not block the learner forever, but can't be told from a slow one.
+So if a worker takes too long (`stall_watch.py` says when), `share` gives its ticket to a second worker as well. The seeds
+determine the episodes, so it does not matter who answers first: the first answer counts. Until it joins again, the late
+worker gets tickets only if nobody else can play.
 
-Rule: rows count only together with the answer of the worker that sent them. What a worker sent before it was lost, or before
-an answer that could not be used, is dropped, and its ticket is played again from the start.
+Rule: rows count only together with the answer of the worker that sent them. If a worker is lost, or its answer can't be
+used, its rows are dropped, and its ticket is played again from the start.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ from millrace.protocol.rows.rollout_checks import wrong_episode
 from millrace.protocol.specs import RunSpec
 
 FIRST_TICKET = 1 << 52
-HELD_AT_ONCE = 2  # tickets of one worker: while the learner takes the answer to one, the worker plays the other
+HELD_AT_ONCE = 2  # the most tickets of a worker: while the learner reads the answer to one, the worker plays the other
 
 OnRows = Callable[[int, EpisodeRows], None]
 """Called with the number of an episode (the index of its seed in the plan) and some of its rows, in order.
 
-All rows of a ticket come at once, when its answer has come.
+It is called with all rows of a ticket in succession, once the answer to the ticket has arrived.
 """
 
 
@@ -49,34 +49,35 @@ class EvaluationPlan:
     """The episodes of one evaluation."""
 
     seeds: tuple[int, ...]
-    """reset seed of each episode"""
+    """the reset seed of each episode"""
     copies: int
-    """seeds of a ticket: as many episodes are played side by side on one worker"""
+    """the number of seeds in a ticket, which is how many episodes a worker plays at the same time"""
     most_steps: int
-    """an episode that reaches this number of env steps is cut"""
+    """the number of env steps at which an episode is cut"""
     greedy: bool = True
-    """take the most probable actions; otherwise draw them"""
+    """whether to take the most probable actions; if not, actions are sampled"""
     send_rows: bool = False
     send_frames: bool = False
     of_best: bool = False
-    """the weights are those of the best policy of the run"""
+    """whether the weights are those of the best policy of the run"""
     opponents: tuple[int, ...] = ()
-    """with teams: the opponents, as in a `Permit`, which take turns"""
+    """with teams, the opponents, numbered as in a `Permit`, which play in turn"""
 
     @staticmethod
     def of(episodes: int, seed: int, copies: int, max_steps: int, purpose: Purpose = Purpose.EPISODES) -> EvaluationPlan:
-        """Greedy episodes, with reset seeds of this purpose.
+        """A plan of greedy episodes, with reset seeds for this purpose.
 
-        `max_steps`: env steps that the whole evaluation may take. Each episode gets an equal share, at least one step.
+        `max_steps` is how many env steps the whole evaluation may take. Each episode gets an equal share, at least one step.
         """
         most_steps = min(max(1, max_steps // episodes), LARGEST)
         of_best = purpose is Purpose.CONFIRMATION
         return EvaluationPlan(episode_seeds(seed, episodes, purpose), copies, most_steps, of_best=of_best)
 
     def how_far(self, played: int, env_steps: int, bound: str = "at most", before: tuple[int, int] = (0, 0)) -> str:
-        """The evaluation's progress, for people: `played` episodes, and `env_steps` of these and of the running episodes.
+        """The evaluation's progress in words. `env_steps` are those of the `played` episodes and of the running ones.
 
-        `bound`: what limits an episode, such as the name of a flag. `before`: episodes and env steps of earlier plans.
+        `bound` introduces the largest number of steps, for example with the name of a flag. `before` are the episodes and
+        env steps of earlier plans.
         """
         episodes, steps = before
         counted = f"{episodes + played:,} of {episodes + len(self.seeds):,} episodes, {steps + env_steps:,} env steps"
@@ -84,20 +85,20 @@ class EvaluationPlan:
 
 
 def episode_seeds(seed: int, episodes: int, purpose: Purpose = Purpose.EPISODES) -> tuple[int, ...]:
-    """The reset seed of each episode. A smaller number of episodes gets the first of these seeds."""
+    """The reset seed of each episode. With fewer episodes, the seeds are the first of those with more."""
     return tuple(env_seed(seed, purpose, episode) for episode in range(episodes))
 
 
 @dataclass(frozen=True)
 class PlayedEpisode:
-    """An episode that was played to its end, or cut."""
+    """An episode that was played to its end or was cut."""
 
     episode: Episode
     cut: bool
 
 
 def evaluation_of(played: Sequence[PlayedEpisode], facts: Sequence[str] = ()) -> Evaluation:
-    """The evaluation that consists of these episodes. `facts`: the names of their facts."""
+    """The evaluation that consists of these episodes. `facts` are the names of their facts."""
     episodes = [one.episode for one in played]
     cut = sum(one.cut for one in played)
     evaluation = Evaluation.of([episode.reward for episode in episodes], [episode.length for episode in episodes], cut)
@@ -112,27 +113,27 @@ class EvaluationDealer:
     """The tickets of the evaluation that is pending, if there is one."""
 
     def __init__(self, run: RunSpec) -> None:
-        """`run` says what rows and episodes look like."""
+        """`run` describes the form of rows and episodes."""
         self.held: dict[int, Member] = {}
         """the tickets that workers hold, by number"""
         self.second: dict[int, Member] = {}
-        """the tickets among these that a second worker plays as well"""
+        """the second worker of each of these tickets that has one, by number"""
         self.most_copies: int | None = None
-        """largest number of env copies that play, on all workers together, unless one worker has more; None: no limit"""
+        """the largest number of env copies that play, summed over all workers (but one worker always may); None: no limit"""
         self._run = run
         self.beside = False
-        """whether the pending evaluation is beside training"""
-        self._most_workers = 0  # largest number of workers that play, if copies are limited; 0: as many as the limit allows
+        """whether the pending evaluation runs alongside training"""
+        self._most_workers = 0  # the most workers that play if copies are limited; 0: as many as the limit allows
         self._plan: EvaluationPlan | None = None
         self.version = -1
-        """of the weights that are evaluated"""
+        """the version of the weights that are evaluated"""
         self._on_rows: OnRows | None = None
         self._first = FIRST_TICKET  # number of the first ticket of this evaluation
-        self._seeds: list[tuple[int, ...]] = []  # of each ticket
-        self._undealt: list[int] = []  # heap: indices of tickets that no worker has
-        self._played: dict[int, Evaluated] = {}  # by index of the ticket
+        self._seeds: list[tuple[int, ...]] = []  # seeds of each ticket
+        self._undealt: list[int] = []  # a heap of the indices of tickets that no worker has
+        self._played: dict[int, Evaluated] = {}  # answers, by index of the ticket
         self._rows: dict[tuple[int, bytes], dict[int, list[EpisodeRows]]] = {}  # by ticket index and worker, then by episode
-        self._late: set[int] = set()  # the sessions of workers whose ticket a second worker has answered
+        self._late: set[int] = set()  # sessions of workers whose ticket a second worker has answered first
 
     @property
     def pending(self) -> bool:
@@ -141,12 +142,12 @@ class EvaluationDealer:
 
     @property
     def done(self) -> bool:
-        """Whether all episodes of the pending evaluation were played."""
+        """Whether all episodes of the pending evaluation have been played."""
         return self._plan is not None and len(self._played) == len(self._seeds)
 
     @property
     def episodes_played(self) -> int:
-        """Number of episodes of the pending evaluation that were played."""
+        """The number of episodes of the pending evaluation that have been played."""
         return sum(len(self._seeds[index]) for index in self._played)
 
     @property
@@ -160,7 +161,7 @@ class EvaluationDealer:
         return list({member.peer: member for member in [*self.held.values(), *self.second.values()]}.values())
 
     def begin(self, plan: EvaluationPlan, version: int, on_rows: OnRows | None = None, *, beside: bool = False) -> None:
-        """Begin to evaluate this version, `beside` training if so. `deal` then gives out the tickets."""
+        """Begin to evaluate this version, alongside training if `beside`. Then call `deal`, which gives out the tickets."""
         assert not self.pending, "an evaluation is pending"
         self._first += len(self._seeds)
         self._plan = plan
@@ -174,9 +175,9 @@ class EvaluationDealer:
         self._rows = {}
 
     def all_play(self) -> None:
-        """Let all workers play the pending evaluation, which was beside training.
+        """Let all workers play the pending evaluation, which has run alongside training.
 
-        If copies are limited, one other worker plays.
+        If copies are limited, only one of the other workers plays.
         """
         self.beside = False
         self._most_workers = 1
@@ -184,7 +185,7 @@ class EvaluationDealer:
     def end(self) -> list[PlayedEpisode]:
         """End the evaluation.
 
-        Returns its episodes in the order of the seeds; if it isn't done, only those that were played.
+        Returns its episodes in the order of the seeds; if it isn't done, only those that have been played.
         """
         for number, member in [*self.held.items(), *self.second.items()]:
             del member.tickets[number]
@@ -196,10 +197,10 @@ class EvaluationDealer:
         return [PlayedEpisode(*both) for answer in answers for both in zip(answer.episodes, answer.cut, strict=True)]
 
     def deal(self, active: Sequence[Member]) -> list[Outgoing]:
-        """Give tickets to the workers among these that play: one to each, then a second while there are plenty.
+        """Give a ticket to each of these workers that plays, and then a second one as long as there are plenty.
 
-        They are in the order of joining, those that only evaluate first. If copies are limited, the first ones play, because
-        a worker keeps its copies.
+        Workers that only evaluate come first; otherwise, they are in the order of joining. If copies are limited, only the
+        first workers play, because a worker keeps its copies.
         """
         plan = self._plan
         out = list[Outgoing]()
@@ -230,7 +231,7 @@ class EvaluationDealer:
         return self.send(idle[0], alone[:1])
 
     def send(self, member: Member, tickets: Iterable[int]) -> list[Outgoing]:
-        """The orders for these tickets, as far as they belong to an evaluation."""
+        """The orders for those of these tickets that belong to the evaluation."""
         return [(member.peer, self._order(member, number)) for number in tickets if number in self.held]
 
     def take_in(self, member: Member, answer: Evaluated) -> str:
@@ -239,7 +240,7 @@ class EvaluationDealer:
         Returns what is wrong with it, or an empty string; a wrong answer's ticket goes to another worker.
         """
         if not self._plays(member, answer.ticket):
-            return ""  # it arrived twice, after the end, or after another worker's answer
+            return ""  # the answer arrived twice, after the end, or after another worker's answer
         index = answer.ticket - self._first
         if why := self._wrong(answer, len(self._seeds[index])):
             self.lose(member, answer.ticket)
@@ -260,7 +261,7 @@ class EvaluationDealer:
         return ""
 
     def take_rows(self, member: Member, rows: EpisodeRows) -> str:
-        """Keep rows until their answer arrives.
+        """Store rows until their answer arrives.
 
         Returns what is wrong with them, or an empty string. Repeated rows are ignored.
         """
@@ -279,7 +280,7 @@ class EvaluationDealer:
         return ""
 
     def lose(self, member: Member, number: int) -> None:
-        """A member doesn't play this ticket any more: if nobody else plays it, it will be dealt again."""
+        """Record that a member no longer plays this ticket. If nobody else plays it, it will be dealt again."""
         other = self.held[number] if self.second.get(number) is member else self.second.get(number)
         if other is None:
             heapq.heappush(self._undealt, self._end(number))
@@ -298,9 +299,10 @@ class EvaluationDealer:
         return Counter(member.peer for member in [*self.held.values(), *self.second.values()])
 
     def _who_may_play(self, members: Sequence[Member], plan: EvaluationPlan) -> list[Member]:
-        """The workers among these that may play: first those that only evaluate, and late ones only if there is no other.
+        """Those of these workers that may play. Late workers play only if all are late.
 
-        If copies are limited, the first ones play, because a worker keeps its copies.
+        Workers that only evaluate come first. If copies are limited, only the first workers play, because a worker keeps its
+        copies.
         """
         players = sorted(members, key=lambda member: not member.hello.evaluates)
         players = [member for member in players if member.session not in self._late] or players
@@ -339,7 +341,7 @@ class EvaluationDealer:
         )
 
     def _matches(self, number: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
-        """For each episode of a ticket, the opponent and the evaluated team: each opponent meets all teams."""
+        """The opponents and the evaluated teams of a ticket's episodes, chosen so that each opponent meets all teams."""
         plan = self._plan
         count = len(self._run.teams)
         if plan is None or not count:
@@ -363,5 +365,5 @@ class EvaluationDealer:
 
 
 def _end(rows: Sequence[EpisodeRows]) -> int:
-    """The first step of an episode that isn't in these rows."""
+    """The first step of an episode that these rows don't contain."""
     return rows[-1].first_step + len(rows[-1].reward) if rows else 0

@@ -1,7 +1,8 @@
-"""The hub: link, ticket coordinator and clock together. A training loop waits only in `gather` and in `evaluate`.
+"""The hub: joins link, ticket coordinator and clock. Through it, a training loop gathers rollouts and publishes weights.
 
-It is all that `millrace.learner.train` knows of the rest, and what `millrace.RolloutService` gives to your own loop.
-Rule: every wait has a deadline and says what it waits for.
+`millrace.learner.train` deals with workers only through the hub, and so does `millrace.RolloutService` for your own loop. A
+loop waits only in `wait_for`, `gather`, `end_evaluation` and `drain`. Rule: every wait has a deadline, and the log says what
+it waits for.
 """
 
 from __future__ import annotations
@@ -45,9 +46,10 @@ log = logging.getLogger("millrace.learner")
 
 T = TypeVar("T")
 POLL_S = 0.1
-GOODBYE_WITHIN_S = 5.0  # at the end of a run: late rollouts are still counted
-GOODBYE_IF_CUT_SHORT_S = 2.0  # if the work is cut short, or if no episode is missing
-# Least interval between two pulses. A minibatch may take only a tenth of it, and one pulse takes as long as a minibatch.
+GOODBYE_WITHIN_S = 5.0  # how long to wait for Goodbyes at the end of a run; late rollouts are still counted meanwhile
+GOODBYE_IF_CUT_SHORT_S = 2.0  # how long to wait if the work is cut short, or if no episode is missing
+# Least interval between two pulses that do something. A pulse takes as long as a small minibatch, of which there may be ten
+# within this interval.
 PULSE_S = 0.003
 
 
@@ -60,18 +62,18 @@ class HubSettings:
     max_env_failures: int
     """How many failures the run survives, as `FailureCount` counts them."""
     acting_dtype: ActingDtype = "float32"
-    """Dtype in which parameters are sent."""
+    """The dtype in which parameters are sent."""
 
 
 class HubSnapshot(NamedTuple):
-    """State of the hub at one moment, for metrics and checkpoints. Cheap to make, and never changed later."""
+    """The state of the hub at one moment, for metrics and checkpoints. It is cheap to make, and never changes later."""
 
     ledger: Ledger
-    """Copy of the hub's ledger."""
+    """A copy of the hub's ledger."""
     incarnations: list[int]
-    """Next incarnation of each lane."""
+    """The next incarnation of each lane."""
     lags: list[int]
-    """Lag of each rollout of the last `gather`."""
+    """The lag of each rollout of the last `gather`."""
     taken_s: float = 0.0
     """Time of the snapshot, by the hub's clock."""
     progress: Progress = Progress()
@@ -87,25 +89,25 @@ class HubSnapshot(NamedTuple):
     evaluate_s: float = 0.0
     """Seconds spent in evaluations since this learner started."""
     learn_s: float = 0.0
-    """Seconds spent on neither, since it first waited for rollouts."""
+    """Seconds spent on anything else, since the learner first waited for rollouts."""
     waiting: str = ""
-    """Who waits for whom, in one line for people; empty if nobody waits long."""
+    """A line for people that says who waits for whom; empty if nobody has waited for long."""
     roles: Mapping[str, str] = {}
-    """`Member.role` of each worker, by its name."""
+    """The `Member.role` of each worker, by its name."""
     worker_stages: Stages = {}
-    """Seconds in each stage, of all workers since this learner started, also of those that have left."""
+    """Total seconds of all workers in each stage since this learner started, including workers that have left."""
     received: tuple[int, int] = (0, 0)
-    """Number of messages and of bytes."""
+    """Number of messages received, and of their bytes."""
     sent: tuple[int, int] = (0, 0)
-    """Number of messages and of bytes."""
+    """Number of messages sent, and of their bytes."""
     refused_messages: int = 0
-    """Number of messages with revoked keys."""
+    """Number of messages that were refused because their sender's key was revoked."""
     refused_handshakes: int = 0
     """Number of handshakes that failed."""
 
 
 HubObserver = Callable[["Hub"], None]
-"""Called with the hub each time that it has listened to the workers."""
+"""Called with the hub each time it has listened to the workers."""
 
 
 class Hub:
@@ -121,7 +123,7 @@ class Hub:
         observer: HubObserver = lambda hub: None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """`check_interrupt` is called while the hub waits: what it raises ends the wait."""
+        """`check_interrupt` is called while the hub waits; an exception that it raises ends the wait."""
         self.link = link
         self.coordinator = coordinator
         self.settings = settings
@@ -130,7 +132,7 @@ class Hub:
         self._check_interrupt = check_interrupt
         self._observer = observer
         self._clock = clock
-        self._lags: list[int] = []  # lag of each rollout of the last `gather`
+        self._lags: list[int] = []  # the lag of each rollout of the last `gather`
         self.lag_statistics = LagStatistics()
         self._progress = Progress()
         run = coordinator.run
@@ -161,8 +163,8 @@ class Hub:
     ) -> None:
         """Set the newest weights. The arrays must not change afterwards.
 
-        `deal`: deal the tickets of the next update now; otherwise `gather` does, because these weights are evaluated first.
-        `env_steps`: number of env steps of training so far; None: the weights never become an opponent.
+        If `deal`, deals the tickets of the next update now; if not, `gather` deals them, because these weights are evaluated
+        first. `env_steps` is the number of env steps of training so far; with None, the weights never become an opponent.
         Raises `RunError` if a parameter is too large for `acting_dtype`.
         """
         sent = to_wire_dtype(parameters, self.settings.acting_dtype)
@@ -173,7 +175,7 @@ class Hub:
             self._server.send(self.coordinator.begin_update())
 
     def keep_opponents(self, parameters: Array, buffers: Array) -> None:
-        """Keep the weights [n, P] and buffers [n, B] of the snapshots of a resumed run."""
+        """Restore the weights [n, P] and buffers [n, B] of the n snapshots of a resumed run."""
         pool = self.coordinator.rollouts.opponents
         versions = [] if pool is None else pool.versions
         for version, of_version, its_buffers in zip(versions, parameters, buffers, strict=True):
@@ -181,7 +183,7 @@ class Hub:
             self.coordinator.weights.kept[version] = Weights(version, sent, its_buffers)
 
     def opponent_policies(self) -> tuple[Floats, Floats] | None:
-        """The weights and buffers of all snapshots, float32, if there are any."""
+        """The weights [n, P] and buffers [n, B] of all n snapshots, float32; None if there are none."""
         kept = self.coordinator.weights.kept
         pool = self.coordinator.rollouts.opponents
         if pool is None or not pool.versions:
@@ -194,9 +196,9 @@ class Hub:
         return self.coordinator.past()
 
     def gather(self, watch: Callable[[], None] = lambda: None) -> list[AcceptedRollout]:
-        """The rollouts of the next update. Raises `NoWorkers`, `Stalled`, `EnvironmentFailed` or `PolicyFailed`.
+        """Wait for the rollouts of the next update. Raises `NoWorkers`, `Stalled`, `EnvironmentFailed` or `PolicyFailed`.
 
-        `watch` is called at least every `POLL_S` of a long wait.
+        During a long wait, `watch` is called at least every `POLL_S` seconds.
         """
         began_s = self._clock()
         wait = LongWait(began_s)
@@ -229,19 +231,22 @@ class Hub:
         self.lag_statistics.not_used(self._lags)
 
     def begin_evaluation(self, plan: EvaluationPlan, on_rows: OnRows | None = None, *, beside: bool = False) -> None:
-        """Let the workers play these episodes with the newest weights; if `beside` training, those that only evaluate."""
+        """Let the workers play these episodes with the newest weights.
+
+        If `beside`, this runs alongside training, and only the workers that do nothing but evaluate play.
+        """
         self._server.send(self.coordinator.begin_evaluation(plan, on_rows, beside=beside))
 
     def end_evaluation(self, watch: Callable[[int, int], None]) -> list[PlayedEpisode]:
-        """Wait for the evaluation that was begun. Returns its episodes in the order of their seeds.
+        """Wait for the pending evaluation. Returns its episodes in the order of their seeds.
 
-        `watch` is called with the numbers of episodes played and of env steps, at least every `POLL_S`. Raises like
-        `gather`.
+        `watch` is called with the number of episodes played and the number of env steps, at least every `POLL_S` seconds.
+        Raises what `gather` raises.
         """
         evaluation = self.coordinator.evaluation
         steps_before = self._worker_steps()
-        wait = LongWait(self._clock())  # since env steps were made
-        steps = steps_before  # how many there were then
+        wait = LongWait(self._clock())  # begins again with each new env step
+        steps = steps_before  # the number of env steps when `wait` began
 
         def watch_and_log() -> None:
             nonlocal wait, steps
@@ -252,7 +257,7 @@ class Hub:
                 steps = steps_now
             elif wait.due(now):
                 log.warning("no env steps for %.0f s: %s", wait.seconds(now), self._server.what_workers_do())
-            watch(evaluation.episodes_played, max(0, steps_now - steps_before))  # the number falls if a worker is lost
+            watch(evaluation.episodes_played, max(0, steps_now - steps_before))  # the difference falls if a worker is lost
 
         def done() -> bool | None:
             if not evaluation.done and evaluation.beside:
@@ -274,15 +279,15 @@ class Hub:
         return played
 
     def pulse(self) -> None:
-        """Answer the workers, then remove those that have been silent for too long, unless that was just done.
+        """Answer the workers, then remove those that have been silent for too long, unless this was done just before.
 
-        Called between minibatches. Never waits, never ends the run. It takes no longer than the work since the last call.
+        Called between minibatches. Never waits, never ends the run, and takes no longer than the work since the last call.
         """
         if self._clock() - self._server.listened_s >= PULSE_S:
             self._listen(0.0, short=True)
 
     def drain(self, reason: str, timeout_s: float = GOODBYE_WITHIN_S) -> None:
-        """Ask every worker to leave and wait for their Goodbye, at most `timeout_s`. Late rollouts are counted."""
+        """Ask every worker to leave, and wait at most `timeout_s` for their Goodbyes. Late rollouts are counted."""
         self._server.send(self.coordinator.drain(reason))
         self._server.wait_until_all_left(self._clock() + timeout_s, POLL_S)
         if late := [member.hello.worker for member in self.coordinator.members.values()]:
@@ -290,17 +295,17 @@ class Hub:
         self._observer(self)
 
     def waiting(self, now: float) -> str:
-        """Who waits for whom, in one line for people; empty if nobody waits long."""
+        """A line for people that says who waits for whom; empty if nobody has waited for long."""
         return self._time.line(now)
 
     # ---------------------------------------------------------------- progress and state
 
     def report_progress(self, progress: Progress) -> None:
-        """Store the progress of the run, for requests of the status."""
+        """Store the progress of the run, with which status requests are answered."""
         self._progress = progress
 
     def progress(self) -> RunProgress:
-        """How far the run is: the progress that was last reported, updated with what the hub knows now."""
+        """How far the run has got: the progress that was last reported, updated with what the hub knows now."""
         return progress_now(self.coordinator, self._progress, self.waiting(self._clock()), self._time.phase)
 
     def status(self, now: float) -> Status:
@@ -309,11 +314,11 @@ class Hub:
 
     @property
     def workers_expected(self) -> int:
-        """Number of worker processes that the user asked for; 0: any number."""
+        """The number of worker processes that the user asked for; 0 for any number."""
         return self._processes.expected
 
     def workers_alive(self) -> int:
-        """Number of workers that step the environment."""
+        """The number of workers that step the environment."""
         stepping = self._processes.stepping()
         return len(self.coordinator.members if stepping is None else stepping)
 
@@ -347,7 +352,7 @@ class Hub:
     # ---------------------------------------------------------------- what the server tells
 
     def happened(self, event: Event) -> None:
-        """Count what has arrived, and what has failed."""
+        """Count rollouts and episodes that have arrived, and failures."""
         match event:
             case RolloutArrived(worker, lane, version):
                 self.lag_statistics.arrived(worker, version, self._clock())
@@ -358,17 +363,17 @@ class Hub:
                 self._count_failure(event)
 
     def sent(self, peer: bytes) -> None:
-        """Do nothing when a message was sent."""
+        """Called when a message was sent. Does nothing."""
 
     # ---------------------------------------------------------------- inside
 
     def _wait(
         self, done: Callable[[], T | None], progress: Callable[[], int], watch: Callable[[], None], nothing_came: str
     ) -> T:
-        """Listen until `done` returns something. Refuses workers that hold tickets idly; raises `Stalled` if all do.
+        """Listen until `done` returns something, and return that. Calls `watch` after each turn.
 
-        `progress` changes with each progress of the awaited work. `watch` is called after each turn. `nothing_came`: the
-        error.
+        Refuses workers that hold tickets without making progress. Raises `Stalled` if all of them do; `nothing_came` begins
+        its message. The result of `progress` must change whenever the awaited work makes progress.
         """
         self._stall_watch.begin(self._clock())
         self._turn(0.0)
@@ -388,7 +393,7 @@ class Hub:
         return result
 
     def _share_evaluation(self, now: float) -> None:
-        """Let a free worker, if there is one, also play the ticket that another one has played for too long."""
+        """Let an idle worker, if there is one, also play the ticket that another worker has played for too long."""
         if out := self.coordinator.share_evaluation():
             seconds = self.settings.stall_timeout_s
             line = self.waiting(now)
@@ -396,7 +401,7 @@ class Hub:
             self._server.send(out)
 
     def _worker_steps(self) -> int:
-        """Env steps of all workers, as of their last heartbeats."""
+        """The total env steps of all workers, as of their last heartbeats."""
         heartbeats = (member.heartbeat for member in self.coordinator.members.values())
         return sum(heartbeat.steps for heartbeat in heartbeats if heartbeat is not None)
 

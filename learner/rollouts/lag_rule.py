@@ -1,8 +1,8 @@
 """The lag rule: how far the acting weights may be behind the newest ones, and so which weights act in which round. Pure.
 
-Rule: update u takes round u, which is one rollout of every lane. All of them are collected with one version of the weights:
-the newest one when update u - L began, or when the first update began if u < L, where L is `max_lag`. So results don't
-depend on anybody's speed. Once update u has begun, the rounds up to u + L may be collected.
+Rule: update u uses round u, which is one rollout of every lane. All rollouts of a round are collected with one version of
+the weights: the newest one when update u - L began, or when the first update began if u < L, where L is `max_lag`. So
+results don't depend on the speed of workers or learner. Once update u has begun, the rounds up to u + L may be collected.
 """
 
 from __future__ import annotations
@@ -15,34 +15,37 @@ class Rounds:
     """The rounds of one run, counted from 0."""
 
     def __init__(self, max_lag: int, next_round: int = 0, versions: Mapping[int, int] = MappingProxyType({})) -> None:
-        """`next_round`, `versions`: a resumed run's next round, and the versions that act in its open rounds."""
+        """For a resumed run, `next_round` is its next round, and `versions` are those that act in its open rounds."""
         self.max_lag = max_lag
         """L"""
         self.next = next_round
         """the round of the next update"""
         self._saved = {number: versions[number] for number in sorted(versions) if number <= next_round + max_lag}
-        # of the rounds that were open before the run was interrupted, and are not yet open again
+        # by round, the versions in rounds that were open when the run was interrupted, and have not been opened again
         self._versions: dict[int, int] = {}
-        # of each round that may be collected and was not taken
+        # by round, the versions in rounds that are open: they may be collected, and were not taken
 
     def begin(self, newest: int) -> range:
-        """Begin the next update, with this version as the newest. Returns the rounds that it opens, once."""
+        """Begin the next update, with `newest` as the newest version. Returns the rounds that this opens.
+
+        A second call for the same update opens none.
+        """
         opened = range(self.next + len(self._versions), self.next + 1 + self.max_lag)
         self._versions |= {number: self._saved.pop(number, newest) for number in opened}
         return opened
 
     def end(self) -> None:
-        """Close the round of the next update, which has taken its rollouts."""
+        """Close the round of the next update, whose rollouts were taken."""
         del self._versions[self.next]
         self.next += 1
 
     def version(self, number: int) -> int:
-        """The version that acts in this open round."""
+        """The version that acts in this round, which must be open."""
         return self._versions[number]
 
     @property
     def versions(self) -> Mapping[int, int]:
-        """The version that acts in each round that is open, or will be as soon as the next update begins."""
+        """The version that acts in each round that is open, or that a resumed run is about to open again, by round."""
         return self._saved | self._versions
 
     def acting(self) -> set[int]:

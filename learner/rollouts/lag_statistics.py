@@ -1,8 +1,8 @@
 """Measures the lag of rollouts, and how long new weights take to reach the environments. Pure.
 
-The lag of a rollout is the learner's version minus the rollout's version, when the rollout is used. The first-use time of a
-worker runs from publishing weights to the arrival of its first rollout with them. It includes the time on the network, the
-time in the worker and the time that one rollout takes.
+The lag of a rollout is the learner's version minus the rollout's version at the time when the rollout is used. The first-use
+time of a worker is the time from the publication of weights to the arrival of the worker's first rollout with them. It
+includes the time on the network, the time in the worker and the time that one rollout takes.
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ from collections import Counter, defaultdict, deque
 from collections.abc import Iterable
 from statistics import median
 
-MOST_VERSIONS = 1_000  # the oldest is forgotten
-MOST_MEASUREMENTS = 1_000  # of each worker; the oldest is forgotten
-MOST_WORKERS = 1_000  # the one that was not heard for longest is forgotten
+MOST_VERSIONS = 1_000  # how many versions are remembered; the oldest is forgotten first
+MOST_MEASUREMENTS = 1_000  # how many measurements are remembered per worker; the oldest is forgotten first
+MOST_WORKERS = 1_000  # how many workers are remembered; the one heard from least recently is forgotten first
 
 
 class LagStatistics:
@@ -21,22 +21,22 @@ class LagStatistics:
 
     def __init__(self) -> None:
         self.lags: Counter[int] = Counter()
-        """rollouts that were used, by their lag"""
+        """the number of rollouts that were used, by their lag"""
         self._published_s: dict[int, float] = {}
-        self._newest_used: dict[str, int] = {}  # by worker: the newest version in its rollouts
+        self._newest_used: dict[str, int] = {}  # by worker, the newest version in its rollouts
         self._first_use_s: dict[str, deque[float]] = defaultdict(lambda: deque(maxlen=MOST_MEASUREMENTS))
 
     def published(self, version: int, now: float) -> None:
-        """From now on, rollouts may be collected with these weights."""
+        """Record that rollouts may be collected with this version of the weights from now on."""
         self._published_s[version] = now
         self._published_s.pop(version - MOST_VERSIONS, None)
 
     def arrived(self, worker: str, version: int, now: float) -> None:
-        """A rollout of this worker, collected with this version, arrived."""
+        """Record the arrival of a rollout that this worker collected with this version."""
         newest = self._newest_used.pop(worker, -1)
         if version > newest and version in self._published_s:
             self._first_use_s[worker].append(now - self._published_s[version])
-        self._newest_used[worker] = max(version, newest)  # at the end: the first is the one that was not heard for longest
+        self._newest_used[worker] = max(version, newest)  # at the end, so the first worker is the one least recently heard
         if len(self._newest_used) > MOST_WORKERS:
             forgotten = next(iter(self._newest_used))
             del self._newest_used[forgotten]
@@ -49,10 +49,10 @@ class LagStatistics:
     def not_used(self, lags: Iterable[int]) -> None:
         """Take back the lags of rollouts whose update failed."""
         self.lags.subtract(lags)
-        self.lags = +self.lags  # without those that are 0 now
+        self.lags = +self.lags  # drops counts that are 0 now
 
     def histogram(self) -> dict[str, int]:
-        """Number of rollouts that were used, by lag, in ascending order. Keys are strings, as in JSON."""
+        """The number of rollouts that were used, by lag, in ascending order. Keys are strings, as in JSON."""
         return {str(lag): self.lags[lag] for lag in sorted(self.lags)}
 
     def first_use_s(self) -> dict[str, float]:

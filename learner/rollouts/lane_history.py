@@ -1,9 +1,9 @@
-"""What the learner knows about a lane's past, accumulated from its rollouts. Pure.
+"""The learner's record of a lane's past, accumulated from its rollouts. Pure.
 
 Rule: a history is a fold over the rollouts of a lane in the order of their rounds, whoever collected them, and whether or
-not they are used. It keeps only what a worker needs to continue where they end (`protocol/lane_past.py`): how the newest
-episode of each copy began, and the actions since. An episode cannot be replayed if it is longer than the limit, or if it
-isn't known how it began: if the lane is lost, the copy starts anew.
+not an update used them. It keeps only what a worker needs to continue where they end (`protocol/lane_past.py`): how the
+newest episode of each copy began, and the actions since. An episode cannot be replayed if it is longer than the limit, or if
+it isn't known how it began. If the lane is lost, the copy of such an episode starts afresh.
 """
 
 from __future__ import annotations
@@ -24,41 +24,41 @@ class _OfRound:
     """The rows of one rollout."""
 
     first: int
-    """number of the first row, counted since the history began"""
+    """the number of the first row, counted since the history began"""
     action: Array
     """[T, N · A, *action]"""
     attributes: bytes
-    """the attributes that the copies had, packed"""
+    """the attributes that were set on the copies, packed"""
 
 
 @dataclass
 class LaneHistory:
-    """The past of one lane of N env copies, as it grows."""
+    """The past of one lane of N env copies with A seats each, which grows with each rollout."""
 
     copies: list[LastEpisode]
-    """[N]; their rows are counted since the history began"""
+    """[N] the newest episode of each copy; rows are counted since the history began"""
     most_steps: int
-    """largest number of steps of an episode that is replayed"""
+    """the largest number of steps of an episode that is replayed"""
     rows: deque[_OfRound] = field(default_factory=deque)
-    """since the earliest of the episodes that can be replayed"""
+    """the rows since the beginning of the earliest episode that can be replayed"""
     count: int = 0
-    """number of rows since the history began"""
+    """the number of rows since the history began"""
     obs: tuple[Array, ...] = ()
-    """[N · A, *leaf] each, then the mask if there are masks, after the last row"""
+    """[N · A, *leaf] each: the observations after the last row, then the masks if there are any"""
     memory: tuple[Array, ...] = ()
     too_long: dict[int, int] = field(default_factory=dict)
-    """for each copy whose running episode has become too long to be replayed: the number of its first row"""
+    """for each copy whose running episode has become too long to be replayed, the number of the episode's first row"""
     no_rows: Array = field(default_factory=lambda: np.zeros(0, np.float32))
-    """[0, N · A, *action]"""
+    """[0, N · A, *action] an empty array with the shape and dtype of actions"""
 
     def copy(self) -> LaneHistory:
-        """An independent copy."""
+        """An independent copy of this history."""
         return replace(self, copies=list(self.copies), rows=self.rows.copy(), too_long=dict(self.too_long))
 
     def add(self, rollout: Rollout, attributes: bytes) -> Bools:
-        """Add the next rollout of the lane. Returns [N] which copies had started anew when it began.
+        """Add the next rollout of the lane. Returns [N], True for copies that had started afresh when it began.
 
-        `attributes`: the attributes of its env copies, packed.
+        `attributes` are those of its env copies, packed.
         """
         T = len(rollout.action)
         began = {each.copy: each for each in rollout.begun}
@@ -78,21 +78,21 @@ class LaneHistory:
         return np.array([new.start != old.start for new, old in zip(self.copies, before, strict=True)])
 
     def forget(self) -> None:
-        """Mark all running episodes as not replayable: it isn't known what the copies did after the last row."""
+        """Mark all running episodes as not replayable, because it isn't known what the copies did after the last row."""
         self.copies = [LastEpisode(last.start, None, self.count, False) for last in self.copies]
         self.rows.clear()
 
     def start_anew(self, attempts: int, *, from_past: bool = True) -> None:
-        """Let all copies start anew after this many failed attempts to continue, without reusing the number of a start.
+        """Let all copies start afresh after this many failed attempts to continue. No start number is used twice.
 
-        `from_past`: whether the first attempt began from this history, so that some copies started anew in it.
+        `from_past` says whether the first attempt began from this history, so that some copies started afresh in it.
         """
-        tried = [last.start + (from_past and not last.goes_on) for last in self.copies]  # in the first attempt
+        tried = [last.start + (from_past and not last.goes_on) for last in self.copies]  # the starts of the first attempt
         self.copies = [LastEpisode(number + attempts - 1, None, self.count, False) for number in tried]
         self.rows.clear()
 
     def past(self, lane: int) -> LanePast:
-        """What a worker needs to continue the lane."""
+        """The past that a worker needs to continue the lane."""
         action = np.concatenate([self.no_rows, *(rows.action for rows in self.rows)])
         start = self.rows[0].first if self.rows else self.count
         return LanePast(
@@ -106,7 +106,7 @@ class LaneHistory:
 
     @classmethod
     def of(cls, past: LanePast, most_steps: int) -> LaneHistory:
-        """The history from a lane's past in a checkpoint, with the limit of the resumed run."""
+        """The history of a lane from its past in a checkpoint. `most_steps` is the limit of the resumed run."""
         found = cls(
             list(past.copies),
             most_steps,
@@ -130,8 +130,8 @@ class LaneHistory:
         return cls([LastEpisode(0, b"", 0, False)] * copies, most_steps)
 
     def _after(self, last: LastEpisode, began: EpisodeBegin | None, resets: Bools, T: int) -> LastEpisode:
-        """The newest episode of copy n, after T more rows. `resets` [T+1]: which rows only reset it."""
-        start = last.start if began is None else max(last.start, began.start)  # never reuse a number
+        """The newest episode of a copy after T more rows. `resets` [T+1] is True for rows that only reset it."""
+        start = last.start if began is None else max(last.start, began.start)  # never use a start number twice
         random = None if began is None else began.random
         if resets[T]:
             return LastEpisode(start, random, self.count + T, True)
@@ -140,19 +140,19 @@ class LaneHistory:
         return last if began is None else LastEpisode(start, random, self.count, False)
 
     def _saved(self, n: int) -> None:
-        """Drop the rows of copy n, because `memory` has its state after the last row."""
+        """Record that the rows of copy n aren't needed, because `memory` has its state after the last row."""
         last = self.copies[n]
         self.copies[n] = LastEpisode(last.start, last.random, self.count, last.over, saved=True)
 
     @property
     def longest_given_up(self) -> int:
-        """Steps of the longest episode that has become too long to be replayed; 0 if there is none."""
+        """The length, in steps, of the longest running episode that is too long to be replayed; 0 if there is none."""
         return max((self.count - first for first in self.too_long.values()), default=0)
 
     def _forget_long_ones(self, *, known: bool) -> None:
-        """Mark episodes that are not replayed, and keep only the rows of the others.
+        """Mark episodes that won't be replayed, and keep only the rows of the others.
 
-        `known`: whether the worker can continue at all.
+        `known` says whether workers can continue the lane at all.
         """
         for n, last in enumerate(self.copies):
             if last.goes_on:
@@ -171,12 +171,12 @@ class LaneHistory:
 
 
 def _needed_from(last: LastEpisode) -> int:
-    """The first row that is needed to replay an episode: the one that reset the copy, for the attributes at that time."""
+    """The first row needed to replay an episode: the row that reset the copy counts, for the attributes at that time."""
     return last.first - 1 if last.random and last.is_repeated else last.first
 
 
 def _resets(rollout: Rollout) -> Bools:
-    """[T+1, N] which rows only reset a copy; the last one is of the next rollout's first step."""
+    """[T+1, N] True for rows that only reset a copy. The last row stands for the first step of the next rollout."""
     if rollout.resets is not None:
         return np.asarray(rollout.resets, bool)
     over = rollout.terminated[-1:] | rollout.truncated[-1:]
@@ -184,7 +184,7 @@ def _resets(rollout: Rollout) -> Bools:
 
 
 def _changes(kept: Iterable[_OfRound], start: int) -> Iterable[AttributesFrom]:
-    """Where the attributes of these rows change, counted from `start`."""
+    """Yield the rows at which the attributes change, counted from `start`, with the new attributes."""
     before = b""
     for rows in kept:
         if rows.attributes != before:
@@ -194,19 +194,19 @@ def _changes(kept: Iterable[_OfRound], start: int) -> Iterable[AttributesFrom]:
 
 @dataclass(frozen=True)
 class LaneHistories:
-    """How histories are kept, and those that a resumed run begins with."""
+    """The settings of lane histories, and the pasts with which a resumed run begins."""
 
     copies: int = 1
-    """N"""
+    """N, the number of env copies of a lane"""
     most_steps: int = -1
-    """largest number of steps of an episode that is replayed; -1: none is"""
+    """the largest number of steps of an episode that is replayed; -1 if none is"""
     pasts: Sequence[LanePast] = ()
     """the pasts of lanes, from a checkpoint"""
 
     def of(self, lane: int) -> LaneHistory | None:
-        """The history of a lane when the run is resumed; None if it has no rollouts yet.
+        """The history of a lane when the run is resumed; None if the lane has no rollouts yet.
 
-        If the number of copies has changed, none of them continues.
+        If the number of copies has changed, no episode continues.
         """
         past = next((past for past in self.pasts if past.lane == lane), None)
         if past is None:

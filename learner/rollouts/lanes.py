@@ -1,8 +1,9 @@
 """The coordinator's records of lanes and tickets. Pure.
 
-Rule: a lane has one owner at a time. A new owner has new env copies for it: the incarnation rises, and rollouts are counted
-from 0 again. The new owner continues the lane's past, unless the environment has failed there, or every attempt to continue
-it was lost: then the copies start anew, so that they don't fail in the same way forever.
+Rule: a lane has one owner at a time. A new owner has new env copies for it, so the incarnation rises, and rollouts are
+counted from 0 again. The new owner continues the lane's past, unless the environment has failed there or every attempt to
+continue it ended with the loss of a worker. In these cases the copies start afresh, so that they don't fail in the same way
+forever.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from millrace.protocol.arrays import Bools
 from millrace.protocol.messages import Hello, LanePast, Permit
 from millrace.protocol.rollout import Rollout
 
-MOST_ATTEMPTS = 3  # attempts to continue a lane, each of which ended with the loss of its worker
+MOST_ATTEMPTS = 3  # after this many attempts to continue a lane that each lost its worker, its copies start afresh
 
 
 @dataclass
@@ -28,31 +29,31 @@ class TicketedLane(PlacedLane):
     due: list[int] = field(default_factory=list)
     """Open rounds without a ticket, in order."""
     dealt: int = 0
-    """Number of tickets of this incarnation that were dealt: the sequence number of the next rollout."""
+    """The number of tickets that were dealt to this incarnation, which is the sequence number of the next rollout."""
     outstanding: set[int] = field(default_factory=set)
     """Tickets that the lane's worker holds."""
     next_sequence: int = 0
-    """Every rollout of this incarnation with a smaller sequence number has arrived."""
+    """The smallest sequence number of this incarnation whose rollout has not arrived."""
     out_of_order: set[int] = field(default_factory=set)
-    """Sequence numbers that have arrived out of order."""
+    """Larger sequence numbers whose rollouts have arrived."""
     newest_taken: tuple[int, int] | None = None
-    """Incarnation and sequence number of the rollout that was taken last; None: none since the learner began."""
+    """Incarnation and sequence number of the rollout that was taken last; None if none was since the learner began."""
     history: LaneHistory | None = None
-    """History of the rollouts that were taken; None: none since the run began."""
+    """History of the rollouts that were taken; None if none was since the run began."""
     failures: int = 0
-    """How often its environment has failed since its last rollout arrived."""
+    """How many times its environment has failed since its last rollout arrived."""
     failed_at_once: bool = True
-    """Whether the first of these failures and losses happened before any rollout of its incarnation."""
+    """Whether the first of these failures and losses happened before any rollout of its incarnation arrived."""
     losses: int = 0
-    """How often its worker was lost while collecting, since its last rollout arrived."""
+    """How many times its worker was lost while collecting since its last rollout arrived."""
 
     @property
     def busy(self) -> int:
-        """Number of its tickets that its worker holds."""
+        """The number of the lane's tickets that its worker holds."""
         return len(self.outstanding)
 
     def restart(self) -> None:
-        """Record that the lane left its worker. The incarnation rises only if it was dealt a ticket."""
+        """Record that the lane left its worker. The incarnation rises only if a ticket was dealt to it."""
         super().restart()
         if self.dealt:
             self.incarnation += 1
@@ -63,7 +64,7 @@ class TicketedLane(PlacedLane):
     def deal(
         self, number: int, round_number: int, version: int, opponent: int | None, past: LanePast | None = None
     ) -> Ticket:
-        """A ticket for the next rollout, for the lane's owner. `past`: for the first ticket of this incarnation."""
+        """Make a ticket for the next rollout, for the lane's owner. `past` goes with the first ticket of an incarnation."""
         assert self.owner is not None
         ticket = Ticket(number, self.number, self.incarnation, self.dealt, round_number, version, self.owner, opponent, past)
         self.outstanding.add(number)
@@ -71,10 +72,10 @@ class TicketedLane(PlacedLane):
         return ticket
 
     def past(self, histories: LaneHistories, waiting: Iterable[tuple[int, Rollout, bytes]]) -> LanePast | None:
-        """The past that a new owner continues; None if the lane begins.
+        """The past that a new owner continues; None if the lane has not begun.
 
-        `waiting`: the rollouts since the history, in order, each with its incarnation before it and the attributes of its
-        env copies after it.
+        `waiting` are the rollouts after the history, in order: for each, its incarnation, the rollout, and the attributes of
+        its env copies.
         """
         history = None if self.history is None else self.history.copy()
         newest = self.newest_taken
@@ -92,9 +93,9 @@ class TicketedLane(PlacedLane):
     def take(
         self, incarnation: int, rollout: Rollout, attributes: bytes, histories: LaneHistories, *, from_past: bool
     ) -> Bools:
-        """Take the rollout of the next round. Returns [N] for which env copies it doesn't continue the previous one.
+        """Take the rollout of the next round. Returns [N], True for env copies that don't continue the previous rollout.
 
-        `from_past`: whether its worker was told to continue the lane's past.
+        `from_past` says whether its worker was told to continue the lane's past.
         """
         sequence = rollout.sequence
         continues = self.newest_taken == (incarnation, sequence - 1)
@@ -108,14 +109,14 @@ class TicketedLane(PlacedLane):
         return anew if (continues or sequence == 0) and not begins else np.ones_like(anew)
 
     def lost(self, *, failed: bool) -> None:
-        """Record that its worker was lost while collecting, or because the environment `failed`."""
+        """Record that the lane's worker was lost while collecting, or because the environment `failed`."""
         if not self.failures and not self.losses:
             self.failed_at_once = not self.next_sequence
         self.losses += not failed
         self.failures += failed
 
     def went_on(self) -> None:
-        """Start counting failures and losses anew, because a rollout was accepted."""
+        """Reset the counts of failures and losses, because a rollout was accepted."""
         self.failures = 0
         self.losses = 0
 
@@ -140,14 +141,14 @@ class Ticket:
     lane: int
     incarnation: int
     sequence: int
-    """Number of its rollout in this incarnation."""
+    """Sequence number of its rollout in this incarnation."""
     round: int
     version: int
     """Version of the weights that act."""
     peer: bytes
     opponent: int | None = None
     past: LanePast | None = None
-    """`opponent` and `past`: as in a `Permit`."""
+    """`opponent` and `past` have the meanings that they have in a `Permit`."""
 
     def permit(self, worker: Hello) -> Permit:
         """The ticket in the form that is sent to this worker."""

@@ -1,9 +1,10 @@
-"""The ledger: what became of every ticket, and of every transition that reached the learner. Plain counts.
+"""The ledger counts what became of every ticket, and of every transition that reached the learner.
 
     tickets       issued   = used + outstanding + lost
     transitions   received = used + waiting + duplicate + late + invalid
 
-Both equations hold at every moment. `outstanding` tickets are with a worker, or their rollouts wait to be used (`waiting`).
+Both equations hold at every moment. A worker holds each `outstanding` ticket, or the ticket's rollout waits to be used; the
+transitions of that rollout are `waiting`.
 """
 
 from __future__ import annotations
@@ -16,15 +17,15 @@ from msgspec import Meta
 from millrace.protocol.bounds import LARGEST
 
 Past = Annotated[int, Meta(ge=0, le=LARGEST >> 2)]
-"""A count from a file that a run continues from: small enough that it still fits into messages later."""
+"""A count that a run continues from a file. It is limited, so that it still fits into messages after it has grown."""
 
 
 class Ledger(msgspec.Struct, kw_only=True):
-    """Counts since the run began; a checkpoint carries them."""
+    """The counts since the run began, which checkpoints save."""
 
     issued: Past = 0
     used: Past = 0
-    """tickets whose rollout an update used"""
+    """tickets whose rollout was used by an update"""
     lost: Past = 0
     """tickets whose worker was lost, left or sent an unusable rollout (a new ticket was dealt), or whose update failed"""
 
@@ -33,18 +34,18 @@ class Ledger(msgspec.Struct, kw_only=True):
     transitions_duplicate: Past = 0
     """transitions of rollouts that arrived a second time"""
     transitions_late: Past = 0
-    """transitions of rollouts of a session that had ended, or of an update that failed"""
+    """transitions of rollouts from a session that had ended, or for an update that failed"""
     transitions_invalid: Past = 0
     """transitions of rollouts that broke the row format or did not fit the run"""
 
     messages_bad: Past = 0
     """messages that could not be read"""
     late_actions: Past = 0
-    """actions that arrived too late at a program that owns its loop, so that it chose its own action"""
+    """actions that arrived too late at a program that runs its own loop, so that it chose the action itself"""
 
     @property
     def outstanding(self) -> int:
-        """Tickets that are neither used nor given up."""
+        """Tickets that are neither used nor lost."""
         return self.issued - self.used - self.lost
 
     @property
@@ -54,9 +55,9 @@ class Ledger(msgspec.Struct, kw_only=True):
         return self.transitions_received - self.transitions_used - dropped
 
     def end_outstanding(self) -> None:
-        """The learner that dealt the outstanding tickets is gone: count them, and rollouts not yet used, as lost.
+        """Count the outstanding tickets, and rollouts not yet used, as lost, because the learner that dealt them is gone.
 
-        Raises `ValueError` for counts from a file that no run can have.
+        Raises `ValueError` for impossible counts from a file.
         """
         if min(self.outstanding, self.transitions_waiting) < 0:
             raise ValueError("ledger: expected at least as many tickets and transitions as were used or lost, got fewer")
@@ -64,7 +65,7 @@ class Ledger(msgspec.Struct, kw_only=True):
         self.transitions_late += self.transitions_waiting
 
     def copy(self) -> Ledger:
-        """A copy that doesn't change with the original."""
+        """An independent copy."""
         return msgspec.structs.replace(self)
 
     def counts(self) -> dict[str, int]:

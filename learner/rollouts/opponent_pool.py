@@ -1,12 +1,12 @@
 """Self-play: which opponents there are, who meets whom, and how strong they are. Pure.
 
-Rule: the opponent of a rollout is a pure function of the seed, the lane, its incarnation, the number of the rollout, and the
-pool as it was when the weights that act were made. So it depends neither on speed nor on the number of workers. Opponents
-are the newest snapshots of the policy, and programs that the user wrote.
+Rule: the opponent of a rollout is a pure function of the seed, the lane, the round, and the pool as it was when the acting
+weights were made. So it depends neither on speed nor on the number of workers. Opponents are the newest snapshots of the
+policy, and programs that the user wrote.
 
-Rule: ratings follow from the episodes that updates used, in their order (Elo 1978; ML-Agents' self-play). An opponent's
-rating changes as the policy's does, by the opposite amount. Episodes against a version that isn't a snapshot change no
-rating.
+Rule: ratings are computed from the episodes that updates used, in order (Elo 1978; ML-Agents' self-play). An opponent's
+rating changes by the same amount as the policy's, in the opposite direction. Episodes against a version that isn't a
+snapshot change no rating.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from millrace.protocol.rollout import Episode
 FIRST_RATING = 1200.0
 ELO_KEY = "self_play/elo"
 K = 8.0
-"""K: the largest change of a rating by one episode."""
+"""Elo's K: the largest change of a rating by one episode."""
 SCALE = 400.0
-"""An opponent whose rating is lower by this much loses ten times as often as it wins."""
+"""The rating difference at which the weaker of two players loses ten times as often as it wins."""
 
 
 class Snapshot(msgspec.Struct):
@@ -39,20 +39,20 @@ class Snapshot(msgspec.Struct):
 
 
 class PoolState(msgspec.Struct, kw_only=True):
-    """What a checkpoint keeps, besides the weights of the snapshots."""
+    """The part of the pool that a checkpoint saves, besides the weights of the snapshots."""
 
     rating: Real = FIRST_RATING
-    """rating of the policy"""
+    """the rating of the policy"""
     snapshots: list[Snapshot] = []
-    """The first one, and the newest, in order."""
+    """the first snapshot and the newest ones, in order"""
     scripted: list[Real] = []
-    """ratings of the programs"""
+    """the ratings of the user's programs"""
 
 
 def teams_of(seats: tuple[str, ...], patterns: Sequence[str] = ()) -> tuple[tuple[int, ...], ...]:
-    """The seats of each team, from these patterns of their names; without patterns, each seat is a team.
+    """The seats of each team, from patterns of their names; without patterns, each seat is a team.
 
-    Raises `UsageError`.
+    Raises `UsageError` if the patterns don't divide the seats into teams of equal size.
     """
     if not patterns:
         return tuple((seat,) for seat in range(len(seats)))
@@ -74,7 +74,7 @@ class PoolSettings(NamedTuple):
 
     seed: int
     window: int
-    """How many snapshots, the newest ones, play."""
+    """How many of the newest snapshots play."""
     save_steps: Count
     """Env steps between two snapshots."""
     latest: float
@@ -102,12 +102,12 @@ class OpponentPool:
 
     @property
     def yardsticks(self) -> tuple[int, ...]:
-        """The opponents of evaluations, always the same: the programs, or else the first snapshot."""
+        """The opponents of evaluations, which never change: the programs or, if there are none, the first snapshot."""
         programs = self._settings.scripted
         return tuple(-1 - k for k in range(programs)) or tuple(self.versions[:1])
 
     def made(self, version: int, env_steps: int) -> bool:
-        """Take note of new weights. Returns whether they become a snapshot."""
+        """Make a snapshot of new weights if one is due. Returns whether they became one."""
         snapshots = self.state.snapshots
         settings = self._settings
         if not settings.window:
@@ -115,12 +115,15 @@ class OpponentPool:
         if snapshots and (version <= snapshots[-1].version or env_steps < snapshots[-1].env_steps + settings.save_steps):
             return False
         snapshots.append(Snapshot(version, env_steps, self.state.rating))
-        # Older weights, within max_lag, may still meet the snapshots that were in the window when they were made.
+        # Older weights that still act, within max_lag, may meet snapshots that were in the window when they were made.
         del snapshots[1 : max(1, len(snapshots) - settings.window - settings.max_lag)]
         return True
 
     def of(self, lane: int, round_number: int, version: int) -> int:
-        """The opponent in the episodes that begin in this rollout, which this version of the weights collects."""
+        """The opponent in episodes that begin in a rollout: that of this lane and round, collected with this version.
+
+        A number of at least 0 is the version of a snapshot or of the acting weights; -1 - k is program k.
+        """
         settings = self._settings
         window = [each for each in self.versions if each <= version][-settings.window :] if settings.window else []
         drawn = generator(settings.seed, Purpose.MATCHES, lane, round_number)
@@ -134,7 +137,7 @@ class OpponentPool:
         return {ELO_KEY: self.state.rating, "self_play/snapshots": float(len(self.versions))}
 
     def played(self, episodes: Iterable[Episode]) -> None:
-        """Change the ratings by episodes that an update used."""
+        """Change the ratings according to episodes that an update used."""
         state = self.state
         by_version = {snapshot.version: snapshot for snapshot in state.snapshots}
         for episode in episodes:
@@ -152,6 +155,6 @@ class OpponentPool:
             state.rating += change
 
     def _change(self, of_opponent: float, score: float) -> float:
-        """How the rating changes by this score. Teams of equal strength win equally often."""
+        """The change of the policy's rating for this score. Teams of equal strength are expected to win equally often."""
         others = self._settings.teams - 1
         return K * (score - 1 / (1 + others * 10 ** ((of_opponent - self.state.rating) / SCALE)))

@@ -1,7 +1,7 @@
 """The state of rollouts that a resumed run needs: numbers, the past of each lane, and the weights of open rounds.
 
-Rule: with it, the next learner deals what the last one would have dealt: the same rounds, with the same versions, on lanes
-that continue where their last rollout ended.
+Rule: with this state, the next learner deals the tickets that the last one would have dealt: for the same rounds, with the
+same versions, on lanes that continue where their last rollout ended.
 """
 
 from __future__ import annotations
@@ -30,25 +30,25 @@ class RoundsState(msgspec.Struct, frozen=True):
 
 
 class PastRollouts(NamedTuple):
-    """The rollouts so far."""
+    """The state after the rollouts so far."""
 
     ledger: Ledger
     incarnations: Sequence[int]
     """the next incarnation of each lane"""
     rounds: RoundsState = RoundsState()
     lanes: Sequence[LanePast] = ()
-    """the pasts of lanes whose rollouts were taken"""
+    """the past of each lane of which rollouts were taken"""
     acting: Sequence[Weights] = ()
     """the weights that act in open rounds, except the newest"""
 
 
 def packed(records: Sequence[msgspec.Struct]) -> Bytes:
-    """Records as bytes, for a file. Their arrays are copied."""
+    """Encode records as bytes, for a file. Their arrays are copied."""
     return np.frombuffer(msgspec.msgpack.encode(records, enc_hook=_described), np.uint8)
 
 
 def unpacked(kind: type[T], data: Bytes) -> list[T]:
-    """Records of one type. Raises `ValueError` or `msgspec.ValidationError` for anything else."""
+    """Decode records of one type. Raises `ValueError` or `msgspec.ValidationError` for anything else."""
     return msgspec.msgpack.decode(data.tobytes(), type=list[kind], dec_hook=_array)  # type: ignore[valid-type]
 
 

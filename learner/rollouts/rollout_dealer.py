@@ -1,9 +1,9 @@
 """The tickets for rollouts: which rounds are open, which worker collects what, and what has arrived. Pure.
 
-Rule: a ticket is the permission for one rollout: of this lane, in this round, with this version of the weights.
-`lag_rule.py` says which rounds are open, and each lane gets a ticket for each of them. If a ticket is lost, its round is
-dealt again, with the same version, and the worker that gets it continues the lane where its last rollout ended. Every ticket
-and every transition is counted in the ledger.
+Rule: a ticket permits one rollout, of one lane, in one round, with one version of the weights. `lag_rule.py` says which
+rounds are open, and each lane gets a ticket for each of them. If a ticket is lost, its round is dealt again, with the same
+version, and the worker that gets it continues the lane where its last rollout ended. Every ticket and every transition is
+counted in the ledger.
 """
 
 from __future__ import annotations
@@ -30,14 +30,13 @@ class AcceptedRollout:
 
     rollout: Rollout
     incarnation: int
-    """Incarnation of the lane when its ticket was dealt. Each incarnation has new env copies."""
+    """The incarnation of the lane when the ticket was dealt. Each incarnation has new env copies."""
     fresh: Bools | bool = True
-    """[N] for each env copy, whether nothing carries over from earlier rollouts: it doesn't continue the last one that was
-    taken of its lane, because the copy has started anew, or a rollout in between was rejected. A single value applies to
-    all.
+    """[N] True for env copies that don't continue the previous rollout that was taken of the lane, because the copy has
+    started afresh, or because a rollout in between was rejected. A single value applies to all copies.
     """
     from_past: bool = False
-    """Whether its worker was told to continue the lane's past with it."""
+    """Whether the worker was told to continue the lane's past with this rollout."""
 
 
 class RolloutDealer:
@@ -52,8 +51,10 @@ class RolloutDealer:
         opponents: OpponentPool | None = None,
         histories: LaneHistories | None = None,
     ) -> None:
-        """`ledger` and `incarnations` come from a checkpoint: the first incarnation of each lane, which may be more or fewer
-        than there are lanes. `opponents`: the pool of a run with teams. `histories`: None: no lane continues.
+        """`ledger` and `incarnations`, the first incarnation of each lane, are from a checkpoint.
+
+        There may be more or fewer incarnations than lanes. `opponents` is the pool of a run with teams. If `histories` is
+        None, no lane continues.
         """
         self.opponents = opponents
         self.histories = histories or LaneHistories()
@@ -72,17 +73,17 @@ class RolloutDealer:
         """the rollouts that have arrived and were not taken, by round and by lane"""
         self.rounds = rounds
         self.attributes: dict[int, bytes] = {}
-        """attributes of env copies, packed, by the version of the weights that they belong to; versions without any may be
-        missing
+        """the attributes of env copies, packed, by the version of the weights with which they were sent; versions without
+        attributes may be missing
         """
         self._absent = list(incarnations[lanes:])  # incarnations of lanes that the run had earlier, and may have again
         self._absent_pasts = [past for past in self.histories.pasts if past.lane >= lanes]
-        self._to_deal = set[int]()  # lanes with rounds to deal
+        self._to_deal = set[int]()  # lanes for which open rounds have no ticket
 
     # ---------------------------------------------------------------- the learner's side
 
     def begin_update(self, version: int) -> None:
-        """Begin the next update, unless it has begun, with this version as the newest, and mark its rounds to be dealt."""
+        """Begin the next update, unless it has begun, with `version` as the newest. `deal` then deals the new rounds."""
         for number in self.rounds.begin(version):
             for lane in self.lanes:
                 lane.due.append(number)
@@ -91,7 +92,7 @@ class RolloutDealer:
         self._to_deal |= {lane.number for lane in self.lanes if lane.due}
 
     def take(self) -> list[AcceptedRollout] | None:
-        """The rollouts of the next update, in lane order, or None while there are too few."""
+        """Take the rollouts of the next update, in lane order. Returns None while some are missing."""
         if len(self.ready.get(self.rounds.next, ())) < len(self.lanes):
             return None
         taken = [rollout for _, rollout in sorted(self.ready.pop(self.rounds.next).items())]
@@ -109,19 +110,19 @@ class RolloutDealer:
         self.ledger.transitions_late += env_steps
 
     def awaited(self) -> list[Ticket]:
-        """The tickets of the next update that workers hold."""
+        """The tickets for the next update that workers hold."""
         return [ticket for ticket in self.held.values() if ticket.round == self.rounds.next]
 
     def collected(self) -> int:
-        """Env steps of the next update's rollouts that have arrived."""
+        """The env steps of the next update's rollouts that have arrived."""
         return sum(arrived.rollout.env_steps for arrived in self.ready.get(self.rounds.next, {}).values())
 
     def waiting(self) -> int:
-        """Number of rollouts that have arrived and were not taken."""
+        """The number of rollouts that have arrived and were not taken."""
         return sum(map(len, self.ready.values()))
 
     def incarnations(self) -> list[int]:
-        """The next incarnation of each lane, for a checkpoint. An incarnation that was dealt a ticket is not used again."""
+        """The next incarnation of each lane, for a checkpoint. An incarnation that got a ticket is never used again."""
         return [*(lane.incarnation + (lane.dealt > 0) for lane in self.lanes), *self._absent]
 
     def pasts(self) -> list[LanePast]:
@@ -152,9 +153,9 @@ class RolloutDealer:
         return [order for peer, numbers in dealt.items() for order in self.send(members[peer], numbers)]
 
     def send(self, member: Member, tickets: Iterable[int]) -> list[Outgoing]:
-        """The orders for these tickets, as far as they are for rollouts: one for each version that they name.
+        """The orders for those of these tickets that are for rollouts: one order for each version that they name.
 
-        A ticket that brings the past of a lane has an order of its own, because a past is long.
+        A ticket that includes the past of a lane has an order of its own, because a past is long.
         """
         chosen = [self.held[number] for number in tickets if number in self.held]
         member.tickets |= {ticket.number: member.replies for ticket in chosen}
@@ -176,9 +177,9 @@ class RolloutDealer:
     # ---------------------------------------------------------------- in
 
     def take_in(self, member: Member, rollout: Rollout) -> bool:
-        """Accept a rollout that has arrived. False if it arrived before.
+        """Accept a rollout that has arrived. Returns False if it had arrived before.
 
-        Raises `BadRollout` if it doesn't fit its ticket. `reject` then counts it.
+        Raises `BadRollout` if it doesn't fit its ticket; then call `reject`, which counts it.
         """
         ticket = self.held.get(rollout.ticket)
         if ticket is None:
@@ -200,12 +201,12 @@ class RolloutDealer:
         return True
 
     def rounds_by(self, number: int) -> int:
-        """The largest number of rounds that an episode can have lasted at the end of this ticket's rollout."""
+        """The largest number of rounds that an episode can have lasted by the end of this ticket's rollout."""
         ticket = self.held.get(number)
         return self.rounds.next + self.rounds.max_lag + 1 if ticket is None else ticket.round + 1
 
     def worker_lost(self, member: Member) -> None:
-        """Take the tickets of a member that is gone. Steps that led to a failure of the environment are not replayed."""
+        """Count the failures and losses of a lost member's lanes, so that steps that led to a failure are not replayed."""
         for number in member.lanes:
             lane = self.lanes[number]
             failed = number == member.failed_lane or (member.hung and bool(lane.outstanding))
@@ -213,7 +214,7 @@ class RolloutDealer:
                 lane.lost(failed=failed)
 
     def late(self, rollout: Rollout) -> None:
-        """Count a rollout of a session that has ended. It is not checked."""
+        """Count a rollout from a session that has ended, without checking it."""
         self.ledger.transitions_received += rollout.env_steps
         self.ledger.transitions_late += rollout.env_steps
 
@@ -225,7 +226,7 @@ class RolloutDealer:
         self.ledger.transitions_invalid += steps
         if number in self.held and number in member.tickets:
             ticket = self.held[number]
-            self.lanes[ticket.lane].arrived(ticket.sequence)  # so that its worker drops it
+            self.lanes[ticket.lane].arrived(ticket.sequence)  # so that the worker stops sending it
             self.lose(member, number)
 
     def lose(self, member: Member, number: int) -> None:
@@ -238,20 +239,20 @@ class RolloutDealer:
     # ---------------------------------------------------------------- inside
 
     def _end(self, member: Member, ticket: Ticket) -> TicketedLane:
-        """Remove the ticket from the outstanding ones. Returns its lane."""
+        """Remove a ticket from the outstanding ones. Returns its lane."""
         del self.held[ticket.number], member.tickets[ticket.number]
         lane = self.lanes[ticket.lane]
         lane.outstanding.remove(ticket.number)
         return lane
 
     def _past(self, lane: TicketedLane, first: int) -> LanePast | None:
-        """The past that the lane's new owner continues. The first round that it collects is `first`."""
+        """The past that the lane's new owner continues. `first` is the first round that it collects."""
         come = [self.ready[number][lane.number] for number in range(self.rounds.next, first)]
         waiting = [(each.incarnation, each.rollout, self._attributes_of(each.rollout)) for each in come]
         return lane.past(self.histories, waiting)
 
     def _drop_after(self, lane: TicketedLane, first: int) -> None:
-        """Drop the lane's rollouts after round `first`, which was lost: they don't continue its replacement."""
+        """Drop the lane's rollouts after round `first`, which was lost, because they don't continue its replacement."""
         for number in [number for number in self.ready if number > first and lane.number in self.ready[number]]:
             dropped = self.ready[number].pop(lane.number)
             self.ledger.lost += 1
@@ -259,11 +260,11 @@ class RolloutDealer:
             insort(lane.due, number)
 
     def _attributes_of(self, rollout: Rollout) -> bytes:
-        """The attributes that the rollout's env copies had."""
+        """The attributes, packed, that were set on the rollout's env copies."""
         return self.attributes.get(rollout.version, b"")
 
     def _marked(self, arrived: AcceptedRollout) -> AcceptedRollout:
-        """The rollout, which the next update uses, marked as fresh or not."""
+        """A rollout that the next update uses, with `fresh` set."""
         rollout = arrived.rollout
         fresh = self.lanes[rollout.lane].take(
             arrived.incarnation,

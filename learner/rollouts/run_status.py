@@ -1,4 +1,4 @@
-"""How far a run is, from what the hub knows now, and the answer to `millrace status`. Pure."""
+"""The progress of a run as the hub knows it now, and the answer to `millrace status`. Pure."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from millrace.protocol.progress import RunProgress
 
 
 def progress_now(coordinator: TicketCoordinator, reported: Progress, waiting: str, phase: str) -> RunProgress:
-    """The progress that was last reported, with the changes since then. `waiting` says who waits for whom."""
+    """The progress that was last reported, with the current ledger, phase and `waiting`, which says who waits for whom."""
     return replace(reported.plain(), ledger=coordinator.rollouts.ledger.counts(), waiting=waiting, phase=phase)
 
 

@@ -1,14 +1,14 @@
 """The weights that orders name, and which worker holds which of them. Pure.
 
-Rule: weights are kept while they are the newest, act in a round that is open, are evaluated, or are an opponent. They are
+Rule: weights are kept while they are the newest, act in an open round, are being evaluated, or are an opponent. They are
 sent to a worker after the first order that names them, and again if its Heartbeat shows that they were lost. A worker drops
-weights only when told to: every order lists the versions to keep, which are those that its outstanding tickets name. So the
-learner knows which weights the worker holds, whatever messages are on their way.
+weights only when told to: every order lists the versions to keep, which are those that the worker's outstanding tickets
+name. So the learner knows which weights the worker holds, even while messages are on their way.
 
-A supervisor that shares weights among its workers gets them once, in place of the first worker that needs them. For all
-these workers the weights count as on the way until a message of the supervisor shows that they have arrived or are lost.
-From then on, a worker has as much time to load them as if they had just been sent to it; weights that it lacks later are
-sent to it directly.
+If a supervisor shares weights among its workers, it gets them once, in place of the first worker that needs them. For all
+these workers, the weights count as being on the way until a message of the supervisor shows that they have arrived or are
+lost. From then on, a worker has as much time to load them as if they had just been sent to it; if it still lacks them
+afterwards, they are sent to it directly.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from millrace.protocol.messages import Collect, Evaluate, Heartbeat, Weights, ve
 
 @dataclass(frozen=True)
 class SentAfter:
-    """They were sent after this many heartbeat replies.
+    """The weights were sent after this many heartbeat replies.
 
-    If the receiver has got a later reply, it has them, or they are lost.
+    Once the receiver has received a later reply, it has the weights, or they are lost.
     """
 
     replies: int
@@ -38,40 +38,37 @@ class SentAfter:
 
 @dataclass(frozen=True)
 class FromSupervisor:
-    """The worker gets them from its supervisor, to which they may still be on the way."""
+    """The worker gets the weights from its supervisor, to which they may still be on the way."""
 
 
 @dataclass(frozen=True)
 class Confirmed:
-    """The worker has said that it holds them."""
+    """The worker has confirmed that it holds the weights."""
 
 
 Standing = SentAfter | FromSupervisor | Confirmed
-"""What the learner knows about some weights at a worker. For weights that the worker lacks there is no entry."""
+"""What the learner knows about a worker's copy of some weights. Weights that the worker lacks have no entry."""
 
 
 class WeightsHeld:
-    """Which weights each worker and each supervisor holds or is about to get, and which it needs.
-
-    This is the only record.
-    """
+    """The only record of which weights each worker and each supervisor holds or is about to get, and which it needs."""
 
     def __init__(self) -> None:
         self.by_worker: dict[bytes, dict[int, Standing]] = {}
-        """by routing id and version"""
+        """the workers' weights, by routing id and version"""
         self.named: dict[bytes, dict[int, set[int]]] = {}
-        """by routing id and ticket, the versions that the ticket names; may include tickets that have ended"""
+        """the versions that each ticket names, by routing id and ticket; may include tickets that have ended"""
         self.by_supervisor = WeakKeyDictionary[SharingSupervisor, dict[int, SentAfter]]()
-        """by version, the newest last; dropped with the last member that has this supervisor"""
+        """the supervisors' weights, by version, the newest last; dropped with the last member that has the supervisor"""
 
     def versions(self, peer: bytes) -> Set[int]:
         """The versions that this worker holds or is about to get."""
         return self.by_worker.get(peer, {}).keys()
 
     def give(self, member: CollectingMember, version: int, supervisor: SharingSupervisor | None) -> bytes | None:
-        """Record that the worker gets these weights, through this supervisor if given.
+        """Record that the worker gets these weights, through the supervisor if one is given.
 
-        Returns to whom to send them; None: to nobody.
+        Returns the routing id to which they must be sent; None if they needn't be sent.
         """
         mine = self.by_worker.setdefault(member.peer, {})
         if supervisor is None:
@@ -87,12 +84,12 @@ class WeightsHeld:
         return supervisor.peer
 
     def needs(self, member: CollectingMember, tickets: Collection[int]) -> set[int]:
-        """The versions that these tickets name, as far as they are the worker's and have not ended."""
+        """The versions that are named by those of these tickets that the worker holds and that have not ended."""
         named = self.named.get(member.peer, {})
         return {version for ticket in member.tickets.keys() & tickets for version in named[ticket]}
 
     def note(self, member: CollectingMember, order: Collect | Evaluate) -> None:
-        """Note what the tickets of this order name."""
+        """Record the versions that the tickets of this order name."""
         named = self.named.get(member.peer, {})
         outstanding = {ticket: versions for ticket, versions in named.items() if ticket in member.tickets}
         self.named[member.peer] = outstanding | _by_ticket(order)
@@ -103,9 +100,9 @@ class WeightsHeld:
         self.by_worker[peer] = {version: standing for version, standing in mine.items() if version in versions}
 
     def hear(self, member: CollectingMember, heartbeat: Heartbeat) -> None:
-        """Take in the worker's list of the weights that it holds.
+        """Update the record from the worker's list of the weights that it holds.
 
-        It lacks all others, unless they may still be on their way.
+        The worker lacks all other weights, unless they may still be on their way.
         """
         mine = self.by_worker.get(member.peer, {})
         after: dict[int, Standing] = {}
@@ -121,12 +118,12 @@ class WeightsHeld:
         self.by_worker[member.peer] = after
 
     def forget(self, peer: bytes) -> None:
-        """The session of this worker has ended."""
+        """Forget a worker whose session has ended."""
         self.by_worker.pop(peer, None)
         self.named.pop(peer, None)
 
     def _may_be_under_way(self, version: int, supervisor: SharingSupervisor | None) -> bool:
-        """Whether these weights may not have reached the supervisor yet. False if it doesn't share weights any more."""
+        """Whether these weights may not have reached the supervisor yet. False if it no longer shares weights."""
         if supervisor is None:
             return False
         sent = self.by_supervisor.get(supervisor, {}).get(version)
@@ -134,7 +131,7 @@ class WeightsHeld:
 
 
 class SentWeights:
-    """The weights of a run that workers need."""
+    """The weights of a run that workers need, and the messages that send them."""
 
     def __init__(self) -> None:
         self.kept: dict[int, Weights] = {}
@@ -147,7 +144,7 @@ class SentWeights:
         self.kept[newest.version] = newest
 
     def after(self, orders: Sequence[Outgoing], members: Mapping[bytes, CollectingMember]) -> list[Outgoing]:
-        """These orders, with the versions that their workers keep, then all the weights that the workers lack."""
+        """These orders, each with the versions that its worker must keep, followed by the weights that the workers lack."""
         out = list[Outgoing]()
         weights = list[Outgoing]()
         for peer, order in orders:
@@ -160,14 +157,14 @@ class SentWeights:
                     # Opponents differ from worker to worker, so theirs are not shared.
                     supervisor = member.shared_by if version == order.version else None
                     weights += self._send(member, version, supervisor)
-                keep = self.held.needs(member, member.tickets)  # also those of the orders that follow
+                keep = self.held.needs(member, member.tickets)  # including those that later orders in this list name
                 self.held.keep_only(peer, keep)
                 order = msgspec.structs.replace(order, keep=tuple(sorted(keep)))
             out.append((peer, order))
         return out + weights
 
     def again(self, member: CollectingMember, heartbeat: Heartbeat) -> list[Outgoing]:
-        """The weights that the worker's unfinished tickets name and that were lost, as its heartbeat shows."""
+        """The weights to send again: the worker's unfinished tickets name them, and this heartbeat shows them as lost."""
         self.held.hear(member, heartbeat)
         lost = sorted(self.held.needs(member, heartbeat.tickets) - self.held.versions(member.peer))
         return [message for version in lost for message in self._send(member, version, None)]

@@ -1,13 +1,13 @@
 """Decides whether a run has stalled, and which workers cause it. Pure.
 
-Rule: env steps, constructions and resets are progress, as are rollouts. Those of workers that only evaluate don't count
-while rollouts are awaited. While a call of the environment runs within its timeout, the run has not stalled: either the call
-ends, or its worker is ended. If nothing happens for `stall_timeout_s`, the workers that hold tickets are refused, and others
-get the tickets. The run ends only if no worker would remain. A worker that holds its tickets, of rollouts or of an
-evaluation, for longer than all calls of the environment may take together is refused, whatever it claims.
+Rule: env steps, constructions, resets and rollouts are progress, but while rollouts are awaited, those of workers that only
+evaluate don't count. While a call of the environment runs within its timeout, the run has not stalled, because either the
+call ends or its worker is ended. If nothing happens for `stall_timeout_s`, the workers that hold tickets are refused, and
+others get the tickets. The run ends only if no worker would remain. A worker that holds its tickets, for rollouts or for an
+evaluation, longer than all their calls of the environment may take together is refused, whatever it claims.
 
 That limit may be days for an evaluation. So if none of its episodes has arrived for `stall_timeout_s` while the learner
-waits for it, a second worker plays the oldest ones as well, whatever the first one claims.
+waits for it, a second worker plays the oldest ticket as well, whatever the first worker claims.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from millrace.learner.rollouts.collecting_member import CollectingMember
 from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
 from millrace.protocol.call_timeouts import CallTimeouts
 
-ENDED_WITHIN_S = 5.0  # time after a timeout in which the learner hears that a worker was ended
+ENDED_WITHIN_S = 5.0  # how long after a timeout the learner may learn that a worker was ended
 CHECK_BUDGETS_EVERY_S = 1.0
 
 
 @dataclass(frozen=True)
 class Standstill:
-    """A verdict: refuse these members; if there are none, end the run."""
+    """A verdict: refuse these members or, if there are none, end the run."""
 
     refuse: tuple[CollectingMember, ...]
     why: str
@@ -38,7 +38,7 @@ class Overdue:
 
 
 class StallWatch:
-    """Watches one run."""
+    """Watches one run for stalls."""
 
     def __init__(self, coordinator: TicketCoordinator, stall_timeout_s: float, timeouts: CallTimeouts) -> None:
         self._coordinator = coordinator
@@ -46,18 +46,19 @@ class StallWatch:
         self._timeouts = timeouts
         self._mark: object = None
         self._progress_s = self._answered_s = 0.0
-        self._answered = 0  # episodes of the pending evaluation
-        self._dealt_s: dict[tuple[bytes, int], float] = {}  # worker and ticket -> when they were first seen here
+        self._answered = 0  # number of episodes of the pending evaluation that have arrived
+        self._dealt_s: dict[tuple[bytes, int], float] = {}  # by worker and ticket, when this file first saw the ticket
         self._budgets_due_s = -math.inf
 
     def begin(self, now: float) -> None:
-        """The learner begins to wait."""
+        """Record that the learner begins to wait."""
         self._progress_s = self._answered_s = now
 
     def check(self, now: float, progress: object, *, evaluating: bool = False) -> Standstill | Overdue | None:
-        """None: the run continues. `progress`: anything that changes when what the learner waits for makes progress.
+        """The verdict; None if the run continues.
 
-        `evaluating`: whether the learner waits for an evaluation, and not for rollouts.
+        `progress` is a value that changes whenever the awaited work makes progress. `evaluating` says that the learner waits
+        for an evaluation, and not for rollouts.
         """
         of_collectors, of_evaluators = self._coordinator.membership.progress.values()
         mark = (of_collectors, evaluating and of_evaluators, progress)
@@ -82,7 +83,7 @@ class StallWatch:
         return Standstill(idle, f"it holds tickets and has made no progress for {self._stall_timeout_s:.0f} s")
 
     def _takes_too_long(self, now: float) -> bool:
-        """Count the evaluation's episodes that have arrived. True if none has for too long; then the time starts again."""
+        """Whether no episode of the evaluation has arrived for too long. If so, the time starts again."""
         answered = self._coordinator.evaluation.episodes_played
         overdue = answered == self._answered and now - self._answered_s > self._stall_timeout_s
         if overdue or answered != self._answered:
@@ -91,14 +92,14 @@ class StallWatch:
         return overdue
 
     def _in_call(self, member: Member, now: float) -> bool:
-        """Whether its supervisor says that it is in a call of the environment, which has not exceeded its timeout."""
+        """Whether the member is, according to its supervisor, in a call of the environment that is within its timeout."""
         said = member.activity
         if said is None or now - member.in_env_code_s > self._coordinator.worker_timeout_s:
             return False
         return said.for_s + now - member.activity_s <= self._timeouts.limit_s(said.doing) + ENDED_WITHIN_S
 
     def _over_budget(self, now: float) -> tuple[CollectingMember, ...]:
-        """The members whose oldest ticket is older than all their tickets may take together."""
+        """The members that have held their oldest ticket for longer than all their tickets together may take."""
         coordinator = self._coordinator
         plan = coordinator.evaluation.plan
         episodes_s = 0.0 if plan is None else self._longest_s(plan.copies, plan.most_steps)
@@ -121,7 +122,7 @@ class StallWatch:
         past = self._coordinator.rollouts.held[number].past
         rollout_s = self._longest_s(run.copies, run.rollout_steps)
         if past is not None:
-            rollout_s += run.copies * self._timeouts.limit_s("resetting")  # besides the one of the start
+            rollout_s += run.copies * self._timeouts.limit_s("resetting")  # one more reset of each copy
         if past is not None and past.repeated_steps:
             rollout_s += past.repeated_steps * self._timeouts.limit_s("repeating")
         return rollout_s
@@ -131,6 +132,6 @@ class StallWatch:
         opening_s = limit_s("making") + limit_s("resetting")
         step_s = max(limit_s("stepping"), limit_s("resetting"))
         if self._coordinator.membership.has_policy_code:
-            opening_s += limit_s("preparing") + limit_s("acting")  # it is made, and gets its weights
-            step_s += 2 * limit_s("acting")  # the policy, and this copy's opponent
+            opening_s += limit_s("preparing") + limit_s("acting")  # making the policy, and loading its weights
+            step_s += 2 * limit_s("acting")  # one action of the policy, and one of this copy's opponent
         return copies * (opening_s + steps * step_s)

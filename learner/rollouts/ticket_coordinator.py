@@ -1,13 +1,13 @@
 """The learner's half of the conversation of a run. Pure: messages and `now` in, messages out; no socket, clock or torch.
 
-Rule: every task of a worker has a ticket. Two dealers decide what to ask for and what an answer means: `rollout_dealer.py`
-and `evaluation_dealer.py`. This file connects them to the workers. A lane has one owner at a time and moves only between
-rollouts; its new owner has new env copies for it, so its incarnation rises. When a worker is lost, its lanes go to other
-workers, which continue them, and its tickets are dealt again. There is no other failure handling. If a Heartbeat shows that
-a message was lost, the message is sent again.
+Rule: every task of a worker has a ticket. Two dealers decide which tickets to give out and how to handle an answer:
+`rollout_dealer.py` and `evaluation_dealer.py`. This file connects them to the workers. A lane has one owner at a time and
+moves only between rollouts; its new owner has new env copies for it, so its incarnation rises. When a worker is lost, its
+lanes go to other workers, which continue them, and its tickets are dealt again. There is no other failure handling. If a
+Heartbeat shows that a message was lost, the message is sent again.
 
-While an evaluation is pending, no ticket for a rollout is dealt, unless the evaluation is beside training: then workers that
-only evaluate play it, whatever the others do.
+While an evaluation is pending, no ticket for a rollout is dealt, unless the evaluation runs alongside training. Then the
+workers that only evaluate play it, while the others collect rollouts.
 """
 
 from __future__ import annotations
@@ -44,15 +44,15 @@ from millrace.protocol.rows.rollout_checks import validate
 from millrace.protocol.specs import RunSpec
 
 CheckRows = Callable[[Rollout, RunSpec, int], None]
-"""Raises `BadRollout` if the rows of a rollout break the row format, or are not those of the run, or if an episode is longer
+"""Raises `BadRollout` if the rows of a rollout break the row format, don't fit the run, or contain an episode that is longer
 than this number of steps."""
 
-MOST_NOTES = 10  # notes of all workers together
-STRIKES = 3  # rollouts or messages that could not be used, after which a worker is refused
+MOST_NOTES = 10  # the most notes of all workers together that are logged
+STRIKES = 3  # a worker is refused after this many rollouts or messages that could not be used
 
 
 class TicketCoordinator(Coordinator[CollectingMember]):
-    """Members, their lanes, and what they are asked for."""
+    """The members, their lanes and their tickets."""
 
     def __init__(
         self,
@@ -70,10 +70,10 @@ class TicketCoordinator(Coordinator[CollectingMember]):
         membership = Membership(run, CollectingMember, self._removed, first_session, lambda member: is_spare(member, lanes))
         super().__init__(membership, worker_timeout_s)
         self.run = run
-        self.version = -1  # until `publish`
+        self.version = -1  # version of the newest weights; -1 before the first `publish`
         self._placement = LanePlacement(lanes, _by_joining)
         self.weights = SentWeights()
-        self._notes = set[str]()  # workers' notes; those that step the same environment send the same ones
+        self._notes = set[str]()  # notes that were logged, because workers with the same environment send the same notes
         self._check_rows = check_rows
 
     # ---------------------------------------------------------------- in
@@ -84,7 +84,7 @@ class TicketCoordinator(Coordinator[CollectingMember]):
         return super().reject_message(peer, why, now)
 
     def refuse(self, member: CollectingMember, why: str) -> list[Outgoing]:
-        """Refuse a worker that holds tickets without working on them, and deal them again."""
+        """Refuse a worker that holds tickets without working on them, and deal its tickets again."""
         return self.membership.refuse(member, SentUnusable, why) + self._deal()
 
     # ---------------------------------------------------------------- the learner's side
@@ -98,9 +98,9 @@ class TicketCoordinator(Coordinator[CollectingMember]):
         env_attributes: Array | None = None,
         env_steps: int | None = None,
     ) -> None:
-        """Set the newest weights. Orders name them from now on: call `begin_update`, or `begin_evaluation`.
+        """Set the newest weights, which later orders name. Then call `begin_update` or `begin_evaluation`.
 
-        `env_steps`: number of env steps of training so far; None: the weights never become an opponent.
+        `env_steps` is the number of env steps of training so far; with None, the weights never become an opponent.
         """
         if self.rollouts.opponents is not None and env_steps is not None:
             self.rollouts.opponents.made(version, env_steps)
@@ -110,12 +110,12 @@ class TicketCoordinator(Coordinator[CollectingMember]):
         self._note_attributes(weights)
 
     def keep(self, weights: Weights) -> None:
-        """Keep weights that act in an open round of a resumed run."""
+        """Store weights that act in an open round of a resumed run."""
         self.weights.kept[weights.version] = weights
         self._note_attributes(weights)
 
     def _note_attributes(self, weights: Weights) -> None:
-        """Record the attributes of the env copies in rollouts with these weights."""
+        """Record the attributes that env copies have in rollouts with these weights."""
         if weights.env_attributes is not None:
             self.rollouts.attributes[weights.version] = weights.env_attributes.tobytes()
 
@@ -139,23 +139,23 @@ class TicketCoordinator(Coordinator[CollectingMember]):
     def begin_evaluation(
         self, plan: EvaluationPlan, on_rows: OnRows | None = None, *, beside: bool = False
     ) -> list[Outgoing]:
-        """Begin to evaluate the newest weights, `beside` training if so. `self.evaluation` says when it is done."""
+        """Begin to evaluate the newest weights, alongside training if `beside`. `self.evaluation.done` says when to end."""
         self.evaluation.begin(plan, self.version, on_rows, beside=beside)
         return self._deal()
 
     def await_evaluation(self) -> list[Outgoing]:
-        """The learner waits for the evaluation beside training: if no evaluating worker is left, let all workers play it."""
+        """Let all workers play the awaited evaluation if no worker that only evaluates is left."""
         if any(member.hello.evaluates for member in self.membership.active()):
             return []
         self.evaluation.all_play()
         return self._deal()
 
     def share_evaluation(self) -> list[Outgoing]:
-        """No answer of the evaluation has come for long: let a second worker, if one is free, play the oldest ticket too."""
+        """Let a second worker, if one is idle, play the oldest ticket too, because no answer has arrived for a long time."""
         return self.weights.after(self.evaluation.share(self.membership.active()), self.members)
 
     def collected(self) -> int:
-        """Env steps of the next update's rollouts, complete ones and running ones, as workers report."""
+        """The env steps of the next update's rollouts, both complete and running, as workers report them."""
         rollouts = self.rollouts
         of_one = self.run.rollout_steps * self.run.copies
         awaited = Counter(ticket.peer for ticket in rollouts.awaited())
@@ -163,13 +163,13 @@ class TicketCoordinator(Coordinator[CollectingMember]):
         return rollouts.collected() + sum(under_way)
 
     def steps_of_update(self) -> int:
-        """Env steps of an update's rollouts, if no step only resets a copy."""
+        """The number of env steps in an update's rollouts, provided that no step only resets a copy."""
         return self.run.lanes * self.run.rollout_steps * self.run.copies
 
     # ---------------------------------------------------------------- inside
 
     def _deal(self) -> list[Outgoing]:
-        """Give lanes without an owner to workers, balance the lanes, and deal tickets."""
+        """Assign lanes without an owner to workers, balance the lanes, and deal tickets."""
         if self.version < 0 or self.membership.draining is not None or not self.members:
             return []
         out = self._placement.place(self.members.values())
@@ -183,7 +183,7 @@ class TicketCoordinator(Coordinator[CollectingMember]):
         dealt = self.rollouts.deal(self.members)
         for peer, order in dealt:
             for permit in order.permits if isinstance(order, Collect) else ():
-                if (past := permit.past) is not None and past.memory:  # the lane has had rollouts
+                if (past := permit.past) is not None and past.memory:  # only then has the lane had rollouts
                     worker = self.members[peer].hello.worker
                     history = self.rollouts.lanes[permit.lane].history
                     longest = 0 if history is None else history.longest_given_up
@@ -192,7 +192,7 @@ class TicketCoordinator(Coordinator[CollectingMember]):
         return dealt
 
     def _needed(self) -> set[int]:
-        """The versions that orders may name, besides the newest."""
+        """The versions, besides the newest, that orders may name."""
         opponents = self.rollouts.opponents
         needed = self.rollouts.rounds.acting()
         if self.evaluation.pending:
@@ -221,10 +221,10 @@ class TicketCoordinator(Coordinator[CollectingMember]):
                 return self._unusable(member, why) if why else []
             case Goodbye(_, reason):
                 self.membership.leave(member, reason)
-        return []  # also for answers to orders that a run doesn't give
+        return []  # including for answers to orders that a run never sends
 
     def _take_rollout(self, member: CollectingMember, rollout: Rollout) -> list[Outgoing]:
-        """Accept a rollout, unless it arrived before. If it can't be used, it is counted and its ticket is lost."""
+        """Accept a rollout, unless it had arrived before. If it can't be used, it is counted, and its ticket is lost."""
         try:
             most_steps = self.rollouts.rounds_by(rollout.ticket) * self.run.rollout_steps
             self._check_rows(rollout, self.run, most_steps)
@@ -245,7 +245,7 @@ class TicketCoordinator(Coordinator[CollectingMember]):
         return out
 
     def _take_evaluated(self, member: CollectingMember, answer: Evaluated) -> list[Outgoing]:
-        """Accept episodes of an evaluation, unless they arrived before."""
+        """Accept episodes of an evaluation, unless they had arrived before."""
         held = len(member.tickets)
         played = self.evaluation.episodes_played
         why = self.evaluation.take_in(member, answer)
@@ -276,10 +276,7 @@ class TicketCoordinator(Coordinator[CollectingMember]):
         return self.rollouts.received(member)
 
     def _removed(self, member: CollectingMember, why: str) -> None:
-        """Count the tickets of a worker that is gone as lost, and its lanes as without owner.
-
-        `_deal` gives both to other workers.
-        """
+        """Count a lost worker's tickets as lost, and take its lanes, so that `_deal` gives both to other workers."""
         self.rollouts.worker_lost(member)
         for number in list(member.tickets):
             dealer = self.rollouts if number in self.rollouts.held else self.evaluation
@@ -288,11 +285,11 @@ class TicketCoordinator(Coordinator[CollectingMember]):
         self.weights.held.forget(member.peer)
 
     def _unusable(self, member: CollectingMember, why: str) -> list[Outgoing]:
-        """Count a message that could not be used; refuse the worker after too many."""
+        """Count a message that could not be used, and refuse the worker after `STRIKES` of them."""
         member.strikes += 1
         return super()._unusable(member, why) if member.strikes >= STRIKES else []
 
 
 def _by_joining(member: Member) -> int:
-    """Sort key: the next lane goes to the worker with the fewest lanes; in a tie, to the one that joined first."""
+    """Sort key of workers with equally few lanes: the one that joined first gets the next lane."""
     return member.join_number

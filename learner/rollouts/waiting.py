@@ -1,10 +1,10 @@
-"""Who waits for whom in a run, and for what share of the time: one line. Pure: the state and `now` in, a sentence out.
+"""A line that says who waits for whom in a run, and for what share of the time. Pure: the state and `now` in, a line out.
 
 Rule: waits shorter than `LONG_S` aren't mentioned. Between two long waits for rollouts, the line mentions the last one, so
-that it does not come and go. While the learner waits, the line names the lanes whose rollouts the next update lacks, and
-says how many of its env steps have been made: with a slow simulator, the first update may be far away. While the learner
-learns, the workers without a ticket wait for weights. The shares are those of training since the learner started:
-evaluations do not count.
+that it does not appear and disappear all the time. While the learner waits, the line names the lanes whose rollouts are
+missing for the next update, and says how many of that update's env steps have been made, because with a slow simulator the
+first update may be far away. While the learner learns, the line says how many workers wait for weights. The shares are those
+of training time since the learner started, without evaluations.
 """
 
 from __future__ import annotations
@@ -22,21 +22,21 @@ from millrace.protocol.bounds import one_line
 Phase = Literal["starting", "gathering", "learning", "evaluating"]
 SHARES_AFTER_S = 30.0
 SHORT_S = 180.0  # longer times are given in minutes
-MOST_LANES = 4  # lanes that are named by their numbers
+MOST_LANES = 4  # the most lanes whose numbers are given
 
 
 class LearnerTime:
-    """What the learner is doing, since when, and how it has spent its time."""
+    """Records what the learner is doing, since when, and how it has spent its time."""
 
     def __init__(
         self, coordinator: TicketCoordinator, now: float, no_worker: Callable[[], str], processes: WorkerProcesses
     ) -> None:
-        """`no_worker` returns a text about what is awaited if there is no member."""
+        """`no_worker` returns a text that says what is awaited while there is no member."""
         self.phase: Phase = "starting"
         self.since_s = now
-        self._last = ""  # the last wait, in words; empty if the last wait for rollouts was short
+        self._last = ""  # the last wait in words; empty if the last wait for rollouts was short
         self.spent_s: dict[Phase, float] = dict.fromkeys(get_args(Phase), 0.0)
-        """seconds of the phases that have ended"""
+        """total seconds of each phase, without the current one"""
         self._coordinator = coordinator
         self._no_worker = no_worker
         self._processes = processes
@@ -47,7 +47,7 @@ class LearnerTime:
         return self.phase == "evaluating"
 
     def turn(self, phase: Phase, now: float) -> None:
-        """The learner enters this phase."""
+        """Record that the learner enters this phase."""
         if self.phase == "gathering":
             waited_s = now - self.since_s
             self._last = f"waited {waited_s:.0f} s for rollouts" if waited_s >= LONG_S else ""
@@ -56,18 +56,18 @@ class LearnerTime:
         self.since_s = now
 
     def learned(self, now: float) -> None:
-        """New weights are about to be sent to the workers that wait for them."""
+        """Record that an update has ended, and that workers that wait for its weights are about to get them."""
         if self.phase == "learning":
             if now - self.since_s >= LONG_S:
                 self._last = self._learning(now)
             self.turn("learning", now)
 
     def until(self, now: float) -> dict[Phase, float]:
-        """Seconds of each phase until now."""
+        """Total seconds of each phase until now."""
         return self.spent_s | {self.phase: self.spent_s[self.phase] + now - self.since_s}
 
     def line(self, now: float) -> str:
-        """Who waits for whom; empty if nobody waits long."""
+        """The line that says who waits for whom; empty if nobody has waited for long."""
         lasts_s = now - self.since_s
         members = self._coordinator.members
         spent_s = self.until(now)
@@ -89,14 +89,14 @@ class LearnerTime:
         return one_line(text)
 
     def _learning(self, now: float) -> str:
-        """For how long the learner learns, and how many workers have lanes and no ticket."""
+        """How long the learner has been learning, and how many workers have lanes but no ticket."""
         members = self._coordinator.members.values()
         idle = sum(not member.tickets for member in members if member.lanes)
         waiting = f", {idle} of {len(members)} workers waiting for weights" if idle else ""
         return f"learning for {now - self.since_s:.0f} s{waiting}"
 
     def _awaited(self, now: float) -> str:
-        """The lanes of the worker that is held up longest, that worker, and how many other lanes are awaited."""
+        """The worker that has been held up longest, its awaited lanes, and the number of other awaited lanes."""
         lanes = dict[bytes, set[int]]()
         members = self._coordinator.members
         for ticket in self._coordinator.rollouts.awaited():
@@ -109,7 +109,7 @@ class LearnerTime:
         return f"lane{'s' * (len(mine) > 1)} {named} ({who})" + (f" and {more} more" if more else "")
 
     def _collected(self, now: float) -> str:
-        """How many env steps of the next update have been made, and how long the rest takes; empty before the first one."""
+        """How many env steps of the next update have been made, and how long the rest will take; empty if none was made."""
         coordinator = self._coordinator
         made = coordinator.collected()
         of = coordinator.steps_of_update()
@@ -121,17 +121,17 @@ class LearnerTime:
         return f"; {which} rollouts: {made:,} of {of:,} env steps{left}"
 
     def _played(self, plan: EvaluationPlan, now: float) -> str:
-        """How far an evaluation is, and which of its players is held up longest."""
+        """How far an evaluation has got, and which of the workers that play it has been held up longest."""
         evaluation = self._coordinator.evaluation
         who = self._held_up_longest(evaluation.players, now)
         done = f"{evaluation.episodes_played} of {len(plan.seeds)} episodes"
         return f"{done} (at most {plan.most_steps:,} env steps each); {who}"
 
     def _held_up_longest(self, members: list[Member], now: float) -> str:
-        """The worker that is held up longest, among those that step for these members, or among the members."""
+        """The worker that has been held up longest: of these members or, if others step for them, of those."""
         return max((held_up(member, now) for member in self._processes.stepping() or members), default=("nobody plays",))[-1]
 
 
 def _in_words(seconds: float) -> str:
-    """A time that is not known exactly."""
+    """A rough time in words: in seconds if it is short, otherwise in minutes."""
     return f"{seconds:.0f} s" if seconds < SHORT_S else f"{seconds / 60:,.0f} min"

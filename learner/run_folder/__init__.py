@@ -1,1 +1,1 @@
-"""The files of a run: checkpoints, metrics, policies."""
+"""The files of a run: settings, checkpoints, metrics, policies, results and logs."""

@@ -1,9 +1,9 @@
-"""Writes files atomically, and retries writes that the disk refused.
+"""Writes files atomically, and retries writes that have failed.
 
-Rule: a file is written beside the target under a name that ends with `.tmp`, flushed to the disk, and then renamed to the
-target; the folder is flushed too. If anything fails, the target stays as it was and the temporary file is removed. Only
-files that nobody needs after a power failure are not flushed. If the disk refuses a write, there is a warning while the run
-trains, and the run fails if it is still refused at the end.
+Rule: a file is written next to its target under a name that ends with `.tmp`, flushed to the disk, and then renamed to the
+target; the folder is flushed, too. If anything fails, the target stays unchanged and the temporary file is removed. Only
+files that nobody needs after a power failure are not flushed. If a write fails, for example because the disk is full, a
+warning is logged while the run trains; the run fails if the write still fails at its end.
 """
 
 from __future__ import annotations
@@ -23,21 +23,21 @@ from millrace.protocol.errors import RunError
 log = logging.getLogger("millrace.learner")
 
 TEMPORARY = ".tmp"
-SAY_AGAIN_S = 60.0  # seconds between warnings about the same reason
-TRY_FOR_S = 10.0  # at the end of a run: somebody may make space
+SAY_AGAIN_S = 60.0  # seconds between two warnings with the same reason
+TRY_FOR_S = 10.0  # seconds for which failed writes are retried at the end of a run, in case somebody frees space
 TRY_EVERY_S = 0.5
 
 Write = Callable[[], object]
-"""Writes the current state of something. Raises `RunError` if the disk refuses it."""
+"""Writes the current state of something. Raises `RunError` if that fails."""
 
 
 def write_atomically(target: Path, write: Callable[[BinaryIO], object], *, flush: bool = True) -> None:
-    """Let `write` fill the file and replace the target by it. Raises what `write` or the file system raises.
+    """Let `write` fill a new file, and replace the target with it. Raises what `write` or the file system raises.
 
-    `flush`: wait until the disk has it.
+    If `flush`, waits until the file is on the disk.
     """
     temporary = target.with_name(target.name + TEMPORARY)
-    temporary.unlink(missing_ok=True)  # from a process that was killed, or a link
+    temporary.unlink(missing_ok=True)  # it may be left from a process that was killed, or be a link
     try:
         with os.fdopen(open_regular(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL), "wb") as file:
             write(file)
@@ -53,15 +53,15 @@ def write_atomically(target: Path, write: Callable[[BinaryIO], object], *, flush
 
 
 def write_file(target: Path, write: Callable[[BinaryIO], object]) -> None:
-    """Like `write_atomically`, but raises `RunError`, in one line, if the file system refuses."""
+    """Like `write_atomically`, but raises `RunError`, with a one-line message, if the file system raises."""
     try:
         write_atomically(target, write)
-    except (OSError, ValueError) as error:  # ValueError: not a valid file name
+    except (OSError, ValueError) as error:  # ValueError is raised for an invalid file name
         raise RunError(f"{target} not written: {reason(error)}") from error
 
 
 def _flush_folder(folder: Path) -> None:
-    """Make sure that the new name survives a power failure."""
+    """Flush a folder to the disk, so that new names in it survive a power failure."""
     handle = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(handle)
@@ -70,7 +70,7 @@ def _flush_folder(folder: Path) -> None:
 
 
 class Writes:
-    """The writes of a run, by name, and those that the disk has refused."""
+    """Makes the writes of a run, and remembers those that have failed, by name."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic, sleep: Callable[[float], None] = time.sleep) -> None:
         self._clock = clock
@@ -78,10 +78,10 @@ class Writes:
         self._refused: dict[str, tuple[Write, RunError]] = {}
         self._said: dict[str, tuple[str, float]] = {}
         self.at_most: Callable[[float], float] = lambda seconds: seconds
-        """Maps the seconds that `confirm` would try to those that it may: fewer once a signal ends the run."""
+        """Limits the seconds for which `confirm` tries, because there is less time once a signal has ended the run."""
 
     def write(self, name: str, write: Write) -> None:
-        """Call `write`. If the disk refuses it, a warning says so, and `confirm` calls it again."""
+        """Call `write`. If it fails, log a warning; `confirm` will call it again."""
         if self._is_written(name, write):
             return
         line = str(self._refused[name][1])
@@ -92,7 +92,7 @@ class Writes:
             log.warning("%s", line)
 
     def confirm(self) -> None:
-        """Return once everything is written. Retries for a while, but not after Ctrl-C. Raises `RunError`."""
+        """Retry failed writes for a while, until they succeed or Ctrl-C is pressed. Raises `RunError` if some still fail."""
         if not self._refused:
             return
         for_s = self.at_most(TRY_FOR_S)

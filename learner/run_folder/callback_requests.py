@@ -1,6 +1,6 @@
-"""Callbacks' requests until the run takes them: numbers to log, and attributes of env copies.
+"""Holds the requests of callbacks until the run takes them: numbers to log, and attributes to set on env copies.
 
-Rule: everything is checked at the call, so that a traceback shows the user's line.
+Rule: a request is checked when it is made, so that a traceback shows the user's line.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from millrace.learner.run_folder.env_attributes import EnvAttributes
 from millrace.protocol.bounds import one_line
 from millrace.protocol.errors import UsageError, safe_repr
 
-MOST_LOGGED = 1_000  # numbers of one row
-LONGEST_NAME = 200  # characters
+MOST_LOGGED = 1_000  # the most numbers that callbacks may log in one row
+LONGEST_NAME = 200  # the most characters of a number's name
 
 
 class Requests:
@@ -21,13 +21,13 @@ class Requests:
 
     def __init__(self, attributes: EnvAttributes | None = None) -> None:
         self.attributes = attributes or EnvAttributes()
-        """attributes of the env copies"""
+        """the attributes that were set on env copies"""
         self.closed = ""
-        """why no attribute may be set now; empty if it may"""
+        """why no attribute may be set now; empty if attributes may be set"""
         self._logged: dict[str, float | None] = {}
 
     def log(self, name: str, value: Any) -> None:
-        """Log this number with the row of this update. Raises `UsageError` for anything but a name and a number."""
+        """Log a number with the row of the current update. Raises `UsageError` for anything but a name and a number."""
         if not isinstance(name, str) or not name or name != one_line(name, LONGEST_NAME):
             raise UsageError(f"log: expected a name of 1 to {LONGEST_NAME} characters in one line, got {_shown(name)}")
         try:
@@ -40,7 +40,7 @@ class Requests:
         self._logged[name] = number if math.isfinite(number) else None
 
     def logged(self) -> dict[str, float | None]:
-        """The numbers that were logged since `take_logged` was called last."""
+        """The numbers that were logged since the last call of `take_logged`."""
         return dict(self._logged)
 
     def set_env_attr(self, name: str, value: Any) -> None:
@@ -50,7 +50,7 @@ class Requests:
         self.attributes.set(name, value)
 
     def take_logged(self) -> dict[str, float | None]:
-        """The numbers that were logged since the last call."""
+        """Take the numbers that were logged since the last call."""
         taken = self._logged
         self._logged = {}
         return taken

@@ -1,10 +1,11 @@
 """Checkpoints of a run: `checkpoints/<env steps>.pt`. `CheckpointSchedule` says when to write one.
 
-Rule: a checkpoint is written atomically; the newest undamaged one is used; and reading one executes no code
+Rule: a checkpoint is written atomically; a resumed run uses the newest undamaged one; and reading one executes no code
 (`weights_only`). A state therefore consists of tensors and plain data; a numpy generator is stored as its
 `bit_generator.state`. torch's loader does not detect damaged data, so the checksums of the file (a zip archive) are verified
-first. The file must contain each element of a tensor: a tensor with a stride of 0 has a few bytes there, but any number once
-copied. And the loader's calls are rehearsed, because they could fill the memory (`learner/rehearsed_pickle.py`).
+first. The file must contain each element of a tensor: a tensor with a stride of 0 has only a few bytes in the file, but
+could grow to any size when copied. And the calls of the loader are checked in advance, because they could fill the memory
+(`learner/rehearsed_pickle.py`).
 """
 
 from __future__ import annotations
@@ -27,8 +28,8 @@ FORMAT = 1
 FOLDER = "checkpoints"
 SUFFIX = ".pt"
 ZIP_BEGINS = b"PK\x03\x04"  # if a file begins with anything else, torch reads a pickle before the archive
-PICKLE = "data.pkl"  # how the name of an archive's pickle ends; torch finds it in capital letters, too
-MOST_VIEWS = 16  # views of the same numbers: an algorithm may save parts of a tensor besides the whole
+PICKLE = "data.pkl"  # suffix of the pickle's name in the archive; torch accepts capital letters, too
+MOST_VIEWS = 16  # the most views of the same numbers, because an algorithm may save parts of a tensor besides the whole
 
 
 class Checkpoint(NamedTuple):
@@ -40,7 +41,7 @@ class Checkpoint(NamedTuple):
 
 
 class CheckpointSchedule:
-    """Says when a checkpoint is due: by time, and after the first update. Until then a killed run has nothing to resume."""
+    """Says when a checkpoint is due: at intervals, and after the first update, so that a killed run can soon be resumed."""
 
     def __init__(self, every_s: float, now: float) -> None:
         self._every_s = every_s
@@ -51,20 +52,20 @@ class CheckpointSchedule:
         return updates == 1 or now - self._began_s >= self._every_s
 
     def saved(self, began_s: float) -> None:
-        """Record that one was begun at this time, and written or refused by the disk. -inf: all are gone, so one is due."""
+        """Record that a checkpoint was attempted at this time. With -inf, the next one is due at once."""
         self._began_s = began_s
 
 
 class _Unreadable(Exception):
-    """The file is damaged; an older one may be intact."""
+    """The checkpoint file is damaged. An older one may be intact."""
 
 
 def save(folder: Path, state: dict[str, Any], env_steps: int, keep: int) -> Path:
     """Write a checkpoint into the run folder.
 
-    The newest `keep` checkpoints up to this one are kept. A later one stays: a resumed run skipped it because it is damaged.
-    Raises `CheckpointError` if it cannot be written; older checkpoints then stay untouched. Raises `UsageError` if the state
-    contains something that could not be read back.
+    Keeps the newest `keep` checkpoints up to this one. It doesn't remove later ones, which are damaged and which a resumed
+    run has skipped. Raises `CheckpointError` if the checkpoint cannot be written; older ones are then untouched. Raises
+    `UsageError` if the state contains something that could not be read back.
     """
     import torch
 
@@ -73,13 +74,13 @@ def save(folder: Path, state: dict[str, Any], env_steps: int, keep: int) -> Path
     record = {"format": FORMAT, "env_steps": env_steps, "state": state}
     try:
         subfolder(folder, FOLDER)
-        for left in regular_files(folder, f"{FOLDER}/*{TEMPORARY}"):  # from a process that was killed
+        for left in regular_files(folder, f"{FOLDER}/*{TEMPORARY}"):  # left by a process that was killed
             left.unlink()
         write_atomically(path, lambda file: torch.save(record, file))
         for old in [each for each in _files(folder) if each <= path][:-keep]:
             old.unlink()
     except (OSError, RuntimeError) as error:
-        refused = error.__context__  # torch raises its own RuntimeError during the file's error
+        refused = error.__context__  # torch raises its own RuntimeError while it handles the file's error
         why = reason(refused if isinstance(refused, OSError) and not isinstance(error, OSError) else error)
         raise CheckpointError(f"checkpoint {path} not written: {why}; older checkpoints are untouched") from error
     return path
@@ -108,7 +109,7 @@ def has_any(folder: Path) -> bool:
 
 
 def newest_env_steps(folder: Path) -> int:
-    """Env steps of the newest checkpoint, by its name; 0 if there is none."""
+    """The env steps of the newest checkpoint, according to its name; 0 if there is none."""
     return max((int(path.stem) for path in _files(folder) if path.stem.isascii() and path.stem.isdecimal()), default=0)
 
 
@@ -134,7 +135,7 @@ def _read(path: Path) -> Checkpoint:
                 raise _Unreadable("it isn't an archive that torch.save wrote")
             with zipfile.ZipFile(file) as archive:
                 if any(entry.compress_type != zipfile.ZIP_STORED for entry in archive.infolist()):
-                    raise _Unreadable("it is compressed, which torch never does")  # a few bytes could fill the memory
+                    raise _Unreadable("it is compressed, which torch never does")  # when read, it could fill the memory
                 if (damaged := archive.testzip()) is not None:
                     raise _Unreadable(f"checksum of {damaged} does not match")
                 for entry in archive.infolist():
@@ -162,7 +163,7 @@ def _read(path: Path) -> Checkpoint:
 
 
 def _check_memory(record: object, size: int) -> None:
-    """Raise `_Unreadable` unless the tensors are as large as a file of this size can be."""
+    """Raise `_Unreadable` if the tensors are larger than a file of `size` bytes can hold."""
     tensors = list(_tensors(record))
     if any(each.device.type != "cpu" or not _is_whole(each) for each in tensors):
         raise _Unreadable("it has a tensor whose elements are not all in the file")
@@ -171,7 +172,7 @@ def _check_memory(record: object, size: int) -> None:
 
 
 def _tensors(record: object) -> Iterator[Tensor]:
-    """Each tensor once. Lists in a stranger's file may contain themselves, or one entry many times."""
+    """Yield each tensor once. Lists in a stranger's file may contain themselves, or one entry many times."""
     import torch
 
     seen: set[int] = set()
@@ -191,7 +192,7 @@ def _tensors(record: object) -> Iterator[Tensor]:
 
 
 def _is_whole(tensor: Tensor) -> bool:
-    """Whether each element has its own memory."""
+    """Whether each element of a tensor has memory of its own."""
     import torch
 
     return tensor.layout == torch.strided and tensor.nbytes <= tensor.untyped_storage().nbytes()

@@ -1,7 +1,7 @@
-"""Attributes of env copies that callbacks set: those of the next weights, and those that a resumed run must send. Pure.
+"""The attributes that callbacks set on env copies: those of the next weights, and those that a resumed run must send. Pure.
 
 Rule: an attribute takes effect with the next version of the weights, so each rollout is collected with the attributes of its
-version, whatever the number of workers. A checkpoint of version v has the attributes of v, and those that wait for v + 1.
+version, whatever the number of workers. A checkpoint of version v has the attributes of v and those for v + 1.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from millrace.protocol.bounds import MAX_NAME, one_line
 from millrace.protocol.errors import UsageError, safe_repr
 from millrace.protocol.wire.plain_values import pack, unpack
 
-MOST_BYTES = 1 << 20  # size of all attributes together: they are sent with all weights
+MOST_BYTES = 1 << 20  # largest size of all attributes together, because they are sent along with all weights
 
 
 class AttributesState(msgspec.Struct, kw_only=True):
-    """What a checkpoint keeps."""
+    """The attributes in a checkpoint."""
 
     sent: bytes = b""
     """packed attributes of the version of the checkpoint; empty if there are none"""
@@ -32,15 +32,18 @@ class EnvAttributes:
     """The attributes of one run, by name."""
 
     def __init__(self, state: AttributesState | None = None, refusal: str = "") -> None:
-        """`state`: from the checkpoint of a resumed run. `refusal`: why this run's env copies have no attributes, if so."""
+        """`state` is from the checkpoint of a resumed run.
+
+        `refusal` says why this run's env copies can't have attributes; it is empty if they can.
+        """
         state = state or AttributesState()
         self._refusal = refusal
-        self._next = _unpacked(state.sent)  # attributes that the next weights carry
-        self._after: dict[str, Any] | None = _unpacked(state.waiting)  # those of the weights after that; None: the same
+        self._next = _unpacked(state.sent)  # attributes of the next weights
+        self._after: dict[str, Any] | None = _unpacked(state.waiting)  # attributes of the weights after those; None if equal
         self._sent = state.sent
         self._version = -1
         self.changes = 0
-        """how often an attribute was set in this process"""
+        """how many times an attribute was set in this process"""
 
     def now(self) -> dict[str, Any]:
         """The newest attributes, by name."""
@@ -65,7 +68,7 @@ class EnvAttributes:
         self.changes += 1
 
     def table(self, version: int) -> Array | None:
-        """The packed attributes of this version's weights, however often you ask; None if there are no attributes."""
+        """The packed attributes of this version's weights, the same on each call; None if there are no attributes."""
         if version != self._version:
             self._sent = pack(self._next) if self._next else b""
             self._version = version
@@ -77,7 +80,7 @@ class EnvAttributes:
     def state(self, version: int) -> AttributesState:
         """The state for a checkpoint of this version."""
         waiting = pack(self.now()) if self.now() else b""
-        first = self._version == -1  # nothing was published in this process
+        first = self._version == -1  # no weights have been published in this process
         return AttributesState(sent=self._sent if first or version == self._version else waiting, waiting=waiting)
 
 

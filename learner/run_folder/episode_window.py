@@ -19,20 +19,20 @@ class EpisodeWindow:
     """The last 100 episodes."""
 
     def __init__(self, episodes: Sequence[Episode] = (), facts: Sequence[str] = ()) -> None:
-        """`facts`: the names of the episodes' facts."""
+        """`facts` are the names of the episodes' facts."""
         self.facts: dict[str, FactMean] = fact_means(facts, ())
         """The means of the episodes' facts, by name."""
         self._names = facts
         self.return_mean: float | None = None
-        """Mean return, or None before the first episode has ended."""
+        """The mean return; None before the first episode has ended."""
         self.length_mean: float | None = None
-        """Mean length in env steps, or None before the first episode has ended."""
+        """The mean length in env steps; None before the first episode has ended."""
         self._episodes: deque[Episode] = deque(maxlen=WINDOW_EPISODES)
         self.extend(episodes)
 
     @staticmethod
     def from_state(episodes: list[Episode], had: Sequence[str] = (), facts: Sequence[str] = ()) -> EpisodeWindow:
-        """The window with these episodes. `had`: the names of their facts; `facts`: the names of new episodes' facts."""
+        """The window with these episodes. `had` are the names of their facts, and `facts` those of new episodes."""
         if tuple(had) != tuple(facts):
             by_name = (dict(zip(had, one.facts, strict=False)) for one in episodes)
             renamed = (tuple(of_one.get(name, math.nan) for name in facts) for of_one in by_name)
@@ -46,7 +46,7 @@ class EpisodeWindow:
     def extend(self, episodes: Sequence[Episode]) -> None:
         """Add episodes that have just ended, in order."""
         if not episodes:
-            return  # usual after updates of short rollouts: the means stay the same
+            return  # common with short rollouts: the means stay the same
         self._episodes.extend(episodes)
         self.return_mean = float(np.mean([episode.reward for episode in self._episodes]))
         self.length_mean = float(np.mean([episode.length for episode in self._episodes]))
@@ -55,5 +55,5 @@ class EpisodeWindow:
 
     @property
     def full(self) -> bool:
-        """True once there are 100."""
+        """Whether the window has all of its 100 episodes."""
         return len(self._episodes) == WINDOW_EPISODES

@@ -1,8 +1,8 @@
-"""What the policy sees, as a picture: some image observations of the first rollouts. Pure.
+"""A picture of what the policy sees: some image observations of the first rollouts. Pure.
 
-There is a row for each of four steps, from the first to the last of one env copy's rollout. The channels, such as stacked
-frames, are side by side; three channels are shown as red, green and blue. Large images are reduced to every second, third, …
-pixel. If the bounds aren't those of bytes, the largest value is white, so that planes of 0 and 1 are visible.
+The picture has a row for each of four steps, from the first to the last of one env copy's rollout. The channels, such as
+stacked frames, are side by side; three channels are shown as red, green and blue. Large images are reduced to every second,
+third, … pixel. If the bounds aren't 0 and 255, the largest value is shown as white, so that planes of 0 and 1 are visible.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from millrace.learner.run_folder.run_folder import as_folder_name
 from millrace.protocol.arrays import Array
 from millrace.protocol.specs import Leaf
 
-ROWS = 4  # of the picture
+ROWS = 4  # number of rows in the picture
 GAP = 2  # pixels between images
-GRAY = 128  # their brightness
-MOST_PIXELS = 256  # of a side of an image
+GRAY = 128  # brightness of these pixels
+MOST_PIXELS = 256  # largest height and width of an image
 Pixels = npt.NDArray[np.uint8]
 
 
@@ -44,7 +44,7 @@ def png(pixels: Pixels) -> bytes:
 
 
 def _sheet(array: Array, leaf: Leaf) -> Pixels:
-    """Rows of images, as one image."""
+    """The rows of the picture, joined into one image."""
     steps = dict.fromkeys(np.linspace(0, len(array) - 1, ROWS).astype(int).tolist())
     images = [np.asarray(array[t, 0], np.uint8) for t in steps]
     white = 255 if leaf.divisor == 255 else max(1, *(int(image.max()) for image in images))
@@ -52,7 +52,7 @@ def _sheet(array: Array, leaf: Leaf) -> Pixels:
 
 
 def _row(image: Array, leaf: Leaf) -> Pixels:
-    """The channels of an image side by side; three of them as colors."""
+    """The channels of an image side by side, or an image in color if there are three channels."""
     last = np.asarray(image if leaf.has_channels_last else np.moveaxis(image, 0, -1), np.uint8)
     every = -(-max(last.shape[:2]) // MOST_PIXELS)
     last = last[::every, ::every]

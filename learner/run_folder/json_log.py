@@ -1,11 +1,14 @@
-"""The log as JSON, one event per line: on stderr (`--log-json`), and its warnings and notices in the run folder (log.jsonl).
+"""The log as JSON, one event per line: all of it on stderr (`--log-json`), warnings and notices also in log.jsonl.
+
+log.jsonl is in the run folder.
 
 Every line has `time` (UTC, ISO 8601), `level`, `event` and `message`, the text for people. `event` is "joined",
 "left", "refused", "environment_raised", "policy_raised", "process_failed" or "asked_to_rejoin"
 (`millrace.learner.members.events`, with the fields of the event), "progress", or "said" for any other line of the log.
 
-Rule: log.jsonl is bounded, and nothing depends on it. If it grows too long, only the newer half is kept. Lines that the disk
-refuses are dropped. It is opened for each line, because somebody may delete it, or its folder, meanwhile.
+Rule: the size of log.jsonl is bounded, and nothing depends on the file. If it grows too long, only the newer half is kept.
+Lines that can't be written are dropped. The file is opened for each line, because somebody may delete it, or its folder, in
+between.
 """
 
 from __future__ import annotations
@@ -62,7 +65,7 @@ def _line(time: float, level: str, event: str, message: str, fields: dict[str, A
 
 
 class LoggedLine(msgspec.Struct, frozen=True):
-    """A line of the log. Its time is local."""
+    """A line of the log, with its time in the local time zone."""
 
     time: Annotated[datetime, Meta(tz=True)]
     level: str
@@ -72,7 +75,7 @@ class LoggedLine(msgspec.Struct, frozen=True):
 
 @contextmanager
 def kept_log(folder: Path) -> Iterator[None]:
-    """Write millrace's warnings into the folder, too."""
+    """Inside this context, also write millrace's warnings and notices to the log in this run folder."""
     handler = _RunLog(folder / RUN_LOG_FILE)
     logger = logging.getLogger("millrace")
     logger.addHandler(handler)
@@ -104,7 +107,7 @@ class _RunLog(logging.Handler):
         self.setFormatter(JsonLines())
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Append one line, unless the record is a notice that isn't kept."""
+        """Append one line, unless the record is a notice that log.jsonl leaves out."""
         if not getattr(record, "kept", True):
             return
         with suppress(OSError, UnicodeError):
@@ -119,7 +122,7 @@ class _RunLog(logging.Handler):
 
 
 def _end(file: int, most: int) -> bytes:
-    """Whole lines from the end of a file, at most this many bytes. Raises OSError."""
+    """The last whole lines of a file, at most this many bytes. Raises OSError."""
     begin = max(0, os.fstat(file).st_size - most)
     end = os.pread(file, most, begin)
     return end.partition(b"\n")[2] if begin else end

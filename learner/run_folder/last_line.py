@@ -1,6 +1,6 @@
 """The last line of a program that trains: why it ended, and how to continue the run. Pure.
 
-Rule: it is one line. Notes that were added to the error on its way (`BaseException.__notes__`) follow it.
+Rule: it is one line. The notes of the error (`BaseException.__notes__`) follow its message.
 """
 
 from __future__ import annotations
@@ -20,29 +20,32 @@ OF_LEARNER = "millrace.learner."
 
 
 def resume_command(run: Path, *, elsewhere: bool) -> str:
-    """The shell command that continues a run. `elsewhere`: its workers are started elsewhere, not by the learner."""
+    """The shell command that continues a run. `elsewhere` says that its workers aren't started by the learner."""
     return f"{typed_name()} {'learner' if elsewhere else 'train'} --resume {shlex.quote(str(run))}"
 
 
 def last_line(program: str, error: BaseException, hints: Sequence[str] = (), *, elsewhere: bool = False) -> str:
-    """Why `program` ended, for a terminal. `hints` follow the notes of the error; `elsewhere`: see `resume_command`."""
+    """The line for a terminal that says why `program` ended. `hints` follow the notes of the error.
+
+    For `elsewhere`, see `resume_command`.
+    """
     more = [note for note in getattr(error, "__notes__", ()) if isinstance(note, str)]
     match error:
         case KeyboardInterrupt():
             why = "interrupted"
-            if (run := getattr(error, "run", None)) is not None:  # `Interrupted`; its class need not be imported for this
+            if (run := getattr(error, "run", None)) is not None:  # an `Interrupted`, whose class isn't imported here
                 more = [f"continue with: {resume_command(run, elsewhere=elsewhere)}"]
         case UserFacingError():
             why = str(error)
         case _:
             why = f"{users_code(error) or 'internal error'}: {type(error).__name__}: {first_line(error)}"
-    return one_line("; ".join([f"{program}: {why}", *more, *hints]), MAX_TEXT)  # it may quote a worker, or a file
+    return one_line("; ".join([f"{program}: {why}", *more, *hints]), MAX_TEXT)  # the text may quote a worker or a file
 
 
 def users_code(error: BaseException) -> str:
-    """FILE:LINE where user code that the learner calls, such as the loss of an algorithm, raised this; else empty.
+    """The FILE:LINE at which user code that the learner calls, such as an algorithm's loss, raised this; else empty.
 
-    An error in a library counts for the code that called it.
+    An error in a library counts as raised by the code that called the library.
     """
     where = ""
     libraries = tuple(sysconfig.get_path(name) for name in ("stdlib", "purelib", "platlib"))

@@ -1,7 +1,7 @@
-"""The lock of a run is a lease: it lapses unless its owner renews it. The file's content, and whether its owner lives. Pure.
+"""The lease behind a run's lock, which lapses unless its owner renews it. Has the content of the lock file. Pure.
 
 Rule: a living owner rewrites the lock file every few seconds with another count. An observer doesn't compare the clocks of
-two machines: it measures with its own clock how long the content stays the same.
+two machines; it measures with its own clock how long the content stays the same.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from millrace.protocol.address import check_address
 from millrace.protocol.bounds import INVALID, Line, Natural
 from millrace.protocol.errors import UsageError
 
-WIDTH = 1024  # bytes: every rewrite has the same length, so that one of them replaces the whole
+WIDTH = 1024  # size of the lock file in bytes, which is fixed so that each rewrite replaces the whole content
 HIGHEST_COUNT = 10**12
 
 
@@ -25,9 +25,9 @@ class Unreachable(Enum):
     """Why nobody can ask the learner of a run."""
 
     INPROC = "inproc"
-    """Its workers are threads: it listens in its own process only."""
+    """Its workers are threads, so it listens in its own process only."""
     KEYS_OF_THE_RUN = "keys"
-    """Its keys are made for this run, and are not in any file."""
+    """Its keys were made for this run only, and are not in any file."""
 
 
 class Listens(NamedTuple):
@@ -38,42 +38,42 @@ class Listens(NamedTuple):
     here: str
     """Its address for processes on its own machine."""
     keys: str = ""
-    """Its key folder; empty if it needs no key."""
+    """Its key folder; empty if no key is needed."""
 
 
 class Owner(msgspec.Struct, frozen=True, kw_only=True):
-    """The content of the lock file."""
+    """The owner of a lock: the content of the lock file."""
 
     host: Line
     pid: Annotated[int, Meta(ge=1, le=2**31 - 1)]
     boot_id: Line
-    """Boot id of the kernel there: processes with the same one are on one machine."""
+    """The boot id of the kernel on `host`. Processes with the same boot id are on the same machine."""
     token: Line
-    """Random: no two locks have the same."""
+    """A random text, which no two locks share."""
     network_namespace: Line = ""
-    """Empty if unknown. A container on the same machine may have its own."""
+    """The network namespace of the process; empty if unknown. A container may have its own."""
     pid_namespace: Line = ""
     """The namespace of `pid`; empty if unknown. A container may have its own."""
     address: Line = ""
-    """Where its learner listens, for other machines; empty if nobody can ask it, or it does not listen yet."""
+    """The learner's address for other machines; empty if nobody can ask the learner, or if it does not listen yet."""
     here: Line = ""
-    """The same for processes on its machine and in its network."""
+    """The learner's address for processes on its machine and in its network."""
     keys: Line = ""
-    """The key folder of its learner; empty if it needs no key."""
+    """The learner's key folder; empty if no key is needed."""
     unreachable: Unreachable | None = None
-    """Why nobody can ask it, if that is known."""
+    """Why nobody can ask the learner; None if it can be asked, or if the reason is not known."""
     count: Natural = 0
-    """How often the owner has rewritten the file."""
+    """How many times the owner has rewritten the file."""
 
     def __str__(self) -> str:
         return f"process {self.pid} on {self.host}"
 
     def listening(self, where: Listens | Unreachable) -> Owner:
-        """The owner with the address where its learner listens; without the address if it is too long for the file."""
+        """This owner with the addresses of its learner, or without them if they are too long for the file."""
         if isinstance(where, Unreachable):
             return replace(self, address="", here="", keys="", unreachable=where)
         found = replace(self, address=where.address, here=where.here, keys=where.keys, unreachable=None)
-        fits = len(replace(found, count=HIGHEST_COUNT).encoded()) == WIDTH  # a longer text would not be cut
+        fits = len(replace(found, count=HIGHEST_COUNT).encoded()) == WIDTH  # content that is too long isn't cut
         return found if fits else replace(self, address="", here="", keys="", unreachable=None)
 
     def encoded(self) -> bytes:
@@ -82,9 +82,9 @@ class Owner(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def decoded(content: bytes) -> Owner | None:
-    """The owner that this content names; None if the content was cut or is being written.
+    """The owner that this content describes; None if the content is cut off, or is just being written.
 
-    Its address is kept only if valid: a command connects to it, and a page shows it as a word to type.
+    Its addresses are kept only if they are valid, because commands connect to them, and pages show them as words to type.
     """
     try:
         owner = msgspec.json.decode(content.strip(), type=Owner)
@@ -99,7 +99,7 @@ def decoded(content: bytes) -> Owner | None:
 
 
 class Verdict(Enum):
-    """What an observer knows about the owner."""
+    """What an observer knows about the owner so far."""
 
     UNKNOWN = "the content has not changed yet"
     ALIVE = "the content has changed"
@@ -107,7 +107,7 @@ class Verdict(Enum):
 
 
 class LeaseWatch:
-    """One observer of one lock file, for one decision: once the content has changed, the owner lives."""
+    """Watches one lock file to decide whether its owner is alive: it is once the content has changed."""
 
     def __init__(self, content: bytes, now: float, dead_after_s: float) -> None:
         self._content = content
@@ -115,7 +115,7 @@ class LeaseWatch:
         self._dead_after_s = dead_after_s
 
     def judge(self, content: bytes, now: float) -> Verdict:
-        """The verdict after reading this content. `now`: seconds by the observer's monotonic clock."""
+        """The verdict after reading this content. `now` is in seconds by the observer's monotonic clock."""
         if content != self._content:
             return Verdict.ALIVE
         return Verdict.DEAD if now - self._since_s >= self._dead_after_s else Verdict.UNKNOWN

@@ -1,8 +1,8 @@
 """The metrics of a run on disk: metrics.jsonl.
 
-Rule: the file ends with a complete row, and there is one row for each update. Rows that the disk refuses are written later.
-A resumed run first removes the rows after its checkpoint. If the run was interrupted before an evaluation and then makes it,
-its metrics go into that update's row.
+Rule: the file ends with a complete row, and there is one row for each update. Rows that can't be written now are written
+later. A resumed run first removes the rows after its checkpoint. If the run was interrupted before an evaluation, the
+resumed run makes it and adds the metrics to the row of the same update.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ from millrace.protocol.errors import RunError
 log = logging.getLogger("millrace.learner")
 
 METRICS_FILE = "metrics.jsonl"
-MOST_LINE_BYTES = 1 << 16  # longest row that is read while the file grows
+MOST_LINE_BYTES = 1 << 16  # size of the longest row that is read while the file grows
 
 
 class MetricsLog:
     """Writes metrics.jsonl."""
 
     def __init__(self, folder: Path, from_env_steps: int = 0, from_update: float = math.inf) -> None:
-        """`from_env_steps`, `from_update`: those of the checkpoint that the run continues from; later rows are removed.
+        """Rows after the checkpoint from which the run continues, at `from_env_steps` and `from_update`, are removed.
 
-        Both are needed, because an update whose rows only reset env copies adds no env step.
-        Raises `RunError`, with a one-line message, if the file cannot be written.
+        Both numbers are needed, because an update whose rows only reset env copies adds no env step. Raises `RunError`, with
+        a one-line message, if the file cannot be written.
         """
         table = folder / METRICS_FILE
         kept: list[dict[str, Any]] = []
@@ -58,13 +58,13 @@ class MetricsLog:
 
     @property
     def gone(self) -> bool:
-        """Whether metrics.jsonl was deleted, or its folder renamed, since its last row. `flush` makes it again."""
+        """Whether metrics.jsonl was deleted, or its folder renamed, since its last row. `flush` recreates it."""
         return self._table.gone
 
     def write(self, progress: Progress, train: Row) -> None:
-        """Add a row, which `flush` writes. `train`: the metrics of the algorithm, of an evaluation if any, and of callbacks.
+        """Add a row, which `flush` writes. `train` are the metrics of the algorithm, of an evaluation, or of callbacks.
 
-        If the newest row is of the same update, these metrics are added to it.
+        If the newest row belongs to the same update, the metrics are added to that row.
         """
         row: Row = progress.row(train)
         if all(self._newest.get(key) == row[key] for key in (UPDATES_KEY, ENV_STEPS_KEY)):
@@ -75,21 +75,21 @@ class MetricsLog:
         self._newest = row
 
     def flush(self) -> None:
-        """Write the rows that are not written yet. Raises `RunError`, with a one-line message, if the disk refuses them.
+        """Write the rows that are not written yet. Raises `RunError`, with a one-line message, if that fails.
 
-        The rows before them stay readable, and the next call tries again.
+        Earlier rows then stay readable, and the next call tries again.
         """
         self._table.flush()
 
     def close(self) -> None:
-        """Close the file."""
+        """Write the remaining rows if possible, and close the file."""
         with suppress(RunError):
             self.flush()
         self._table.close()
 
 
 def read_rows(path: Path) -> list[dict[str, Any]]:
-    """The rows of a metrics.jsonl, each with its env steps. A last line that was cut off is ignored.
+    """The rows of a metrics.jsonl, each of which has its env steps. Ignores a last line that was cut off.
 
     Other unreadable rows are left out, and the log says how many. Raises OSError.
     """
@@ -100,7 +100,7 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
 
 
 def read_and_count_rows(path: Path) -> tuple[list[dict[str, Any]], int]:
-    """The readable rows, and the number of others. A last line that was cut off doesn't count. Raises OSError."""
+    """The readable rows, and the number of unreadable ones, without a last line that was cut off. Raises OSError."""
     *lines, _ = read(path, MOST_BYTES).split(b"\n")
     rows = [row for line in lines if (row := decoded_row(line)) is not None]
     return rows, len(lines) - len(rows)
@@ -110,7 +110,7 @@ _DECODER = msgspec.json.Decoder(dict[str, int | float | None])
 
 
 def decoded_row(line: bytes) -> dict[str, Any] | None:
-    """A row: finite numbers, or null, by name; None if it cannot be read."""
+    """Decode a row of finite numbers or nulls, by name. Returns None if it cannot be read."""
     try:
         row = _DECODER.decode(line)
         msgspec.convert(row[ENV_STEPS_KEY], Natural)

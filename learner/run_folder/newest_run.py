@@ -1,4 +1,4 @@
-"""`--resume auto`: the run to continue. So the same command starts a run and continues it, however it ended."""
+"""Finds the run that `--resume auto` continues, so that one command can both start a run and continue it."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ AUTO = Path("auto")
 
 
 def newest_run(config: RunSettings) -> Path | None:
-    """The newest run folder with a checkpoint in `run_dir`, for this environment, algorithm and seed; or None.
+    """The newest run folder in `run_dir` that has a checkpoint and this environment, algorithm and seed; None without one.
 
-    The name of a run folder ends with the start time, and a number if several began in that second.
+    The name of a run folder ends with the start time, and with a number if several runs began in that second.
     """
     name = re.escape(f"{as_folder_name(config.env)}-{as_folder_name(config.algo)}-s{config.seed}-")
     pattern = re.compile(name + r"(\d{8}-\d{6})(?:-(\d{1,9}))?")
@@ -31,7 +31,7 @@ def newest_run(config: RunSettings) -> Path | None:
     for path in root.iterdir() if root.is_dir() else ():
         named = pattern.fullmatch(path.name)
         if named is not None and _can_be_resumed(path, config):
-            number = int(named[2] or 1)  # of the runs that began in one second, the first has no number, and the next is 2
+            number = int(named[2] or 1)  # the first run that began in a second has no number, and the next has number 2
             matching.append((named[1], number, path))
     if not matching:
         log_notice(log, f"no run to resume in {config.run_dir}: a new one begins")

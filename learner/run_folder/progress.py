@@ -1,6 +1,6 @@
 """The progress of a run, and the names under which its numbers are logged.
 
-The names are those of Stable-Baselines3 where it has one. The x axis is env steps.
+If Stable-Baselines3 has a name for a number, that name is used. The x axis is env steps.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ ENV_STEPS_KEY = "time/total_timesteps"
 UPDATES_KEY = "time/iterations"
 RETURN_KEY = "rollout/ep_rew_mean"
 NOT_SHOWN = ("at_s", "settings", "episodes", "rollouts", "incarnations", "requests")
-"""Fields of `Progress` that a log of it leaves out."""
+"""Fields of `Progress` that a log of the progress leaves out."""
 Row = Mapping[str, float | None]
 
 
 class Progress(RunProgress, frozen=True, kw_only=True):
-    """The progress of a run as callbacks get it, the terminal among them: how far it is, what is new, and requests.
+    """The progress of a run, which callbacks get: how far the run has got, what is new, and methods for requests.
 
-    Returns are sums of raw rewards, undiscounted. Times are in seconds, speeds in env steps a second over all workers. A
-    number that does not exist yet is None. Fields that only some methods of `Callback` get say so. Do not keep the arrays of
-    `rollouts`, which are read-only: copy them.
+    Returns are sums of raw rewards, undiscounted. Times are in seconds, speeds in env steps per second over all workers. A
+    number that does not exist yet is None. If only some methods of `Callback` get a field, its description says so. Don't
+    keep the arrays of `rollouts`, which are read-only; copy them.
 
     >>> import millrace
     >>> seen = []
@@ -41,44 +41,46 @@ class Progress(RunProgress, frozen=True, kw_only=True):
     run: str = ""
     """path of the run folder"""
     facts: dict[str, FactMean] = {}
-    """for each name in `info_keys`: what the environment reported at the ends of the last 100 training episodes"""
+    """for each name in `info_keys`, the mean of the numbers that the environment reported at the ends of the last 100
+    training episodes
+    """
     note: str = ""
-    """a message to the user, in one line"""
+    """a one-line message for the user"""
     settings: dict[str, Any] = {}
     """all settings of the run, by name; `algorithm` has those of the algorithm"""
     metrics: dict[str, float] = {}
-    """numbers of the last update (before the first update, of cloning), by the names under which they are logged: losses and
-    the like
+    """the algorithm's numbers, such as losses, in the last update (before the first update, those of cloning), by the names
+    under which they are logged
     """
     episodes: tuple[Episode, ...] = ()
     """the episodes that ended in the rollouts of the last update"""
     lags: tuple[int, ...] = ()
-    """lag of each rollout of the last update"""
+    """the lag of each rollout of the last update"""
     evaluation: Evaluation | None = None
     """the last evaluation"""
     evaluated: EvaluatedPolicy = EvaluatedPolicy()
-    """`version` and `env_steps` of the evaluated policy, which with `eval_workers` is older than the newest one"""
+    """`version` and `env_steps` of the evaluated policy, which with `eval_workers` is older than the newest policy"""
     best: tuple[float, int] | None = None
-    """mean return of the best evaluation so far, and env steps of the evaluated policy"""
+    """the mean return of the best evaluation so far, and the env steps of the policy that it evaluated"""
     checkpoint: str = ""
-    """path of the newest checkpoint; empty before the first"""
+    """the path of the newest checkpoint; empty before the first"""
     rollouts: tuple[Rollout, ...] = ()
-    """in `Callback.on_rollouts`: the rollouts of the next update, in the order in which they arrived"""
+    """only in `Callback.on_rollouts`: the rollouts of the next update, in lane order"""
     incarnations: tuple[int, ...] = ()
-    """in `Callback.on_rollouts`: for each rollout the incarnation of its lane, which rises when the lane gets new copies;
-    `Rollout.sequence` then starts from 0 again
+    """only in `Callback.on_rollouts`: for each rollout, the incarnation of its lane, which rises when the lane gets new
+    copies; `Rollout.sequence` then starts from 0 again
     """
     requests: Requests | None = None
     """the requests of callbacks"""
 
     def plain(self) -> RunProgress:
-        """The part of it that can be sent and written."""
+        """The part of the progress that can be sent and written to files."""
         return RunProgress(**{name: getattr(self, name) for name in RunProgress.__struct_fields__})
 
     def log(self, name: str, value: SupportsFloat) -> None:
-        """Log a number with the metrics of this update. A name without a slash is logged as custom/NAME.
+        """Log a number with the metrics of the current update. A name without a slash is logged as custom/NAME.
 
-        Use it in `on_rollouts`, `on_update` and `on_evaluation`. A value that is not finite is logged as missing. Raises
+        Use this in `on_rollouts`, `on_update` and `on_evaluation`. A value that is not finite is logged as missing. Raises
         `UsageError` for anything but a name without line breaks and a number.
         """
         if self.requests is None:
@@ -86,11 +88,11 @@ class Progress(RunProgress, frozen=True, kw_only=True):
         self.requests.log(name, value)
 
     def set_env_attr(self, name: str, value: Any) -> None:
-        """Set an attribute of every env copy that trains, from the next version of the weights on: a curriculum.
+        """Set an attribute of every training env copy from the next version of the weights on, as for a curriculum.
 
-        `value` is plain data: numbers, text, lists, dicts, numpy arrays. Each rollout is collected with the attributes of
-        its version, so the result is the same for any number of workers. Checkpoints keep them. Evaluations use env copies
-        without them. Raises `UsageError` if the value cannot be sent, and in `on_checkpoint` and `on_end`.
+        `value` is plain data: numbers, text, lists, dicts or numpy arrays. Each rollout is collected with the attributes of
+        its version, so the result is the same for any number of workers. Checkpoints save the attributes. Evaluations use
+        env copies without them. Raises `UsageError` if the value cannot be sent, and in `on_checkpoint` and `on_end`.
         """
         if self.requests is None:
             raise UsageError(f"set_env_attr {name}: this is not the progress of a run")
@@ -98,11 +100,11 @@ class Progress(RunProgress, frozen=True, kw_only=True):
 
     @property
     def env_attrs(self) -> dict[str, Any]:
-        """The attributes of env copies that were set so far, by name; in a resumed run also those set earlier."""
+        """The attributes that have been set on env copies so far, by name, including those set before a resume."""
         return {} if self.requests is None else self.requests.attributes.now()
 
     def row(self, train: Row) -> dict[str, float | None]:
-        """One flat row of metrics. `train`: the metrics of the algorithm."""
+        """One flat row of metrics. `train` are the metrics of the algorithm, of an evaluation, or of callbacks."""
         row: dict[str, float | None] = {
             RETURN_KEY: self.return_mean,
             "rollout/ep_len_mean": self.length_mean,
@@ -125,5 +127,5 @@ def steps_per_second(env_steps: int, seconds: float) -> float:
 
 
 def named(train: Row) -> dict[str, float | None]:
-    """The metrics of an algorithm or an evaluation under the names by which they are logged."""
+    """The metrics of an algorithm or an evaluation, under the names by which they are logged."""
     return {name if "/" in name else f"train/{name}": value for name, value in train.items()}

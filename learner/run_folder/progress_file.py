@@ -1,7 +1,8 @@
-"""progress.json: how far a run is, once a second while it trains. For a killed run it shows when it was last alive.
+"""progress.json: the progress of a run, written once a second while it trains. It shows when a killed run was last alive.
 
-Rule: nothing depends on it. It is replaced atomically, but not flushed to the disk, because that would slow the training
-loop; a power failure may destroy it. Refused writes are dropped. Once the run has a summary, the summary counts.
+Rule: nothing depends on this file. It is replaced atomically, but not flushed to the disk, because that would slow the
+training loop; a power failure may destroy it. Failed writes are not retried. Once the run has a summary, that is used
+instead.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from millrace.protocol.progress import RunProgress
 
 PROGRESS_FILE = "progress.json"
 EVERY_S = 1.0
-LONGEST_SILENCE_S = 10.0  # after this time it is written even if nothing has changed, as a sign of life
+LONGEST_SILENCE_S = 10.0  # after this time, the file is written even if nothing has changed, as a sign of life
 
 
 class ProgressFile:
@@ -34,9 +35,9 @@ class ProgressFile:
         self._looked_s = 0.0
 
     def write(self, progress: Callable[[], RunProgress], now: float) -> None:
-        """Write how far the run is, if a second has passed and something has changed, or if the last time is long ago.
+        """Write the progress if a second has passed and something has changed, or if the last write was long ago.
 
-        `now`: seconds since 1970.
+        `now` is in seconds since 1970.
         """
         if 0.0 <= now - self._looked_s < EVERY_S:
             return
@@ -45,16 +46,16 @@ class ProgressFile:
         is_new = replace(newest, at_s=self._written.at_s) != self._written
         if not is_new and now - self._written.at_s < LONGEST_SILENCE_S:
             return
-        with suppress(OSError, ValueError):  # ValueError: a text of the environment that is not UTF-8
+        with suppress(OSError, ValueError):  # ValueError is raised for an environment's text that is not UTF-8
             content = msgspec.json.encode(newest)
             write_atomically(self._path, lambda file: file.write(content), flush=False)
             self._written = newest
 
 
 def last_progress(run: Path, summary: Summary | None, total_steps: int = 0) -> RunProgress:
-    """How far a run is, or was when it ended, from its `summary`, or else from its progress.json.
+    """The last known progress of a run, from its `summary` if there is one, otherwise from its progress.json.
 
-    `total_steps`: from its settings; nothing else is known if neither can be read.
+    `total_steps` is from its settings, and all that is known if neither can be read.
     """
     if summary is not None:
         return of_summary(summary, total_steps)
@@ -65,13 +66,13 @@ def last_progress(run: Path, summary: Summary | None, total_steps: int = 0) -> R
 
 
 def progress_before(resumed: Path | None, total_steps: int) -> RunProgress:
-    """How far a run of this many env steps is before it begins. A resumed run continues from its newest checkpoint."""
+    """The progress of a run before it begins. A resumed run begins at its newest checkpoint."""
     env_steps = 0 if resumed is None else min(newest_env_steps(resumed), LARGEST)
     return RunProgress(env_steps=env_steps, total_steps=total_steps)
 
 
 def of_summary(summary: Summary, total_steps: int) -> RunProgress:
-    """How far a run was when it ended."""
+    """The progress of a run when it ended."""
     return RunProgress(
         env_steps=summary.env_steps,
         total_steps=total_steps,

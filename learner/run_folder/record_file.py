@@ -1,6 +1,6 @@
 """A file of a run that grows by whole records, such as metrics.jsonl.
 
-Rule: the file ends with a whole record. Records that the disk refuses wait in memory, and are written later.
+Rule: the file ends with a whole record. Records that can't be written now wait in memory and are written later.
 """
 
 from __future__ import annotations
@@ -13,38 +13,38 @@ from pathlib import Path
 from millrace.learner.run_folder.regular_files import open_regular, subfolder
 from millrace.protocol.errors import RunError
 
-MOST_WAITING = 100_000  # records that the disk refused: 100 MB of memory for rows of metrics
+MOST_WAITING = 100_000  # the most records that wait to be written; rows of metrics then take 100 MB of memory
 
 
 class RecordFile:
-    """A file to which whole records are appended. Records that the disk refuses wait, and one that it cut off is removed.
+    """A file to which whole records are appended. A record that was written only in part is removed, and waits.
 
-    If the file is no longer at its path, it is made again there, with its folder.
+    If the file is no longer at its path, it is recreated there, with its folder.
     """
 
     def __init__(self, run: Path, name: str) -> None:
-        """`name`: a file in this run folder, or in a subfolder. Raises OSError."""
+        """`name` is that of a file in this run folder or in one of its subfolders. Raises OSError."""
         self._run = run
         self._path = run / name
         self._waiting: deque[bytes] = deque(maxlen=MOST_WAITING)
         self._bytes = 0
-        self._cut = 0  # bytes at the end of the file that the first waiting record replaces
+        self._cut = 0  # number of bytes at the end of the file that the first waiting record replaces
         self._open()
 
     @property
     def gone(self) -> bool:
-        """Whether its path now leads to another file, or to none."""
+        """Whether the path no longer leads to this file."""
         try:
             return not os.path.samestat(os.stat(self._path), os.fstat(self._number))
         except OSError:
             return True
 
     def append(self, record: bytes) -> None:
-        """Add a record. It waits for `flush`."""
+        """Add a record, which waits until `flush` writes it."""
         self._waiting.append(record)
 
     def replace(self, newest: bytes, record: bytes) -> None:
-        """Add a record in place of the newest one."""
+        """Add a record in place of the newest one, whose content is `newest`."""
         if self._waiting:
             self._waiting.pop()
         else:
@@ -52,7 +52,7 @@ class RecordFile:
         self._waiting.append(record)
 
     def flush(self) -> None:
-        """Write the waiting records. Raises `RunError`."""
+        """Write the waiting records. Raises `RunError` if that fails; the remaining records then go on waiting."""
         try:
             if self.gone:
                 gone = self._file
@@ -64,7 +64,7 @@ class RecordFile:
                 self._cut = 0
             while self._waiting:
                 rest = self._waiting[0]
-                while rest:  # if the disk takes only a part, the next write says why
+                while rest:  # if only a part can be written, the next write raises and says why
                     rest = rest[self._file.write(rest) :]
                 self._bytes += len(self._waiting.popleft())
         except OSError as error:

@@ -1,8 +1,8 @@
 """Opens and lists the files of a run folder.
 
-Rule: a run folder may come from a stranger, so only regular files inside it are read and written. No link is followed, and a
-FIFO, a device or a folder in place of a file is refused: an `OSError` says what is there. Other packages write into a
-`subfolder`, which isn't a link either.
+Rule: a run folder may come from a stranger, so only regular files inside it are read and written. Links are not followed,
+and a FIFO, a device or a folder in place of a file is refused with an `OSError` that says what is there. Other packages
+write into a `subfolder`, which can't be a link either.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ log = logging.getLogger("millrace.learner")
 
 
 def open_regular(path: Path, flags: int = os.O_RDONLY) -> int:
-    """Open a file as `os.open` does, and return its descriptor. Raises `OSError`, also for anything but a regular file."""
+    """Open a file as `os.open` does, and return its descriptor. Raises `OSError`, even for what isn't a regular file."""
     try:
         file = os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, 0o666)
     except OSError:
@@ -39,7 +39,7 @@ def open_regular(path: Path, flags: int = os.O_RDONLY) -> int:
 
 
 def read(path: Path, most_bytes: int = MOST_TEXT_BYTES) -> bytes:
-    """The content of a file. Raises `OSError`, also if it has more bytes."""
+    """The content of a file. Raises `OSError` if it can't be read or has more than `most_bytes`."""
     with os.fdopen(open_regular(path), "rb") as file:
         if (size := os.fstat(file.fileno()).st_size) > most_bytes:
             raise OSError(errno.EFBIG, f"expected at most {most_bytes:,} bytes, got {size:,}", str(path))
@@ -47,7 +47,7 @@ def read(path: Path, most_bytes: int = MOST_TEXT_BYTES) -> bytes:
 
 
 def regular_files(run: Path, pattern: str) -> list[Path]:
-    """The regular files of a run folder whose names match, such as `videos/*.mp4`, in the order of their names.
+    """The regular files of a run folder that match a pattern, such as `videos/*.mp4`, in the order of their names.
 
     Anything else with such a name is left out, and the log says so.
     """
@@ -58,7 +58,7 @@ def regular_files(run: Path, pattern: str) -> list[Path]:
 
 
 def subfolder(run: Path, name: str) -> Path:
-    """A folder inside a run folder, made if it is not there. Raises `OSError`, also if it is a link."""
+    """Make a folder inside a run folder unless it exists, and return its path. Raises `OSError`, even if it is a link."""
     folder = run / name
     folder.mkdir(parents=True, exist_ok=True)
     _expect(stat.S_IFDIR, folder.lstat().st_mode, folder)

@@ -1,4 +1,4 @@
-"""Results of a run: greedy evaluations, the best policy, the summary (summary.json), a dataset of its episodes."""
+"""The results of a run: greedy evaluations, the best policy, the summary (summary.json), and datasets of its episodes."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from millrace.protocol.specs import SCORE
 
 SUMMARY_FILE = "summary.json"
 ALL_STEPS_DONE = "all steps done"
-"""why a run ended if nothing ended it earlier"""
+"""The reason why a run ended if nothing ended it earlier."""
 EVALUATION_KEY = "eval/mean_reward"
 EVALUATION_LENGTH_KEY = "eval/mean_ep_length"
 Z_95 = 1.959964
-"""Quantile of the normal distribution for an interval of 95 %."""
+"""The quantile of the normal distribution for a 95 % interval."""
 EVALUATED_AT_KEY = "eval/env_steps"
-"""env steps of the policy that was evaluated beside training, which are fewer than those of the row with the result"""
+"""The env steps of a policy that was evaluated alongside training. The row with the result has more env steps than this."""
 
 
 class FactMean(msgspec.Struct, frozen=True):
     """The mean of a number that the environment reports at the ends of episodes."""
 
     mean: Real | None
-    """over the episodes that have the number; None if none has it"""
+    """the mean over the episodes that have the number; None if none has it"""
     missing: Natural
-    """how many episodes do not have it"""
+    """how many episodes do not have the number"""
 
     def __str__(self) -> str:
         mean = "missing" if self.mean is None else f"{self.mean:.3g}"
@@ -41,7 +41,8 @@ class FactMean(msgspec.Struct, frozen=True):
 METRICS_BESIDE_FACTS = frozenset(
     {"ep_rew_mean", "ep_len_mean", "exploration_rate", "mean_reward", "mean_ep_length", "env_steps"}
 )
-"""Other values logged as rollout/NAME or eval/NAME: no fact may have such a name, because one of the two would be lost."""
+"""The names of other values that are logged as rollout/NAME or eval/NAME. A fact can't have such a name, because then one of
+the two would be lost."""
 
 
 def fact_means(names: Sequence[str], episodes: Iterable[Sequence[float]]) -> dict[str, FactMean]:
@@ -52,13 +53,13 @@ def fact_means(names: Sequence[str], episodes: Iterable[Sequence[float]]) -> dic
         there = [number for number in column if not math.isnan(number)]
         mean = None
         if there:
-            mean = math.fsum(number / len(there) for number in there)  # their sum may be too large for a float
+            mean = math.fsum(number / len(there) for number in there)  # divides first, because the sum may overflow
         means[str(name)] = FactMean(mean, len(column) - len(there))
     return means
 
 
 def fact_metrics(group: str, facts: Mapping[str, FactMean]) -> dict[str, float | None]:
-    """The facts under the names by which they are logged: eval/is_success and eval/is_success_missing."""
+    """The facts under the names by which they are logged, such as eval/is_success and eval/is_success_missing."""
     row: dict[str, float | None] = {}
     for name, fact in facts.items():
         row |= {f"{group}/{name}": fact.mean, f"{group}/{name}_missing": fact.missing}
@@ -66,7 +67,7 @@ def fact_metrics(group: str, facts: Mapping[str, FactMean]) -> dict[str, float |
 
 
 class Evaluation(msgspec.Struct, frozen=True, kw_only=True):
-    """The result of greedy episodes, in raw rewards.
+    """The result of an evaluation by greedy episodes, in raw rewards.
 
     >>> import millrace
     >>> result = millrace.evaluate(run, episodes=2, workers=1)
@@ -83,17 +84,17 @@ class Evaluation(msgspec.Struct, frozen=True, kw_only=True):
     length_mean: Real
     """mean length of an episode in env steps"""
     cut: Natural = 0
-    """episodes that were stopped because they were too long; their return up to then counts"""
+    """how many episodes were stopped because they were too long; their return up to then counts"""
     facts: dict[str, FactMean] = {}
-    """for each name in `info_keys`: what the environment reported at the ends of the episodes; and the score, if there were
-    opponents
+    """for each name in `info_keys`, the mean of the numbers that the environment reported at the ends of the episodes; also
+    the score, if there were opponents
     """
     matches: Natural = 0
     """how many of the episodes were played against opponents"""
 
     @staticmethod
     def of(returns: Sequence[float], lengths: Sequence[int], cut: int) -> Evaluation:
-        """The evaluation of these episodes; `cut` of them were too long."""
+        """The evaluation that consists of these episodes, of which `cut` were too long."""
         return Evaluation(
             episodes=len(returns),
             return_mean=float(np.mean(returns)),
@@ -113,7 +114,7 @@ class Evaluation(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def score_interval(self) -> tuple[float, float] | None:
-        """The 95 % confidence interval of the score (Wilson 1927), if there were opponents."""
+        """The 95 % confidence interval of the score (Wilson 1927); None without opponents."""
         score = self.facts.get(SCORE)
         if not self.matches or score is None or score.mean is None:
             return None
@@ -124,7 +125,7 @@ class Evaluation(msgspec.Struct, frozen=True, kw_only=True):
         return max(0.0, (middle - half) / (1 + z2 / n)), min(1.0, (middle + half) / (1 + z2 / n))
 
     def metrics(self) -> dict[str, float | None]:
-        """The numbers that are logged with a row of metrics."""
+        """The numbers of this evaluation that are logged in a row of metrics."""
         returns = {EVALUATION_KEY: self.return_mean, EVALUATION_LENGTH_KEY: self.length_mean}
         return returns | fact_metrics("eval", self.facts)
 
@@ -134,16 +135,16 @@ class EvaluatedPolicy(msgspec.Struct, frozen=True):
 
     version: Version = -1
     env_steps: Natural = 0
-    """env steps of training up to this version"""
+    """the env steps of training up to this version"""
 
 
 class Best(msgspec.Struct, frozen=True, kw_only=True):
     """The policy with the highest mean return in the run's own evaluations."""
 
     env_steps: Natural
-    """env steps of training when it was evaluated"""
+    """the env steps of training after which it was evaluated"""
     chosen_by: Real
-    """the mean return by which it was chosen, which is biased upwards as the maximum of several means"""
+    """the mean return by which it was chosen, which is biased upwards because it is the maximum of several means"""
     evaluation: Evaluation
     """a second evaluation of the same policy, on other episodes"""
 
@@ -151,8 +152,8 @@ class Best(msgspec.Struct, frozen=True, kw_only=True):
 class Summary(msgspec.Struct, frozen=True, kw_only=True):
     """The results of a run, from its summary.json. `Run.summary` is None until the run has ended.
 
-    Returns are sums of raw rewards, undiscounted. Numbers count from the beginning of the run, also after a resume, unless
-    they say otherwise.
+    Returns are sums of raw rewards, undiscounted. Numbers count from the beginning of the run, even after a resume, unless
+    their description says otherwise.
 
     >>> import millrace
     >>> summary = millrace.Run(run).summary
@@ -175,33 +176,33 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     stop_reason: str
     """why it ended: `all steps done`, the target that it reached, the callback that ended it, an error or a signal"""
     cut_short: bool = False
-    """an error or an interrupt ended the run"""
+    """whether an error or an interrupt ended the run"""
     return_mean_100: Real | None
     """mean return of the last 100 training episodes; None if none has ended"""
     facts_100: dict[str, FactMean] = {}
-    """for each name in `info_keys`: what the environment reported at the ends of these episodes"""
+    """for each name in `info_keys`, the mean of the numbers that the environment reported at the ends of these episodes"""
     evaluation: Evaluation | None
     """evaluation of the final policy by greedy episodes; None if the run was cut short before it"""
     ended_by: Real | None = None
-    """the mean return of the final policy, if it ended the run by reaching `target_return` or through a callback. A return
-    that decides something is biased upwards: `evaluation` is then a second one, on other episodes
+    """the mean return of the final policy's evaluation, if that ended the run by reaching `target_return` or through a
+    callback. Such a return is biased upwards, so `evaluation` is then a second evaluation, on other episodes
     """
     best: Best | None = None
     """the best policy of the run's own evaluations, if there were any"""
     ledger: dict[str, Natural] = {}
-    """number of tickets and transitions in each state"""
+    """the number of tickets and of transitions in each state"""
     lags: dict[str, Natural] = {}
-    """number of rollouts that updates used, by lag, since this process started"""
+    """the number of rollouts that updates used, by lag, since this process started"""
     first_use_s: dict[str, Real] = {}
-    """by worker: median seconds from publishing new weights to the arrival of the first rollout under them"""
+    """by worker, the median of the seconds from publishing new weights to the arrival of the first rollout with them"""
     stages: dict[str, Seconds] = {}
-    """seconds that the learner spent in each stage: collecting, updating, evaluating and so on"""
+    """the seconds that the learner, and all workers together, spent in each stage, such as collecting and updating"""
     versions: dict[str, str] = {}
-    """versions of millrace and of the packages that decide its results"""
+    """the versions of millrace and of the packages on which its results depend"""
 
 
 class RecordedDataset(msgspec.Struct, frozen=True, kw_only=True):
-    """Size and returns of a dataset.
+    """The size and the returns of a recorded dataset.
 
     >>> import millrace
     >>> result = millrace.record(run, "cartpole/example-v0", steps=20, workers=1)
@@ -215,7 +216,7 @@ class RecordedDataset(msgspec.Struct, frozen=True, kw_only=True):
     return_mean: float
     return_std: float
     cut: int
-    """episodes that were stopped because they were too long"""
+    """how many episodes were stopped because they were too long"""
 
     def __str__(self) -> str:
         cut = ", the last of them cut short" if self.cut else ""
@@ -224,5 +225,5 @@ class RecordedDataset(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def read_summary(run: Path) -> Summary:
-    """The summary.json of a run folder. Raises OSError, also if there is none, or an error of msgspec."""
+    """Read the summary.json of a run folder. Raises OSError if there is none, or an error of msgspec if it is damaged."""
     return msgspec.json.decode(read(run / SUMMARY_FILE), type=Summary)

@@ -1,16 +1,16 @@
 """The folder of a run: which files it has, and how they are written and read.
 
-    runs/<env>-<algo>-s<seed>-<time>/       with a number after the time if several began in one second
+    runs/<env>-<algo>-s<seed>-<time>/       with a number after the time if several runs began in one second
       config.toml           all settings of the run
       run.json              the format of the folder (run_format.py)
       metrics.jsonl         a row per update (metrics_log.py)
       tensorboard/    the same for TensorBoard, if requested
-      checkpoints/          to resume from (checkpoint.py)
+      checkpoints/          from which the run can be resumed (checkpoint.py)
       policy.safetensors    the arrays of the acting policy, by name
-      best.safetensors      the same of the best policy in the run's own evaluations
+      best.safetensors      the same for the best policy in the run's own evaluations
       observation*.png      what the policy sees, if that is an image (image_sample.py)
-      policy.json           the meaning of these arrays: with it, another program can act
-      progress.json         how far the run is, once a second while it trains (progress_file.py)
+      policy.json           the meaning of the policy's arrays, with which other programs can act
+      progress.json         the progress, written once a second while the run trains (progress_file.py)
       summary.json          the results of the run (results.py)
       log.jsonl             warnings and notices of the learner (json_log.py)
       workers/              the logs of local worker processes
@@ -67,13 +67,13 @@ from millrace.protocol.specs import PolicySpec, RunSpec, facts_of_all_seats
 
 POLICY_FORMAT = 2
 Which = Literal["final", "best"]
-UNREADABLE = (OSError, *INVALID)  # what reading a damaged file raises
+UNREADABLE = (OSError, *INVALID)  # the exceptions that reading a damaged file raises
 
 log = logging.getLogger("millrace.learner")
 
 
 class Interrupted(KeyboardInterrupt):
-    """The user stopped the run. Its checkpoint is written, and it can be resumed from its folder."""
+    """The user stopped the run. Its checkpoint has been written, and it can be resumed from its folder."""
 
     def __init__(self, run: Path) -> None:
         super().__init__(str(run))
@@ -97,29 +97,29 @@ class PolicyDescription(msgspec.Struct, frozen=True, kw_only=True):
     policy: PolicySpec
     arrays: tuple[ArrayPosition, ...]
     buffers: tuple[str, ...]
-    """names of arrays that are not parameters: mean and standard deviation for observation normalization"""
+    """the names of the arrays that are not parameters: mean and standard deviation for observation normalization"""
     wrappers: tuple[Line, ...] = ()
-    """wrappers of every env copy, the innermost first"""
+    """the wrappers of every env copy, the innermost first"""
     facts: Annotated[tuple[Name, ...], Meta(max_length=MAX_FACTS)] = ()
-    """names of the numbers that the run logs of each episode"""
+    """the names of the numbers that the run logs for each episode"""
     masked: bool = False
     """whether the environment says which actions are allowed"""
     eval_env_kwargs: dict[str, Scalar] = {}
-    """keyword arguments of evaluation copies, in addition to `env_kwargs` or in place of those of the same name"""
+    """keyword arguments of evaluation copies, in addition to `env_kwargs`; they override those of the same name"""
     seats: Annotated[tuple[Name, ...], Meta(max_length=MAX_SEATS)] = ()
-    """the names of the environment's agents; empty if it is gymnasium's"""
+    """the names of the environment's agents; empty for a gymnasium environment"""
     teams: Annotated[tuple[tuple[Natural, ...], ...], Meta(max_length=MAX_SEATS)] = ()
-    """the seats of each team, if it has met opponents"""
+    """the seats of each team, if the policy was trained against opponents"""
 
 
 class StoredPolicy(NamedTuple):
-    """A policy as its files describe it. Modules that it names are not imported, except that acting needs the encoder."""
+    """A policy read from its files. Reading imports none of the modules that they name; acting imports the encoder's."""
 
     card: PolicyDescription
     parameters: Floats
-    """flat [P], for `Policy.load`"""
+    """the parameters [P] float32, for `Policy.load`"""
     buffers: Floats
-    """flat, likewise"""
+    """the buffers, float32, for `Policy.load`"""
 
 
 class RunSettings(Protocol):
@@ -127,17 +127,17 @@ class RunSettings(Protocol):
 
     @property
     def env(self) -> str:
-        """Environment id."""
+        """The environment's id."""
         ...
 
     @property
     def algo(self) -> str:
-        """Name of the algorithm."""
+        """The name of the algorithm."""
         ...
 
     @property
     def seed(self) -> int:
-        """Seed of the run."""
+        """The seed of the run."""
         ...
 
     @property
@@ -154,23 +154,23 @@ class RunFolder:
     """The folder of one run."""
 
     def __init__(self, path: Path, made: Path | None = None) -> None:
-        """`made`: if the folder is new, the topmost folder that was made for it."""
+        """For a new folder, `made` is the topmost folder that was made for it."""
         self.path = path
         self._made = made
         self._is_relative = False
-        self._workers_elsewhere = False  # the last argument of `write_config`
+        self._workers_elsewhere = False  # the last argument that `write_config` got
         self.started_from = ""
         """See `RunFormat`."""
         self.writes = Writes()
-        """The run's writes into the folder, which the disk may refuse."""
+        """Makes the run's writes into the folder, and retries those that fail."""
         self.lock: RunLock | None = None
-        """Held while this process trains the run."""
+        """The lock of the run, while this process trains it."""
 
     @staticmethod
     def create(config: RunSettings, started_s: float | None = None) -> RunFolder:
-        """Make a new folder with its config.toml. A run of the same name and second gets a number after the time: -2, -3, ….
+        """Make a new folder with its config.toml. If the name is taken, a number follows the time: -2, -3, ….
 
-        `started_s` is wall-clock time. Raises `UsageError` if no folder can be made.
+        `started_s` is wall-clock time; by default, the current time. Raises `UsageError` if no folder can be made.
         """
         stamp = time.strftime("%Y%m%d-%H%M%S", time.localtime(started_s))
         name = f"{as_folder_name(config.env)}-{as_folder_name(config.algo)}-s{config.seed}"
@@ -196,7 +196,7 @@ class RunFolder:
     def open(path: Path) -> RunFolder:
         """Open an existing folder.
 
-        Raises `UsageError` if it is not a run folder, or of a newer format than this code knows.
+        Raises `UsageError` if it is not a run folder, or has a newer format than this code knows.
         """
         if not path.is_dir():
             raise UsageError(f"run {path}: no such folder")
@@ -212,9 +212,9 @@ class RunFolder:
 
     @staticmethod
     def open_policy(path: Path) -> RunFolder:
-        """Open an existing folder to read its policy. A copy of policy.json and policy.safetensors is enough.
+        """Open an existing folder to read its policy. A folder with only policy.json and policy.safetensors will do.
 
-        Raises `UsageError`, as `open` does.
+        Raises what `open` raises.
         """
         if not (path / POLICY_JSON).is_file():
             return RunFolder.open(path)
@@ -223,24 +223,24 @@ class RunFolder:
         return RunFolder(path)
 
     def stay(self) -> None:
-        """Keep naming the same folder even if the program, or an environment in it, changes its working directory."""
+        """Make the path absolute, because the program, or an environment in it, may change the working directory."""
         self._is_relative = not self.path.is_absolute()
         self.path = self.path.absolute()
         self._made = None if self._made is None else self._made.absolute()
 
     @property
     def shown(self) -> Path:
-        """The path that was given, if it still leads to the folder."""
+        """The path to show to the user: relative if a relative path was given and still leads to the folder."""
         try:
             here = Path.cwd()
-        except OSError:  # it was deleted
+        except OSError:  # raised if the working directory was deleted
             return self.path
         return self.path.relative_to(here) if self._is_relative and self.path.is_relative_to(here) else self.path
 
     def remove(self) -> None:
-        """Remove the folder, and the parent folders made for it if they are empty.
+        """Remove the folder, and the parent folders that were made for it if they are empty.
 
-        Does nothing if the folder was there before, or after `keep`.
+        Does nothing if the folder existed before, or once `keep` was called.
         """
         if self._made is None:
             return
@@ -248,17 +248,17 @@ class RunFolder:
         for parent in self.path.parents:
             if not parent.is_relative_to(self._made):
                 break
-            with suppress(OSError):  # another run is in the folder, or has removed it
+            with suppress(OSError):  # raised if another run has a folder there, or has removed this one
                 parent.rmdir()
 
     def remove_temporary(self) -> None:
-        """Remove the incomplete files of a process that was killed."""
+        """Remove incomplete files that a killed process has left."""
         for left in self.path.glob(f"*{TEMPORARY}"):
             with suppress(OSError):
                 left.unlink()
 
     def remove_summary(self) -> None:
-        """Remove the summary of a run that had ended and now continues. Raises `RunError` if that fails."""
+        """Remove the summary, because a run that had ended now continues. Raises `RunError` if that fails."""
         path = self.path / SUMMARY_FILE
         try:
             path.unlink(missing_ok=True)
@@ -266,11 +266,11 @@ class RunFolder:
             raise RunError(f"{path} cannot be removed: {reason(error)}; remove it, then resume the run") from error
 
     def keep(self) -> None:
-        """Record that the run has begun: `remove` does nothing from now on."""
+        """Record that the run has begun, so that `remove` does nothing from now on."""
         self._made = None
 
     def is_gone(self) -> bool:
-        """Whether the folder or its config.toml was deleted or renamed. Raises `RunError`."""
+        """Whether the folder or its config.toml was deleted or renamed. Raises `RunError` if it can't be read."""
         try:
             return not stat.S_ISREG((self.path / CONFIG_FILE).stat().st_mode)
         except (FileNotFoundError, NotADirectoryError):
@@ -279,7 +279,7 @@ class RunFolder:
             raise RunError(f"run folder {self.path} cannot be read: {error.strerror}") from error
 
     def make_again(self, config: RunSettings) -> str:
-        """Make the folder or its config.toml again. Returns one line that says so. Raises `RunError` if that fails."""
+        """Recreate the folder or its config.toml. Returns one line that says so. Raises `RunError` if that fails."""
         line = f"{self.path / 'config.toml'} was deleted; it is written again"
         if not self.path.is_dir():
             line = f"run folder {self.path} was deleted or renamed; the run continues there in a new folder"
@@ -291,7 +291,7 @@ class RunFolder:
         return line
 
     def write_config(self, config: RunSettings, *, workers_elsewhere: bool = False) -> None:
-        """Write config.toml and run.json: at the start, and again when a run is resumed, perhaps with other settings."""
+        """Write config.toml and run.json, at the start and again when a run is resumed, perhaps with other settings."""
         self._workers_elsewhere = workers_elsewhere
         write_format(self.path, workers_elsewhere=workers_elsewhere, started_from=self.started_from)
         self._write(CONFIG_FILE, f"{HEAD}{config.to_toml()}{END}".encode("utf-8", "surrogateescape"))
@@ -299,7 +299,7 @@ class RunFolder:
     def write_policy(self, run: RunSpec, parameters: Floats, buffers: Floats, which: Which = "final") -> None:
         """Write the arrays and policy.json.
 
-        `parameters` [P] begins with the acting part; the rest (the critic) is not written.
+        `parameters` [P] begins with the acting parameters; the rest, such as the critic's, is not written.
         """
         spec = run.policy
         env = run.env
@@ -340,7 +340,7 @@ class RunFolder:
             arrays = load(content)
             if not _checksum_matches(content):
                 raise ValueError(f"{POLICY_ARRAYS[which]}: its checksum does not match")
-        except (*UNREADABLE, SafetensorError, KeyError) as error:  # KeyError: a dtype that numpy does not have
+        except (*UNREADABLE, SafetensorError, KeyError) as error:  # KeyError is raised for a dtype that numpy lacks
             raise UsageError(f"policy of run {self.path} cannot be read: {one_line(reason(error))}") from error
         if (encoder := description.policy.encoder) is not None:
             refuse_modules_in(self.path, [encoder.factory])
@@ -376,7 +376,7 @@ class RunFolder:
         self._write(SUMMARY_FILE, msgspec.json.format(msgspec.json.encode(summary), indent=2) + b"\n")
 
     def summary(self) -> Summary | None:
-        """Read summary.json. None if it is missing or damaged; a warning is logged for a damaged one."""
+        """Read summary.json. Returns None if it is missing or damaged; logs a warning if it is damaged."""
         try:
             return read_summary(self.path)
         except FileNotFoundError:
@@ -388,7 +388,7 @@ class RunFolder:
             return None
 
     def write_images(self, files: Mapping[str, bytes]) -> None:
-        """Write pictures, by the names of their files."""
+        """Write pictures, given by the names of their files."""
         for name, content in files.items():
             self._write(name, content)
 
@@ -397,13 +397,13 @@ class RunFolder:
 
 
 def _split(content: bytes) -> tuple[bytes, bytes]:
-    """Head and numbers of a safetensors file."""
+    """Split a safetensors file into its head and its numbers."""
     begin = 8 + int.from_bytes(content[:8], "little")
     return content[8:begin], content[begin:]
 
 
 def _checksum_matches(content: bytes) -> bool:
-    """Whether the numbers of a safetensors file are those that were written. True for a file without a checksum."""
+    """Whether the numbers of a safetensors file match its checksum. True for a file without one."""
     head, numbers = _split(content)
     match msgspec.json.decode(head):
         case {"__metadata__": {"crc32": checksum}}:
@@ -412,7 +412,7 @@ def _checksum_matches(content: bytes) -> bool:
 
 
 def _decode_description(text: bytes) -> PolicyDescription:
-    """Decode policy.json. JSON has no infinity, so a missing bound is null there. Raises one of `UNREADABLE`."""
+    """Decode policy.json. JSON has no infinity, so null stands for a missing bound. Raises one of `UNREADABLE`."""
     fields = msgspec.json.decode(text, type=dict[str, Any])
     match fields:
         case {"policy": {"action": {"low": list(low), "high": list(high)} as action}}:

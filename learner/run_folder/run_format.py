@@ -1,8 +1,8 @@
-"""What identifies the run in a folder: its settings (config.toml) and its format (run.json), written when it is made.
+"""The files that identify a run folder: its settings (config.toml) and its format (run.json), written when it is made.
 
-Rules: a folder of the current format or an older one can be evaluated, reported and resumed; a newer one is rejected in
-one line. Raise `RUN_FORMAT` when older code could not read a folder of the new one. Modules are never imported from a run
-folder, because it may come from a stranger.
+Rules: a folder of the current format or an older one can be evaluated, reported and resumed; one of a newer format is
+rejected with a one-line error. When you change the format so that older code can't read it, increase `RUN_FORMAT`. Modules
+are never imported from a run folder, because it may come from a stranger.
 """
 
 from __future__ import annotations
@@ -32,29 +32,29 @@ POLICY_JSON = "policy.json"
 POLICY_ARRAYS = {"final": "policy.safetensors", "best": "best.safetensors"}
 HEAD = "# Repeat this run: millrace train --config THIS_FILE (it is whole if it ends with # end)\n"
 END = "# end\n"
-"""The first and the last line of config.toml. A file that was cut off may still be TOML, with other settings."""
+"""The last line of config.toml; `HEAD` is the first. Without it, a file that was cut off could still be valid TOML."""
 MOST_CONFIG_BYTES = 1 << 18
-MOST_NESTED = 1_000_000  # lines times dots in a line: for each line, tomllib goes through all parts of its table's name
+MOST_NESTED = 1_000_000  # limit of lines times dots in a line: for each line, tomllib visits all parts of a table's name
 
 
 class RunFormat(msgspec.Struct, frozen=True, kw_only=True):
-    """run.json."""
+    """The content of run.json."""
 
     format: int
     millrace: str
-    """the version of millrace that wrote it"""
+    """the version of millrace that wrote the file"""
     workers_elsewhere: bool = False
-    """Whether the run's workers were started elsewhere. Its setting `workers` then has no meaning."""
+    """whether the run's workers were started elsewhere, so that its setting `workers` has no meaning"""
     started_from: str = ""
-    """What the run started from in place of random weights, as printed at its start; empty if there was nothing."""
+    """the line about the run from which this one started, as printed at its start; empty if it began with random weights"""
 
 
 DISTRIBUTIONS = {"millrace": "millrace-rl", "torch": "torch", "gymnasium": "gymnasium", "numpy": "numpy"}
-"""Name of the installed distribution, by import name."""
+"""The name of the installed distribution of each package, by import name."""
 
 
 class _Identity(msgspec.Struct):
-    """What every config.toml has."""
+    """The settings that every config.toml has."""
 
     env: str
     algo: str
@@ -64,7 +64,7 @@ class _Identity(msgspec.Struct):
 
 @cache
 def versions() -> dict[str, str]:
-    """Versions of Python and of the packages that decide results, by import name; without those not installed."""
+    """The versions of Python and of the installed packages on which results depend, by import name."""
     versions = {"python": platform.python_version()}
     for name, distribution in DISTRIBUTIONS.items():
         with suppress(metadata.PackageNotFoundError):
@@ -73,7 +73,7 @@ def versions() -> dict[str, str]:
 
 
 def write_format(folder: Path, *, workers_elsewhere: bool = False, started_from: str = "") -> None:
-    """Write run.json with the current format. Raises `RunError`."""
+    """Write run.json with the current format. Raises `RunError` if that fails."""
     run_format = RunFormat(
         format=RUN_FORMAT,
         millrace=versions().get("millrace", ""),
@@ -85,9 +85,9 @@ def write_format(folder: Path, *, workers_elsewhere: bool = False, started_from:
 
 
 def read_config(run: Path) -> dict[str, Any]:
-    """The settings in the config.toml of a run folder, unchanged; they include env, algo and seed.
+    """The settings in the config.toml of a run folder, as they are there; they include env, algo and seed.
 
-    Raises `UsageError` for a file that is missing or cannot be read, or names a module in the run folder.
+    Raises `UsageError` if the file is missing, cannot be read, or names a module in the run folder.
     """
     where = run / CONFIG_FILE
     try:
@@ -106,7 +106,7 @@ def read_config(run: Path) -> dict[str, Any]:
 
 
 def parse_toml(text: str, where: str) -> dict[str, Any]:
-    """The content of a TOML file. Raises `UsageError`, also for a config.toml that has the first line but not the last."""
+    """The content of a TOML file. Raises `UsageError` if it is not valid, or if it is a config.toml that was cut off."""
     text = text.removeprefix("\ufeff")  # a byte order mark, which some editors write
     if text.startswith(HEAD) and not text.rstrip().endswith(END.strip()):
         raise UsageError(f"{where} is cut off: expected {END.strip()!r} as its last line; restore it, or start a new run")
@@ -131,7 +131,7 @@ def is_run_folder(folder: Path) -> bool:
 
 
 def _texts(value: Any) -> Iterator[str]:
-    """Every text in nested tables and lists."""
+    """Yield every text in nested tables and lists."""
     match value:
         case str():
             yield value
@@ -144,7 +144,7 @@ def _texts(value: Any) -> Iterator[str]:
 
 
 def check_format(folder: Path) -> RunFormat:
-    """The run.json of a run folder. Raises `UsageError`, with a one-line message, if this millrace cannot read it."""
+    """Read the run.json of a run folder. Raises `UsageError`, with a one-line message, if this version cannot read it."""
     try:
         run_format = msgspec.json.decode(read(folder / RUN_FILE), type=RunFormat)
     except FileNotFoundError:

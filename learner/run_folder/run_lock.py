@@ -1,9 +1,9 @@
-"""The lock of a run folder: one process trains a run at a time.
+"""The lock of a run folder, which ensures that only one process trains a run at a time.
 
-Rule: the file `run.lock` names the owner. On one machine the system's lock on it (flock) decides; the kernel releases it
-when the process dies, however it dies. Machines that share the folder may not see each other's system locks. So the owner
-also rewrites the file every few seconds (`lease.py`); an owner on another machine that stops doing so counts as dead. The
-lock of a dead owner is taken over. Commands that only read a run folder don't need the lock.
+Rule: the file `run.lock` names the owner. On a single machine, the system's lock on this file (flock) decides; the kernel
+releases it when the process dies, however it dies. Machines that share the folder may not see each other's system locks, so
+the owner also rewrites the file every few seconds (`lease.py`); an owner on another machine that stops doing so counts as
+dead. The lock of a dead owner is taken over. Commands that only read a run folder don't need the lock.
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ NUMBERS = Path("/proc/self/ns/pid")
 
 
 class Pace(NamedTuple):
-    """How often an owner rewrites its lock, and how an observer waits for that. In seconds."""
+    """How often an owner rewrites its lock, and how long an observer waits for that, in seconds."""
 
     rewrite_every: float = 3.0
     dead_after: float = 30.0
     look_every: float = 0.5
     confirm_after: float = 1.0
-    """When to check, after taking over a lock from another machine, whether a third machine took it at the same time."""
+    """How long after taking over a lock from another machine to check whether a third machine took it at the same time."""
 
 
 PACE = Pace()
@@ -53,11 +53,11 @@ WHY_UNREACHABLE = {
         "with --transport tcp and --keys, the keys of its local workers are not in any file; run it with --transport ipc"
     ),
 }
-JOIN_S = 5.0  # a file system that doesn't answer must not block the process
+JOIN_S = 5.0  # how long to wait for the thread at the end, because a file system that doesn't answer must not block that
 
 
 class RunLock:
-    """The lock of one run folder, held while it is entered."""
+    """The lock of one run folder, held inside the context."""
 
     def __init__(
         self,
@@ -82,13 +82,14 @@ class RunLock:
         self._file = -1
         self._other: Owner | None = None
         self._stop = threading.Event()
-        self._writing = threading.Lock()  # guards this object: the thread and `confirm` both read and rewrite the file
+        self._writing = threading.Lock()  # guards this object, because the thread and `confirm` both rewrite the file
         self._thread = threading.Thread(target=self._rewrite_often, name="run-lock", daemon=True)
 
     def __enter__(self) -> Self:
         """Take the lock.
 
-        Raises `UsageError`, which names the owner, if another process has it, and `RunError` if it cannot be written.
+        Raises `UsageError`, which names the owner, if another process has the lock, and `RunError` if the lock file cannot
+        be written.
         """
         try:
             self._take()
@@ -107,18 +108,18 @@ class RunLock:
         self._close()
 
     def announce(self, where: Listens | Unreachable) -> None:
-        """Write into the lock file where the learner of this run listens for `millrace status`, or why nobody can ask it."""
+        """Write to the lock file where the learner listens for `millrace status`, or why it cannot be asked."""
         with self._writing:
             self._owner = self._owner.listening(where)
         self._rewrite()
 
     @property
     def taken_over(self) -> bool:
-        """Whether another process is known to have taken the run over. Costs nothing."""
+        """Whether another process is known to have taken the run over. Reads no file."""
         return self._other is not None
 
     def check(self) -> None:
-        """Raise `RunTakenOver` if another process is known to have taken the run over. Costs nothing."""
+        """Raise `RunTakenOver` if another process is known to have taken the run over. Reads no file."""
         if self._other is not None:
             raise RunTakenOver(
                 f"run {self._folder}: {self._other} took it over, because this process seemed dead for "
@@ -126,7 +127,7 @@ class RunLock:
             )
 
     def confirm(self) -> None:
-        """Read the lock file, before something is written. Raises `RunTakenOver`."""
+        """Read the lock file. Raises `RunTakenOver` if another process has taken the run over. Called before writing."""
         self._rewrite()
         self.check()
 
@@ -142,19 +143,22 @@ class RunLock:
                     self._file = open_regular(self._path, os.O_RDWR)
                     made = False
                 except FileNotFoundError:
-                    continue  # it was released in between
+                    continue  # its owner has released it in between
             try:
                 if self._take_open_file(made=made):
                     return
             except BaseException as error:
-                if made and isinstance(error, OSError):  # as on a full disk
+                if made and isinstance(error, OSError):  # such as on a full disk
                     self._path.unlink(missing_ok=True)
                 self._close()
                 raise
             self._close()
 
     def _take_open_file(self, *, made: bool) -> bool:
-        """Take the lock of the open file. False if the file was released meanwhile. Raises `UsageError`."""
+        """Take the lock of the open file. Returns False if its owner released it meanwhile.
+
+        Raises `UsageError` if its owner is alive.
+        """
         alone = self._lock_by_system()
         if not self._is_open_file():
             return False
@@ -176,7 +180,10 @@ class RunLock:
         return True
 
     def _lock_by_system(self) -> bool:
-        """Take the system's lock. False if the file system has none. Raises `UsageError` if another process has it."""
+        """Take the system's lock. Returns False if the file system has no locks.
+
+        Raises `UsageError` if another process has it.
+        """
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
@@ -186,7 +193,10 @@ class RunLock:
         return True
 
     def _wait_until_dead(self, owner: Owner | None) -> None:
-        """Return once the content has stayed the same for long enough, or is gone. Raises `UsageError` if it changes."""
+        """Wait until the content has stayed the same for long enough, or the file is gone.
+
+        Raises `UsageError` if the content changes, because then its owner is alive.
+        """
         pace = self._pace
         log.warning(
             "run %s: its lock names %s; waiting up to %.0f s to see whether it lives",
@@ -198,9 +208,9 @@ class RunLock:
         while True:
             self._sleep(pace.look_every)
             try:
-                content = read(self._path)  # by its name: a file system may cache the content of an open file
+                content = read(self._path)  # opens it again, because a file system may cache the content of an open file
             except FileNotFoundError:
-                return  # its owner has released it
+                return  # the owner has released it
             match watch.judge(content, self._clock()):
                 case Verdict.ALIVE:
                     raise self._refusal(decoded(content) or owner)
@@ -208,7 +218,7 @@ class RunLock:
                     return
 
     def _refusal(self, owner: Owner | None) -> UsageError:
-        if owner is not None and _is_gone(owner):  # whoever can read a file can lock it
+        if owner is not None and _is_gone(owner):  # another process has locked the file: whoever can read it can do so
             return UsageError(
                 f"run {self._folder}: {owner}, which trained it, is gone, but another process has locked "
                 f"{self._path}; end that process (`lslocks` shows it) or delete the file, then resume"
@@ -225,7 +235,7 @@ class RunLock:
             self._rewrite()
 
     def _rewrite(self) -> None:
-        with self._writing, suppress(OSError):  # a file system that doesn't answer now may answer next time
+        with self._writing, suppress(OSError):  # a file system that fails now may work next time
             if self._other is not None:
                 return
             try:
@@ -240,7 +250,7 @@ class RunLock:
             self._write()
 
     def _make_again(self) -> None:
-        """Someone removed the file, perhaps with the whole folder: make it again if the folder is there."""
+        """Recreate the file after somebody has removed it, unless the whole folder is gone."""
         if not self._folder.is_dir():
             return
         file = open_regular(self._path, os.O_RDWR | os.O_CREAT | os.O_EXCL)
@@ -262,7 +272,7 @@ class RunLock:
         return owner is not None and owner.token == self._owner.token
 
     def _is_open_file(self) -> bool:
-        """Whether the open file is still the one at this path: its owner may have removed it."""
+        """Whether the open file is still the one at this path. Its owner may have removed it."""
         with suppress(FileNotFoundError):
             return os.path.samestat(os.fstat(self._file), os.lstat(self._path))
         return False
@@ -274,19 +284,19 @@ class RunLock:
 
 
 class LearnerOfRun(NamedTuple):
-    """Where to ask the learner of a run, from this machine."""
+    """Where this machine can ask the learner of a run."""
 
     address: str
     keys: Path | None
-    """Its key folder, which may be on another machine; None if it needs no key."""
+    """The learner's key folder, which may be on another machine; None if no key is needed."""
     is_here: bool
-    """Whether it is on this machine and in this network, and `address` is its own."""
+    """Whether the learner is on this machine and in this network, so that `address` is its own address."""
 
 
 def learner_of_run(folder: Path) -> LearnerOfRun:
-    """Where the learner that trains the run in this folder now listens.
+    """Where the learner that now trains the run in this folder listens.
 
-    Raises `UsageError`, with a one-line message, if none does, or if it cannot be asked from this machine.
+    Raises `UsageError`, with a one-line message, if none trains it, or if it cannot be asked from this machine.
     """
     owner = living_owner(folder, time.time())
     if not owner.address:
@@ -301,11 +311,11 @@ def learner_of_run(folder: Path) -> LearnerOfRun:
 
 
 def living_owner(folder: Path, now: float) -> Owner:
-    """Who seems to train the run in this folder, for display; `now` is wall-clock time.
+    """The process that seems to train the run in this folder, for display. `now` is wall-clock time.
 
-    A process on this machine is looked up by its number. Others, also in containers, rewrite the file every few seconds; if
-    the clocks of two machines differ by much, the answer is wrong, so no write depends on it. Raises `UsageError`, with a
-    one-line message, if nobody seems to.
+    A process on this machine is looked up by its process number. Other ones, including those in containers, rewrite the file
+    every few seconds; if the clocks of two machines differ by much, the answer is wrong, so no write depends on it. Raises
+    `UsageError`, with a one-line message, if no process seems to train the run.
     """
     path = folder / LOCK_FILE
     try:
@@ -323,12 +333,12 @@ def living_owner(folder: Path, now: float) -> Owner:
 
 
 def _is_gone(owner: Owner) -> bool:
-    """Whether no process has the owner's number any more. False if that cannot be known."""
+    """Whether the owner's process has ended. False if that cannot be known."""
     return _has_our_numbers(owner) and not _is_alive(owner.pid)
 
 
 def _has_our_numbers(owner: Owner) -> bool:
-    """Whether the owner's process number is valid for this process: it is on this machine, in the same container."""
+    """Whether this process can look up the owner's process number: both are on one machine, in the same container."""
     return owner.boot_id == _boot() and owner.pid_namespace == _namespace(NUMBERS)
 
 
@@ -337,7 +347,7 @@ def _is_alive(pid: int) -> bool:
         os.kill(pid, 0)
     except ProcessLookupError:
         return False
-    except PermissionError:  # the process of another user
+    except PermissionError:  # the process belongs to another user
         return True
     return True
 
@@ -351,7 +361,7 @@ def _boot() -> str:
 
 
 def _namespace(kind: Path) -> str:
-    """The namespace of this kind that this process is in; empty if that is not known."""
+    """This process's namespace of this kind; empty if it is not known."""
     try:
         return os.readlink(kind)
     except OSError:

@@ -1,11 +1,11 @@
-"""Words and sentences for people: how far a run is, what slows it down, what went wrong in it, and how it ended. Pure.
+"""Words and sentences for people: how far a run has got, what slows it down, what went wrong in it, and how it ended. Pure.
 
-Everything that shows a `RunProgress` takes its words from here, so that all use the same ones.
+Everything that shows a `RunProgress` takes its words from here, so that the same words are used everywhere.
 
 Rule: the side that waits less is the slower one. If learner and workers take turns, one waits while the other works, so the
 shares of time that they wait add up to about 1; if they work at the same time, only the faster one waits. If the shares add
-up to more, both wait at once: for some workers, or for messages on their way. This is said only if the learner waits for
-longer than it works, because otherwise faster workers or messages would change little.
+up to more, both wait at once, for some of the workers or for messages on their way. The sentence says so only if the learner
+waits for longer than it works, because otherwise faster workers or messages would change little.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from collections.abc import Mapping
 from millrace.protocol.messages import Status
 from millrace.protocol.progress import RunProgress
 
-ABOUT_EQUAL = 0.2  # if the shares of time that both sides wait differ by less, neither side is named
-BOTH_WAIT = 0.1  # for a larger share of the time than this, learner and workers wait at once
-LEAST_PER_S = 1e-4  # an env step in three hours; a smaller speed is 0
-LONG_RETURN = 1e12  # from this size on, the digits of a return would make a table too wide
+ABOUT_EQUAL = 0.2  # if the shares of time for which the two sides wait differ by less, neither is called slower
+BOTH_WAIT = 0.1  # how far the two shares must exceed 1 together before both sides are said to wait at once
+LEAST_PER_S = 1e-4  # one env step in three hours; a lower speed is shown as 0
+LONG_RETURN = 1e12  # from this size on, all digits of a return would make a table too wide
 COLLECTING = ("act", "step", "wait")
 WRONG = {
     "lost": ("rollout was lost and dealt again", "rollouts were lost and dealt again"),
@@ -30,17 +30,17 @@ WRONG = {
     "messages_bad": ("message could not be read", "messages could not be read"),
     "late_actions": ("action came too late", "actions came too late"),
 }
-"""Singular and plural, by name in the ledger"""
+"""The words for one and for several of each count of the ledger."""
 
 
 def steps_in_words(progress: RunProgress) -> str:
-    """How many env steps have been made, and of how many."""
+    """How many env steps have been made, and of how many in all."""
     made = f"{progress.env_steps_made:,}"
     return f"{made} of {progress.total_steps:,}" if progress.total_steps else made
 
 
 def percent(progress: RunProgress) -> str:
-    """How much of the run is done. It is 100% only once all of it is done."""
+    """How much of the run is done, rounded down, so that it is 100% only once all of it is done."""
     return f"{math.floor(100 * progress.share)}%"
 
 
@@ -52,7 +52,7 @@ def return_in_words(mean: float | None) -> str:
 
 
 def workers_in_words(progress: RunProgress) -> str:
-    """How many workers are alive, and of how many."""
+    """How many workers are alive, and of how many expected ones."""
     expected = f" of {progress.workers_expected}" if progress.workers_expected else ""
     return f"{progress.workers_alive}{expected}"
 
@@ -66,7 +66,7 @@ def lag_in_words(progress: RunProgress) -> str:
 
 
 def weights_in_words(version: int, newest: int) -> str:
-    """Which weights a worker holds: `version` compared with the `newest`; -1: none."""
+    """How old the weights that a worker holds are: `version` compared with the `newest`. -1 means that it has none."""
     if version < 0:
         return "none"
     return f"{newest - version} behind" if version < newest else "newest"
@@ -80,12 +80,12 @@ def workers_here(status: Status) -> str:
 
 
 def bottleneck(progress: RunProgress) -> str:
-    """Whom the learner waits for now, or else which part of the run takes most of the time. Empty while nothing is known."""
+    """Whom the learner waits for now or, if nobody, which part of the run takes most of the time. Empty if unknown."""
     return who_waits(progress) or slowest_part(progress.stages)
 
 
 def who_waits(progress: RunProgress) -> str:
-    """Whom the learner waits for now. Empty if it does not wait long, or the run has ended."""
+    """Whom the learner waits for now. Empty if it has not waited for long, or if the run has ended."""
     waiting = progress.waiting
     if not waiting or progress.stop_reason:
         return ""
@@ -93,7 +93,7 @@ def who_waits(progress: RunProgress) -> str:
 
 
 def slowest_part(stages: Mapping[str, float | None]) -> str:
-    """Which part of a run takes most of the time, by the seconds spent in each stage. Empty while nothing is known."""
+    """Which part of a run takes most of the time, according to the seconds in each stage. Empty while nothing is known."""
     learner = {name: stages.get(f"learner_{name}") or 0.0 for name in ("wait", "update", "other", "evaluate")}
     worker = {name: stages.get(f"worker_{name}") or 0.0 for name in COLLECTING}
     all_s = sum(learner.values())
@@ -126,7 +126,7 @@ def slowest_part(stages: Mapping[str, float | None]) -> str:
 
 
 def per_second(steps: float) -> str:
-    """Env steps per second. Few of them have digits after the point, so that a slow simulator does not look dead."""
+    """Env steps per second. Low speeds are shown with decimals, so that a slow simulator does not look dead."""
     return f"{steps:.2g}" if LEAST_PER_S <= steps < 9.95 else f"{steps:,.0f}"
 
 
@@ -139,19 +139,19 @@ def duration(seconds: float) -> str:
 
 
 def last_sign(progress: RunProgress) -> str:
-    """Since when a run without results has shown no sign of life, in local time. Empty if that is not known."""
+    """The local time since which a run without results has shown no sign of life, in words. Empty if it is not known."""
     if not progress.at_s:
         return ""
     return time.strftime("no sign since %Y-%m-%d %H:%M:%S", time.localtime(progress.at_s))
 
 
 def ending(reason: str, after: str = "", *, cut_short: bool) -> str:
-    """How a run ended, and why. `after`: words for how long it ran."""
+    """How a run ended, and why. `after` are words that say how long it ran."""
     how = "Interrupted" if cut_short else "Finished"
     return f"{how}{after}" if reason == how.lower() else f"{how}{after}: {reason}"
 
 
 def went_wrong(counts: Mapping[str, float | None]) -> str:
-    """What was lost, dropped or unreadable, from these counts of the ledger. Empty if nothing was."""
+    """What was lost, dropped or unreadable, according to these counts of the ledger. Empty if nothing was."""
     found = ((counts.get(name) or 0, texts) for name, texts in WRONG.items())
     return ", ".join(f"{count:,.0f} {texts[count != 1]}" for count, texts in found if count > 0)

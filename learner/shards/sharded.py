@@ -56,7 +56,7 @@ class Sharded(ActorCritic):
     # ---------------------------------------------------------------- what rank 0 tells, and the others do
 
     def update(self, batch: Batch, pulse: Callable[[], None]) -> UpdateMetrics:
-        """See `ActorCritic`. If `pulse` raises, the update ends in all processes, at the next gradient step or at its end."""
+        """See `ActorCritic`. If `pulse` raises, all processes end the update, at the next gradient step or at its end."""
         self._stopped = None
         self.learners.others_wait = False
         if self.learners.leads:

@@ -58,7 +58,7 @@ class StepHub:
         self.while_waiting: Callable[[], None] = lambda: None
         """called now and then while the hub waits; an exception that it raises ends the wait"""
         self.on_death: Callable[[Failed], None] = lambda event: None
-        """called when a worker's process has ended in code of its environment; by default, only the lost copies are reported"""
+        """called when a worker's process has ended in code of its environment; the lost copies are reported in any case"""
         self.status_of_run: Callable[[float], Status] | None = None
         """returns the status of the run that acts on these copies, to which `status` adds the workers of this hub"""
         self._link = link
