@@ -152,7 +152,7 @@ class ActorCritic(GradientDescent):
         Raises `RunError` before a step whose loss, logged numbers or gradient norm are not finite, and after the last step
         if the new weights could give actions that are not finite.
         """
-        if not batch.valid.any():  # all seats waited for their turns, so there is nothing to learn from
+        if not batch.valid.any():  # with several agents, all seats may wait: then there is nothing to learn
             self.env_steps += batch.env_steps
             return {}
         self.set_schedules()

@@ -173,7 +173,7 @@ def _bounded(rows: Floats | Doubles, center: Floats | Doubles, spread: Floats | 
     """The rows [B, D], with values that are far from the center [D] replaced; the same array if no value is far."""
     distance = rows - center.astype(rows.dtype)
     if (np.einsum("bd,bd->d", distance, distance) <= (FAR * spread) ** 2).all():
-        return rows  # most batches: the sum of all squares is smaller than the square of one far value
+        return rows  # true for most batches: if all squares sum to less than the square of a far value, no value is far
     far = abs(distance) > FAR * spread
     return np.where(far, center + np.copysign(CLIP * spread, distance), rows) if far.any() else rows
 

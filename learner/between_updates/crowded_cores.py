@@ -14,7 +14,7 @@ from contextlib import contextmanager
 log = logging.getLogger("millrace.learner")
 
 LONG_S = 10.0
-SHARE = 0.5  # the least CPU time of an update, as a share of its duration, at which it isn't called slow
+SHARE = 0.5  # an update counts as waiting if its CPU time is at most this share of its duration
 
 
 class CrowdedCores:

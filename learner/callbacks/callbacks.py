@@ -45,7 +45,7 @@ class Callbacks:
         return self
 
     def add(self, callback: object) -> None:
-        """Add a callback, which is called after the others. Raises `UsageError` if it is no callback."""
+        """Add a callback, which is called after the others. Raises `UsageError` if it isn't a valid callback."""
         self._callbacks.append(_checked(callback))
 
     def wants(self, moment: str) -> bool:

@@ -37,7 +37,7 @@ from millrace.protocol.messages import (
 
 
 class Coordinator(ABC, Generic[M]):
-    """The members, and the answers to their messages."""
+    """Answers the messages of the members, removes members, and deals work to them."""
 
     def __init__(self, membership: Membership[M], worker_timeout_s: float) -> None:
         self.membership = membership

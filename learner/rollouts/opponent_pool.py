@@ -81,7 +81,7 @@ class PoolSettings(NamedTuple):
     """The share of rollouts in which the policy plays against itself."""
     max_lag: int
     scripted: int = 0
-    """How many programs there are."""
+    """How many of the opponents are programs that the user wrote."""
     teams: int = 2
     """How many teams there are, of which the policy plays one."""
 

@@ -40,7 +40,7 @@ class AcceptedRollout:
 
 
 class RolloutDealer:
-    """Lanes, rounds, tickets and the ledger."""
+    """Deals tickets for rollouts, accepts rollouts, and keeps the records of lanes, rounds and the ledger."""
 
     def __init__(
         self,

@@ -69,7 +69,7 @@ class Owner(msgspec.Struct, frozen=True, kw_only=True):
         return f"process {self.pid} on {self.host}"
 
     def listening(self, where: Listens | Unreachable) -> Owner:
-        """This owner with the addresses of its learner, or without them if they are too long for the file."""
+        """The owner with the addresses of its learner, or without them if they are too long for the file."""
         if isinstance(where, Unreachable):
             return replace(self, address="", here="", keys="", unreachable=where)
         found = replace(self, address=where.address, here=where.here, keys=where.keys, unreachable=None)

@@ -361,7 +361,7 @@ def _boot() -> str:
 
 
 def _namespace(kind: Path) -> str:
-    """This process's namespace of this kind; empty if it is not known."""
+    """The namespace of this kind to which this process belongs; empty if it is not known."""
     try:
         return os.readlink(kind)
     except OSError:

@@ -185,7 +185,7 @@ class ReplayBuffer(Rewinding[Overwritten]):
         self._rows = 0
         self._remembered: Remembered | None = None
         self._overwritten: list[Overwritten] = []  # contents saved since `remember`, oldest first
-        self._newest: dict[int, Ints] = {}  # by lane, [columns] the `_written` at which the last observation was stored
+        self._newest: dict[int, Ints] = {}  # by lane, [columns] value of `_written` when the last observation was stored
 
     def __len__(self) -> int:
         """The number of transitions that can be drawn."""
@@ -233,7 +233,7 @@ class ReplayBuffer(Rewinding[Overwritten]):
         needed = np.zeros(goes_on.shape, bool)  # [T+1, N] observations to store
         needed[:-1] = valid & ~goes_on[:-1]
         needed[1:] |= leads
-        written = np.full(needed.shape, NO_SLOT)  # [T+1, N] the `_written` at which each observation is stored
+        written = np.full(needed.shape, NO_SLOT)  # [T+1, N] value of `_written` when each observation is stored
         written[needed] = self._written + np.arange(np.count_nonzero(needed))
         written[0][continues] = newest[continues]
         written = np.maximum.accumulate(written)  # while a seat waits, its newest observation stays where it is
@@ -289,8 +289,9 @@ class ReplayBuffer(Rewinding[Overwritten]):
         return self._obs if self._mask is None else (*self._obs, self._mask)
 
     def _continues(self, first: Sequence[Array], newest: Ints, room: int) -> Bools:
-        """[N] True where a copy's rollout begins with the newest observation stored for it, whose `_written` is in `newest`.
+        """[N] True where a copy's rollout begins with the newest observation that is stored for it.
 
+        `newest` [N] is the value of `_written` when that observation was stored, or NO_SLOT. The rollout needs `room` slots.
         The observations are compared, in case a caller that stacks rollouts itself has left one out. The stored observation
         must also be so new that adding this rollout does not overwrite it.
         """

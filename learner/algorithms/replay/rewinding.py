@@ -17,7 +17,7 @@ KeptT = TypeVar("KeptT")
 
 
 class Remembered(NamedTuple):
-    """The state of a replay buffer that `roll_back` returns to, without the slots."""
+    """The state to which `roll_back` returns a replay buffer, without the content of the slots."""
 
     written: int
     rows: int
