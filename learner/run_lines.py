@@ -52,7 +52,7 @@ class RunLine(NamedTuple):
     seed: int = 0
     started: str = ""
     progress: RunProgress = RunProgress()
-    """how far it has got"""
+    """how far the run has got"""
     summary: Summary | None = None
     problem: str = ""
     """why it cannot be read; empty if it can"""

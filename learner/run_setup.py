@@ -78,7 +78,7 @@ class RunSetup:
     """The learner processes of a run with shards, which share the updates."""
 
     def announce(self, bound: Bound) -> None:
-        """Write to the lock of the run folder at which address `millrace status` can ask, or why it can't."""
+        """Write the learner's address, which `millrace status` asks, to the lock of the run, or why it can't be asked."""
         address = bound.link.address
         keyring = bound.keyring
         lock = self.folder.lock

@@ -89,7 +89,7 @@ def mistakes(algorithm: type, settings: dict[str, Any], *, learns: bool) -> Iter
         except Exception as error:
             yield _raised("it cannot be made", error)
             return
-        if made:  # then no policy can act
+        if made:  # with such weights no policy can act, so no batches can be made for the other rules
             yield from made
             return
         try:

@@ -11,7 +11,7 @@ from millrace.learner.config.hyperparameters import A2CConfig
 
 
 class A2C(ActorCritic):
-    """The policy gradient with GAE, in one step per batch."""
+    """The policy gradient with GAE, and one gradient step per batch."""
 
     Config = A2CConfig
     config: A2CConfig

@@ -1,7 +1,7 @@
-"""The base of every algorithm: what the training loop of `millrace.learner.train` calls, and checks of what it returns.
+"""The base of every algorithm: the methods that the training loop (`millrace.learner.train`) calls, and checks of results.
 
-Your own algorithm may return anything. If its result cannot be used, one line says why and names the class. This file
-doesn't need torch.
+The checks are needed because your own algorithm may return anything. If its result cannot be used, a one-line error says why
+and names the class. This file doesn't need torch.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
 
 
 class Start(NamedTuple):
-    """What a new run takes over from an earlier run, whose policy has the same `PolicySpec`."""
+    """The parts of an earlier run that a new run takes over. The policies of both have the same `PolicySpec`."""
 
     state: dict[str, Any]
     """The `state_dict` of the earlier run's algorithm. If only the policy of that run is known, it holds just `parameters`,
@@ -64,9 +64,9 @@ class Start(NamedTuple):
 
 
 class Algorithm(ABC):
-    """The base of every algorithm: it learns from batches, and gives the weights of the policy that collects the next ones.
+    """The base of every algorithm, which learns from batches and provides the weights of the policy that collects the next.
 
-    A subclass writes `__init__`, `update`, `weights`, `state_dict` and `load_state_dict`, and has its settings in `Config`.
+    A subclass defines `__init__`, `update`, `weights`, `state_dict` and `load_state_dict`, and has its settings in `Config`.
     """
 
     Config: ClassVar[type[AlgorithmConfig]] = AlgorithmConfig

@@ -159,7 +159,7 @@ class GradientDescent(Algorithm):
         return {"env_steps": self.env_steps, "version": self.version, "pretraining_steps": self.pretraining_steps}
 
     def load_other_state(self, state: dict[str, Any]) -> None:
-        """Continue from `other_state`."""
+        """Restore what `other_state` returned."""
         self.env_steps = int(state["env_steps"])
         self.version = int(state["version"])
         self.pretraining_steps = int(state["pretraining_steps"])

@@ -67,7 +67,7 @@ class RunningMoments:
         return np.where(variance > rounding**2 + TINY**2, np.sqrt(variance), np.maximum(rounding, 1.0))
 
     def state_dict(self) -> dict[str, Any]:
-        """Tensors and numbers, copied."""
+        """A copy of the state, as tensors and numbers."""
         return {"count": self.count, "mean": torch.tensor(self.mean), "squares": torch.tensor(self._squares)}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -155,7 +155,7 @@ class ObservationNormalizer:
         return np.concatenate([mean, std.astype(np.float32)])
 
     def state_dict(self) -> dict[str, Any]:
-        """Tensors and numbers, copied."""
+        """A copy of the state, as tensors and numbers."""
         first = {"first": torch.tensor(self._first)} if len(self._first) else {}
         return self._moments.state_dict() | first
 
@@ -228,7 +228,7 @@ class RewardScaler:
             self._largest = max(self._largest, float(abs(valid).max(initial=0)))
 
     def state_dict(self) -> dict[str, Any]:
-        """Tensors and numbers, copied."""
+        """A copy of the state, as tensors and numbers."""
         return {
             "moments": self._moments.state_dict(),
             "largest": self._largest,

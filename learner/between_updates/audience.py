@@ -2,7 +2,7 @@
 
 Rule: numbers are counted, and written to a row of the metrics, before they are reported. Numbers that callbacks log are
 added to the row of the newest update, even if one of the callbacks raises. `on_checkpoint` is called after a checkpoint was
-written, so callbacks can't make requests there: the checkpoint would lack them.
+written, so callbacks can't set attributes of env copies there: the checkpoint would lack them.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ SHOW_EVERY_S = 0.2  # least interval at which progress between two updates is sh
 
 
 class Audience:
-    """Everything that watches one run."""
+    """Reports one run to everything that watches it."""
 
     def __init__(self, run: RunParts, callbacks: Callbacks, files: RunFiles, requests: Requests) -> None:
         """`requests` are the requests that callbacks make."""

@@ -97,7 +97,7 @@ class Evaluations:
     def conclude(self, watch: Callable[[], None]) -> bool:
         """Evaluate the final policy and, if the run kept a best policy, evaluate that again on other episodes.
 
-        Sets `final` and `confirmed`. Returns whether the final policy was evaluated here for the first time.
+        Sets `final` and `confirmed`. Returns whether the final policy had not been evaluated with as many episodes before.
         """
         state = self._state
         before = self.of_newest()

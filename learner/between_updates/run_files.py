@@ -34,7 +34,7 @@ log = logging.getLogger("millrace.learner")
 
 
 class RunFiles:
-    """The files of one run."""
+    """Writes the files of one run."""
 
     def __init__(self, run: RunParts, evaluations: Evaluations, attributes: EnvAttributes) -> None:
         """Removes the metrics of updates after the checkpoint of a resumed run. Raises `RunError` if that is impossible."""

@@ -114,5 +114,5 @@ class Tally:
         return stages | {f"worker_{name}": s for name, s in snapshot.worker_stages.items()}
 
     def wall_s(self, snapshot: HubSnapshot) -> float:
-        """Seconds of training."""
+        """Seconds of training so far, including those before a resume, without evaluations."""
         return self.wall_before_s + snapshot.taken_s - self._started_s - snapshot.evaluate_s

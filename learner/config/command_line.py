@@ -16,7 +16,7 @@ from millrace.learner.run_folder.newest_run import AUTO, newest_run
 
 
 class RunFlags(Config, frozen=True, kw_only=True):
-    """All settings of a run, and where their defaults come from."""
+    """All settings of a run, and the flags that say where their defaults come from."""
 
     config: Annotated[Path | None, Flag("PATH")] = None
     """TOML file of settings. The config.toml of a run folder repeats that run."""

@@ -39,7 +39,7 @@ def final_evaluation_size(
     budget = 3 * env_steps // 4
     most = config.eval_max_steps
     length = time_limit or episode_length
-    if length is None:  # episodes may have no end
+    if length is None:  # no episode has ended, so episodes may have no end
         return EvaluationSize(FEWEST_EPISODES, max(min(most, budget), 1))
     episodes = min(max(int(budget / max(length, 1.0)), FEWEST_EPISODES), MOST_EPISODES)
     if time_limit is not None:

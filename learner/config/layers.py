@@ -35,7 +35,7 @@ ALL_BUT_TABLES = {*Config.__struct_fields__} - {"algorithm", *TABLES}
 
 
 class SettingsLayer(NamedTuple):
-    """Settings from one source: those of the run and of its algorithm side by side."""
+    """The settings from one source, with those of the run and those of its algorithm in one mapping."""
 
     where: str
     """how an error begins: a file, `preset NAME` or `train`; empty for flags, which are recognized by their names"""

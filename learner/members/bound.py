@@ -23,17 +23,17 @@ from millrace.protocol.wire.learner_link import LearnerLink
 log = logging.getLogger("millrace.learner")
 
 LINGER_S = 0.5  # how long a closed socket still tries to send queued messages
-LINGER_ELSEWHERE_S = 2.0  # the same, if the learner is on another machine
+LINGER_ELSEWHERE_S = 2.0  # the same for workers that are started elsewhere, perhaps on other machines
 
 
 @dataclass(frozen=True)
 class Bound:
-    """An address that is bound, and who may connect there."""
+    """A bound address, with the keys that may connect there."""
 
     link: LearnerLink
     context: zmq.Context[zmq.Socket[bytes]]
     keyring: Keyring | None
-    """None if no key is needed."""
+    """The keys that may connect; None if no key is needed."""
 
     def announce(self, advertise: str) -> None:
         """Log how to start a worker on another machine."""

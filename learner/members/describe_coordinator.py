@@ -26,11 +26,11 @@ from millrace.protocol.messages import TOLD_TO_STOP, Describe, Described, Goodby
 from millrace.protocol.progress import RunProgress
 from millrace.protocol.specs import WaitSpec
 
-FIRST_TICKET = 1 << 51  # the first ticket of a description, far from a run's tickets, because a worker may still be
-# describing when the run begins
+# Far from a run's tickets, because a worker may still be describing the environment when the run begins.
+FIRST_TICKET = 1 << 51
 
 Accept = Callable[[DescribedEnv], None]
-"""Raises `UsageError` if the run cannot be made with this environment."""
+"""A check that raises `UsageError` if the run cannot be made with this environment."""
 
 
 def accept_any(env: DescribedEnv) -> None:

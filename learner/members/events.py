@@ -66,7 +66,7 @@ class Failed:
 
     json_name: ClassVar[str]
     raised_as: ClassVar[type[EnvironmentFailed | PolicyFailed]] = EnvironmentFailed
-    """The class of `exception`."""
+    """The class of the error that `exception` makes."""
     worker: str
     host: str
     error: str
@@ -154,7 +154,7 @@ class LaneContinued:
     worker: str
     lane: int
     repeated_steps: int
-    """The number of env steps that are replayed before it continues."""
+    """The number of env steps that are replayed before the lane continues."""
     new_episodes: int
     """How many of its env copies begin new episodes instead."""
     longest: int = 0
@@ -172,7 +172,7 @@ class RolloutRejected:
 
 @dataclass(frozen=True)
 class RolloutArrived:
-    """A rollout was accepted."""
+    """A rollout has arrived and was accepted."""
 
     worker: str
     lane: int

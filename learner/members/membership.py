@@ -72,7 +72,7 @@ class Answered:
     out: list[Outgoing]
     """The messages of the answer."""
     changed: bool = False
-    """Whether a worker joined, or members were removed."""
+    """Whether a worker joined or members were removed, so that work may have to be dealt."""
 
 
 M = TypeVar("M", bound=Member)

@@ -21,7 +21,7 @@ class CollectingMember(Member):
 
     @property
     def steps_under_way(self) -> int:
-        """Env steps of its unfinished tickets, as of its newest heartbeat."""
+        """The env steps that were made for its unfinished tickets, as of its newest heartbeat."""
         return 0 if self.heartbeat is None else max(0, self.heartbeat.steps - self.ended_steps)
 
     def record_heartbeat(self, heartbeat: Heartbeat) -> list[int]:

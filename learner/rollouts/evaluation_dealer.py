@@ -119,7 +119,7 @@ class EvaluationDealer:
         self.second: dict[int, Member] = {}
         """the second worker of each of these tickets that has one, by number"""
         self.most_copies: int | None = None
-        """the largest number of env copies that play, summed over all workers (but one worker always may); None: no limit"""
+        """the most env copies that play, summed over all workers; a single worker plays even with more; None: no limit"""
         self._run = run
         self.beside = False
         """whether the pending evaluation runs alongside training"""

@@ -26,7 +26,7 @@ class _OfRound:
     first: int
     """the number of the first row, counted since the history began"""
     action: Array
-    """[T, N · A, *action]"""
+    """[T, N · A, *action] the actions"""
     attributes: bytes
     """the attributes that were set on the copies, packed"""
 

@@ -23,7 +23,10 @@ log = logging.getLogger("millrace.learner")
 
 
 def open_regular(path: Path, flags: int = os.O_RDONLY) -> int:
-    """Open a file as `os.open` does, and return its descriptor. Raises `OSError`, even for what isn't a regular file."""
+    """Open a file as `os.open` does, and return its descriptor.
+
+    Raises `OSError` if that fails, or if it isn't a regular file.
+    """
     try:
         file = os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, 0o666)
     except OSError:
@@ -58,7 +61,10 @@ def regular_files(run: Path, pattern: str) -> list[Path]:
 
 
 def subfolder(run: Path, name: str) -> Path:
-    """Make a folder inside a run folder unless it exists, and return its path. Raises `OSError`, even if it is a link."""
+    """Make a folder inside a run folder unless it exists, and return its path.
+
+    Raises `OSError` if that fails, or if something else, such as a link, has this name.
+    """
     folder = run / name
     folder.mkdir(parents=True, exist_ok=True)
     _expect(stat.S_IFDIR, folder.lstat().st_mode, folder)

@@ -388,7 +388,7 @@ class RunFolder:
             return None
 
     def write_images(self, files: Mapping[str, bytes]) -> None:
-        """Write pictures, given by the names of their files."""
+        """Write pictures into the folder. `files` has the content of each, by the name of its file."""
         for name, content in files.items():
             self._write(name, content)
 

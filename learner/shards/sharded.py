@@ -236,7 +236,7 @@ def _contents(state: object) -> Iterator[bytes]:
 
 
 def _packed(state: dict[str, Any]) -> Array:
-    """A state as bytes."""
+    """Encode a state as bytes."""
     file = io.BytesIO()
     torch.save(state, file)
     return np.frombuffer(bytearray(file.getvalue()), np.uint8)

@@ -1,6 +1,7 @@
 """The arguments of `millrace.make_vec` as one record.
 
-Rule: a value out of its range is refused here, in one line, before a worker is started. `make_vec` has checked the types.
+Rule: a value out of its range is refused here, with a one-line error, before a worker is started. `make_vec` has already
+checked the types.
 """
 
 from __future__ import annotations

@@ -29,8 +29,8 @@ log = logging.getLogger("millrace.learner")
 
 POLL_S = 0.05  # interval at which to check whether a child process has ended
 LISTEN_EVERY_S = 0.5  # interval at which heartbeats are answered while steps go through shared memory
-PATIENCE_S = 10.0  # how long a lost lane waits for a restarted worker (at most half the timeout) before it goes to a worker
-# that already has lanes
+# How long a lost lane waits for a restarted worker, at most half the timeout, before it goes to a worker that has lanes.
+PATIENCE_S = 10.0
 BUSY_S = 1.0  # how long closing waits for a step under way: no longer, because the step may hang, and nobody uses its result
 
 

@@ -1,8 +1,9 @@
 """MLPs of one shape, with or without batch normalization (Ioffe and Szegedy 2015), and how they fold into plain MLPs.
 
 Rule: a training pass normalizes by the mean and variance of its own minibatch, and moves the running statistics towards
-them. To act, a network uses the running statistics. Batch normalization is then linear, so it is folded into the linear
-layers: workers act with a plain MLP, and need neither statistics nor PyTorch.
+them. A pass that doesn't train these MLPs, such as one that acts, uses the running statistics (except for targets, see
+`of_minibatch`). Batch normalization is then linear, so it is folded into the linear layers: workers act with a plain MLP,
+and need neither statistics nor PyTorch.
 
 With `Normalized.BEFORE` an MLP is a BN; then linear, BN and activation for each hidden layer; then linear (XQC, Palenicek et
 al. 2025). With `Normalized.AFTER` there is a BN in front of every linear layer (CrossQ, Bhatt et al. 2024).

@@ -18,7 +18,7 @@ from millrace.protocol.errors import UsageError
 from millrace.protocol.random_streams import Purpose
 from millrace.protocol.rollout import Batch
 
-PRIOR_SLOT = -1  # `Sample.slots` of a prior transition
+PRIOR_SLOT = -1  # stands for every prior transition in `Sample.slots`
 
 
 def check_dataset_fits_memory(content: Content) -> None:

@@ -99,8 +99,9 @@ class OffPolicy(GradientDescent):
         """
 
     def update(self, batch: Batch, pulse: Callable[[], None]) -> UpdateMetrics:
-        """Add a batch to the replay buffer, and take the gradient steps that are due, with `pulse` between. Returns metrics.
+        """Add a batch to the replay buffer, then take the gradient steps that are due. Returns metrics.
 
+        Calls `pulse` between gradient steps.
         If a loss or a gradient is not finite, raises `RunError` before it reaches the weights.
         """
         self.set_schedules()

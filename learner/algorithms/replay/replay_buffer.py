@@ -39,7 +39,7 @@ from millrace.protocol.random_streams import Purpose, generator
 from millrace.protocol.rollout import Batch
 from millrace.protocol.specs import ActionSpec, Leaf
 
-PRIORITY_OFFSET = 1e-6  # added to errors, so that every transition can be drawn again
+PRIORITY_OFFSET = 1e-6  # is added to errors, so that every transition can be drawn again
 DRAWN_AT_ONCE = 1 << 20  # the most bytes of transitions to draw together, so that they stay in the cache
 DISCRETE = ActionSpec("discrete", (), "int64")
 
@@ -351,7 +351,7 @@ class ReplayBuffer(Rewinding[Overwritten]):
     def _uniform(self, count: int) -> tuple[Ints, Array, Floats]:
         used = min(self._written, self.size)
         slots = self.generator.integers(0, used, count)
-        while not (found := (row := self._row[slots])["is_row"]).all():  # at least half of the slots have a row
+        while not (found := (row := self._row[slots])["is_row"]).all():  # few rounds: half of the slots have a row
             slots[~found] = self.generator.integers(0, used, np.count_nonzero(~found))
         return slots, row, np.ones(count, np.float32)
 
