@@ -41,12 +41,13 @@ class Config(RolloutConfig, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     start_from: Annotated[Fixed[str], Flag("PATH", alias="from")] = ""
     """Start from the policy of this run folder in place of random weights, with its statistics of observations and rewards.
     A folder with only policy.json and policy.safetensors will do. All other settings are those of the new run, and schedules
-    start anew. A resumed run doesn't read the folder again: see docs/how-to/resume.md.
+    start from the beginning. A resumed run doesn't read the folder again: see docs/how-to/resume.md.
     """
     from_parts: Fixed[Literal["auto", "policy", "best", "critic", "all"]] = "auto"
-    """What `--from` takes. policy: the newest policy and the statistics. best: the policy of the best evaluation. critic:
-    also the critic, the target networks and the temperature. all: also the optimizers. A replay buffer is never taken.
-    auto: critic with sac and td3 if the run has a checkpoint, because their actors follow the critic at once; else policy.
+    """What `--from` takes over. policy: the newest policy and the statistics. best: the policy of the best evaluation.
+    critic: also the critic, the target networks and the temperature. all: also the optimizers. A replay buffer is never
+    taken over. auto: critic with sac and td3 if the run has a checkpoint, because their actors immediately follow the
+    critic; otherwise policy.
     """
     device: Free[Literal["auto", "cpu", "cuda"]] = "auto"
     """Device of the learner. auto: cuda if PyTorch finds a GPU, else cpu."""
@@ -57,15 +58,15 @@ class Config(RolloutConfig, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
     eval_episodes: Free[Count | None] = None
     """Number of greedy episodes in an evaluation. none: 100. Without eval_every, the evaluation at the end has fewer,
-    but at least 10, if 100 could take more than three quarters of the env steps of training.
+    but at least 10, if 100 episodes could take more than three quarters of the env steps of training.
     """
     eval_every: Free[Natural] = 0
     """Env steps between evaluations during training. 0: evaluate only at the end."""
     eval_workers: Free[Natural] = 0
-    """Number of workers that only evaluate, so that training continues meanwhile: train starts them in addition to workers;
-    a learner doesn't wait for any, and uses those that `millrace worker --evaluate` starts. The result counts at the next
-    evaluation, or at the end, when the learner waits for it. If no such worker is left by then, the others play. 0: all
-    workers evaluate, and training waits.
+    """Number of workers that only evaluate, so that training continues during evaluations. `millrace train` starts them in
+    addition to workers; `millrace learner` doesn't wait for any, and uses those that `millrace worker --evaluate` starts.
+    The result counts at the next evaluation, or at the end, when the learner waits for it. If no such worker is left by
+    then, the other workers play the episodes. 0: all workers evaluate, and training waits.
     """
     eval_copies: Free[Annotated[int, Meta(ge=1, le=MAX_SEEDS)]] = 4
     """Number of evaluation episodes that a worker plays at the same time, each on its own env copy. The last bits of results
@@ -73,7 +74,7 @@ class Config(RolloutConfig, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     """
     eval_max_steps: Free[Count] = 1_000_000
     """Largest number of env steps of one evaluation. Each episode gets an equal share: with 100 episodes, an episode that
-    reaches 10000 steps is cut. Its return up to that step counts, and the result says how many were cut.
+    reaches 10000 steps is cut. Its return up to that step counts, and the result says how many episodes were cut.
     """
     target_return: Free[float | None] = None
     """Stop as soon as the mean return of an evaluation is at least this. Needs eval_every."""
@@ -84,7 +85,7 @@ class Config(RolloutConfig, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
     self_play: Fixed[Natural] = 0
     """Self-play in an environment of several agents: the policy plays one team, and opponents play the others. They are
-    drawn from this many snapshots of the policy, the newest ones. 0: the policy plays all agents, or meets only opponents.
+    drawn from this many of the policy's newest snapshots. 0: the policy plays all agents, or meets only your own opponents.
     """
     self_play_save_steps: Free[Count] = 20_000
     """Env steps between two snapshots."""
@@ -95,8 +96,8 @@ class Config(RolloutConfig, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     policy meets only them. docs/how-to/self_play.md shows what the factory returns.
     """
     teams: Annotated[Fixed[tuple[str, ...]], Flag("PATTERN ...")] = ()
-    """The teams, all of the same size: for each a pattern of its agents' names, as in "red_*" "blue_*". Default: each agent
-    is a team. In different env copies, the policy plays different teams.
+    """The teams, all of the same size. Give a pattern of its agents' names for each, as in "red_*" "blue_*". Default: each
+    agent is a team. In different env copies, the policy plays different teams.
     """
 
     # ---------------------------------------------------------------------------------------------- the learner's process
@@ -113,13 +114,13 @@ class Config(RolloutConfig, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     """
 
     shards: Fixed[Count] = 1
-    """Number of parts of a batch whose gradients are computed apart, for several learner processes (ppo, a2c, impala,
-    reinforce). torchrun starts the processes; their number must divide this one, and doesn't change the results. Must divide
-    lanes. See docs/how-to/shards.md.
+    """Number of parts of a batch whose gradients are computed separately, for several learner processes (ppo, a2c, impala,
+    reinforce). torchrun starts the processes; their number must divide the number of shards, and doesn't change the
+    results. Must divide lanes. See docs/how-to/shards.md.
     """
     shard_timeout_s: Free[Positive] = 600.0
     """Seconds that a learner process waits for the others in an update, or for rank 0 between updates, such as during a
-    callback; then all end with exit code 75.
+    callback. After that, all of them end with exit code 75.
     """
     insecure_shards: Free[bool] = False
     """Let the learner processes of a run with shards connect over a network, without keys and without encryption. Anyone who
@@ -143,9 +144,9 @@ class Config(RolloutConfig, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     update.
     """
     keep_checkpoints: Free[Count] = 3
-    """Number of checkpoints to keep, the newest ones."""
+    """Number of newest checkpoints to keep."""
     tensorboard: Free[bool] = False
-    """Write the metrics as TensorBoard events too, into the folder tensorboard of the run folder
+    """Also write the metrics as TensorBoard events, to the folder tensorboard of the run folder
     (pip install tensorboard).
     """
     record: Free[str] = ""
@@ -154,9 +155,9 @@ class Config(RolloutConfig, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     """
 
     prior: Fixed[str] = ""
-    """Id of a Minari dataset to learn from too, such as cartpole/ppo-v0 (pip install 'minari[hdf5]' pillow).
-    clone_epochs starts with a policy that acts as it does. Algorithms with a replay buffer draw a share of each minibatch
-    from it, which prior_share sets.
+    """Id of a Minari dataset to learn from in addition, such as cartpole/ppo-v0 (pip install 'minari[hdf5]' pillow). With
+    clone_epochs, the run begins with a policy that imitates the dataset. Algorithms with a replay buffer draw a share of
+    each minibatch from the dataset, which prior_share sets.
     """
 
     def to_toml(self) -> str:

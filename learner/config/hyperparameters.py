@@ -29,7 +29,7 @@ class AlgorithmConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
     rollout_steps: Free[Count] = 128
     """T, the number of steps of each env copy in a rollout."""
     net: Fixed[tuple[Count, ...]] = (64, 64)
-    """Sizes of the hidden layers, of the actor and of the critic alike, or of the Q-network."""
+    """Sizes of the hidden layers of the actor, and likewise of the critic, or of the Q-network."""
     activation: Fixed[Literal["tanh", "relu"]] = "tanh"
     """Activation function of the hidden layers."""
     encoder: Fixed[str | None] = None
@@ -88,7 +88,7 @@ class ActorCriticConfig(RecurrentConfig, frozen=True):
     batch_size: Free[Count] = 64
     """Largest number of rows (steps of one env copy) in a minibatch. With core, whole sequences may exceed it."""
     n_epochs: Free[Count] = 10
-    """Number of epochs: how often an update uses each row."""
+    """Number of epochs: how many times an update uses each row."""
     gae_lambda: Free[Fraction] = 0.95
     """λ of generalized advantage estimation. 1: Monte Carlo return. 0: one-step TD error."""
     normalize_advantage: Free[bool] = True
@@ -139,17 +139,17 @@ class IMPALAConfig(RecurrentConfig, frozen=True):
     optimizer: Fixed[Optimizer] = "rmsprop"
     """Optimizer: rmsprop (α = 0.99) or adam, each with ε = 1e-5."""
     n_epochs: Free[Count] = 1
-    """Number of epochs: how often an update uses each row. V-trace is computed anew in each epoch."""
+    """Number of epochs: how many times an update uses each row. V-trace is recomputed in each epoch."""
     minibatches: Free[Count] = 1
     """Number of minibatches (gradient steps) in an epoch."""
     vtrace_lambda: Free[Fraction] = 1.0
     """λ of V-trace. 1: as in the paper. 0: one step."""
     rho_bar: Free[Positive] = 1.0
     """ρ̄ of V-trace: importance weights of TD errors are clipped to this. The larger it is, the closer the
-    learned values are to those of the newest policy (without clipping: exactly those).
+    learned values are to those of the newest policy (without clipping, they are exactly those).
     """
     c_bar: Free[Positive] = 1.0
-    """c̄ of V-trace: importance weights of traces are clipped to this. It decides how far back the effect of a TD error
+    """c̄ of V-trace: importance weights of traces are clipped to this. It determines how far back the effect of a TD error
     reaches.
     """
 
@@ -241,7 +241,7 @@ class QLearningConfig(OffPolicyConfig, frozen=True):
     replay ratio.
     """
     double: Free[bool] = True
-    """Double Q-learning: the network chooses the next action, and the target network values it."""
+    """Double Q-learning: the network chooses the next action, and the target network evaluates it."""
     dueling: Fixed[bool] = False
     """Dueling network: an action value is the value of the state plus the action's advantage minus the mean advantage."""
     target_every: Free[Count] = 250
@@ -257,8 +257,8 @@ class QLearningConfig(OffPolicyConfig, frozen=True):
     epsilon_schedule: Free[Literal["linear", "exponential"]] = "linear"
     """How ε falls from its initial to its final value."""
     epsilon_steps: Free[Count] = 10_000
-    """Number of env steps, summed over all env copies, over which ε falls. With exponential: until the distance to its final
-    value is 1/e of what it was.
+    """Number of env steps, summed over all env copies, over which ε falls. With exponential, the number after which the
+    distance of ε from its final value is 1/e of what it was.
     """
     max_grad_norm: Free[Positive | None] = None
     """Clip the norm of the gradient to this. none: no clipping."""
@@ -293,7 +293,7 @@ class RainbowConfig(QLearningConfig, frozen=True):
     quantiles: Fixed[Annotated[int, msgspec.Meta(ge=2)]] = 16
     """Number of quantiles of the return that are learned for each action."""
     batch_norm: Fixed[bool] = True
-    """Batch normalization of the inputs and in front of each activation of the hidden layers (Bhatt et al. 2024)."""
+    """Use batch normalization for the inputs and before each activation of the hidden layers (Bhatt et al. 2024)."""
     dueling: Fixed[bool] = True
     """Dueling network: an action value is the value of the state plus the action's advantage minus the mean advantage."""
     target_every: Free[Count] = 1
@@ -329,8 +329,8 @@ class ContinuousConfig(OffPolicyConfig, frozen=True):
     """Replay ratio: gradient steps for each env step after learning_starts. It is exact, whatever the size of the rollouts.
     """
     random_shift: Free[Annotated[int, msgspec.Meta(ge=0, le=64)]] = 4
-    """Largest random shift of images, in pixels, each time they are in a minibatch (DrQ-v2). It has no effect on
-    observations without images.
+    """Largest random shift, in pixels, by which images are moved each time they are in a minibatch (DrQ-v2). It has no
+    effect on observations without images.
     """
 
 
@@ -340,7 +340,7 @@ class SACConfig(ContinuousConfig, frozen=True):
     ent_coef: Fixed[Positive | None] = None
     """Temperature α: the weight of the entropy. none: learned, so that the entropy stays near target_entropy."""
     target_entropy: Free[float | None] = None
-    """The entropy that a learned temperature aims at. none: minus the dimension of the action."""
+    """The entropy at which a learned temperature aims. none: minus the dimension of the action."""
 
 
 class TQCConfig(SACConfig, frozen=True):
@@ -351,7 +351,7 @@ class TQCConfig(SACConfig, frozen=True):
     quantiles: Fixed[Count] = 25
     """Number of quantiles that each critic learns."""
     dropped_quantiles: Free[Natural] = 2
-    """Number of the highest quantiles, for each critic, that targets leave out, so that values are not overestimated."""
+    """How many of the highest quantiles targets leave out for each critic, so that values are not overestimated."""
 
 
 class NormalizedConfig(SACConfig, frozen=True):

@@ -45,7 +45,7 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     must be literals: "my_module:Scale(by=0.5)". The first one is the innermost.
     """
     seat_id: Fixed[bool] = False
-    """In an environment of several agents, tell each agent in its observations which one it is."""
+    """In an environment of several agents, add to each agent's observations which agent it is."""
     critic_keys: Annotated[Fixed[tuple[str, ...]], Flag("KEY ...")] = ()
     """Keys of a Dict observation that only the critic sees: the policy acts without them (ppo, a2c, impala, reinforce). For
     PettingZoo, the key state is the environment's state().
@@ -53,8 +53,8 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     seed: Fixed[Annotated[int, Meta(ge=0)]] = 1
     """Seed of all random numbers of the run."""
     workers: Free[Count | None] = None
-    """Number of worker processes on this machine (train only). none: one for each core, but at most one for each lane. Take
-    more if steps wait for something else than the CPU.
+    """Number of worker processes on this machine (train only). none: one for each core, but at most one for each lane. Use
+    more if env steps wait for something other than the CPU.
     """
     envs: Adaptable[Count] = 8
     """Number of env copies, summed over all workers. Must be a multiple of lanes."""
@@ -66,9 +66,9 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     distributed over the workers. Results depend on lanes and envs, not on the number of workers.
     """
     max_lag: Free[Natural] = 0
-    """Lag of the rollouts: after the first updates, they are collected with weights that are exactly this many versions
-    older than the learner's. 0: workers and learner take turns. Above 0: both run at the same time; impala, dqn, sac and td3
-    are made for that. Runs are reproducible with any lag.
+    """Lag of the rollouts: after the first updates, rollouts are collected with weights that are exactly this many versions
+    older than the learner's. 0: workers and learner take turns. Above 0: both run at the same time, for which impala, dqn,
+    sac and td3 are made. Runs are reproducible with any lag.
     """
     vector: Annotated[Free[str], Flag(f"{{{','.join(KINDS)}}}|NAME")] = "loop"
     """How the env copies of a lane are stepped. loop: one after another. native: by the environment's own vector version.
@@ -90,8 +90,8 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     """
     max_env_copies: Free[Natural] = 0
     """Largest number of env copies of the run on all machines together, for example because of floating licences. It
-    includes those that play evaluations, on as few workers as needed. 0: no limit. To limit one machine, set the variable
-    MILLRACE_COPIES_PER_MACHINE.
+    includes the copies for evaluations, which are then played on as few workers as needed. 0: no limit. To limit one
+    machine, set the variable MILLRACE_COPIES_PER_MACHINE.
     """
     min_workers: Free[Natural] = 0
     """Start training when this many workers have joined. 0: wait for all local workers (train) or one worker
@@ -138,18 +138,18 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     """
     lost_lanes: Free[Literal["continue", "restart"]] = "continue"
     """What happens to running episodes when their worker is lost, when lanes move to another worker, and when the run is
-    resumed. continue: each is replayed on another env copy from its beginning, with the same seed and actions, and continues
-    from there. If the environment is deterministic given its seed, results then don't depend on which workers were lost.
+    resumed. continue: each episode is replayed on another env copy from its beginning, with the same seed and actions, and
+    then continues. If the environment is deterministic given its seed, results then don't depend on which workers were lost.
     restart: new episodes begin.
     """
     replay_limit: Free[Natural] = 1000
-    """Longest episode, in steps, that is replayed so that it can continue. If it is longer, a new one begins. Replaying an
-    episode takes as long as its steps took, without the policy.
+    """Longest episode, in steps, that is replayed so that it can continue. In place of a longer one, a new episode begins.
+    Replaying an episode takes as long as its steps took, without the policy.
     """
     restart_episodes: Free[Natural] = 0
-    """Number of episodes after which each env copy is closed and created again, also in evaluations: for simulators that
-    grow or slow down the longer they run. The new copy continues with the seed and the random numbers of the old one, so
-    results don't change if the environment is deterministic given its seed. 0: never.
+    """Number of episodes after which each env copy is closed and created again, including in evaluations, for simulators
+    that grow or slow down the longer they run. The new copy continues with the seed and the random numbers of the old one,
+    so results don't change if the environment is deterministic given its seed. 0: never.
     """
     no_workers_timeout_s: Free[Positive] = 600.0
     """Write a checkpoint and end the run if there has been no worker for this many seconds. A run whose workers are all
@@ -164,11 +164,11 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     wrote (an `OwnPolicy`, an opponent, an encoder), takes longer than this many seconds. 0: never.
     """
     max_env_failures: Free[Natural] = 3
-    """Two counts of failures end the run. In a row: more than this, or more than 10, in one lane without a rollout in
-    between (a failure after env steps counts as a quarter). Within an hour: more failures after env steps than this × (1 +
-    env copies × h + w / 30), where h is the hours since the learner began, at most 1, and w the seconds that the failed
-    workers had worked before. A failure is an exception or an unusable result of the environment or of an `OwnPolicy`, or a
-    worker process that ends unasked: the environment may have ended it.
+    """How many failures the run survives. Either of two counts ends it. In a row: more than this, or more than 10, in one
+    lane without a rollout in between (a failure after env steps counts as a quarter). Within an hour: more failures after
+    env steps than this × (1 + env copies × h + w / 30), where h is the hours since the learner began, at most 1, and w the
+    seconds that the failed workers had worked before. A failure is an exception or an unusable result of the environment or
+    of an `OwnPolicy`, or a worker process that ends unexpectedly, because the environment may have ended it.
     """
 
     def all_wrappers(self, given: Sequence[WrapperLike] | None = None) -> list[WrapperLike]:
