@@ -20,7 +20,7 @@ class RolloutKeywords(TypedDict, total=False):
     eval_env_kwargs: Mapping[str, bool | int | float | str]
     """Keyword arguments for env copies of evaluations, in addition to env_kwargs; they override those of the same name."""
     seat_id: bool
-    """In an environment of several agents, tell each agent in its observations which one it is."""
+    """In an environment of several agents, add to each agent's observations which agent it is."""
     critic_keys: Sequence[str]
     """Keys of a Dict observation that only the critic sees: the policy acts without them (ppo, a2c, impala, reinforce).
     For PettingZoo, the key state is the environment's state().
@@ -29,7 +29,7 @@ class RolloutKeywords(TypedDict, total=False):
     """Seed of all random numbers of the run."""
     workers: int | None
     """Number of worker processes on this machine (train only). none: one for each core, but at most one for each lane.
-    Take more if steps wait for something else than the CPU.
+    Use more if env steps wait for something other than the CPU.
     """
     envs: int
     """Number of env copies, summed over all workers. Must be a multiple of lanes."""
@@ -38,9 +38,9 @@ class RolloutKeywords(TypedDict, total=False):
     distributed over the workers. Results depend on lanes and envs, not on the number of workers.
     """
     max_lag: int
-    """Lag of the rollouts: after the first updates, they are collected with weights that are exactly this many versions
-    older than the learner's. 0: workers and learner take turns. Above 0: both run at the same time; impala, dqn, sac
-    and td3 are made for that. Runs are reproducible with any lag.
+    """Lag of the rollouts: after the first updates, rollouts are collected with weights that are exactly this many
+    versions older than the learner's. 0: workers and learner take turns. Above 0: both run at the same time, for which
+    impala, dqn, sac and td3 are made. Runs are reproducible with any lag.
     """
     vector: str
     """How the env copies of a lane are stepped. loop: one after another. native: by the environment's own vector version.
@@ -62,8 +62,8 @@ class RolloutKeywords(TypedDict, total=False):
     """
     max_env_copies: int
     """Largest number of env copies of the run on all machines together, for example because of floating licences. It
-    includes those that play evaluations, on as few workers as needed. 0: no limit. To limit one machine, set the
-    variable MILLRACE_COPIES_PER_MACHINE.
+    includes the copies for evaluations, which are then played on as few workers as needed. 0: no limit. To limit one
+    machine, set the variable MILLRACE_COPIES_PER_MACHINE.
     """
     min_workers: int
     """Start training when this many workers have joined. 0: wait for all local workers (train) or one worker (learner)."""
@@ -104,18 +104,18 @@ class RolloutKeywords(TypedDict, total=False):
     """
     lost_lanes: Literal["continue", "restart"]
     """What happens to running episodes when their worker is lost, when lanes move to another worker, and when the run is
-    resumed. continue: each is replayed on another env copy from its beginning, with the same seed and actions, and
-    continues from there. If the environment is deterministic given its seed, results then don't depend on which
-    workers were lost. restart: new episodes begin.
+    resumed. continue: each episode is replayed on another env copy from its beginning, with the same seed and actions,
+    and then continues. If the environment is deterministic given its seed, results then don't depend on which workers
+    were lost. restart: new episodes begin.
     """
     replay_limit: int
-    """Longest episode, in steps, that is replayed so that it can continue. If it is longer, a new one begins. Replaying
-    an episode takes as long as its steps took, without the policy.
+    """Longest episode, in steps, that is replayed so that it can continue. In place of a longer one, a new episode
+    begins. Replaying an episode takes as long as its steps took, without the policy.
     """
     restart_episodes: int
-    """Number of episodes after which each env copy is closed and created again, also in evaluations: for simulators that
-    grow or slow down the longer they run. The new copy continues with the seed and the random numbers of the old one,
-    so results don't change if the environment is deterministic given its seed. 0: never.
+    """Number of episodes after which each env copy is closed and created again, including in evaluations, for simulators
+    that grow or slow down the longer they run. The new copy continues with the seed and the random numbers of the old
+    one, so results don't change if the environment is deterministic given its seed. 0: never.
     """
     no_workers_timeout_s: float
     """Write a checkpoint and end the run if there has been no worker for this many seconds. A run whose workers are all
@@ -130,11 +130,12 @@ class RolloutKeywords(TypedDict, total=False):
     you wrote (an `OwnPolicy`, an opponent, an encoder), takes longer than this many seconds. 0: never.
     """
     max_env_failures: int
-    """Two counts of failures end the run. In a row: more than this, or more than 10, in one lane without a rollout in
-    between (a failure after env steps counts as a quarter). Within an hour: more failures after env steps than this ×
-    (1 + env copies × h + w / 30), where h is the hours since the learner began, at most 1, and w the seconds that the
-    failed workers had worked before. A failure is an exception or an unusable result of the environment or of an
-    `OwnPolicy`, or a worker process that ends unasked: the environment may have ended it.
+    """How many failures the run survives. Either of two counts ends it. In a row: more than this, or more than 10, in one
+    lane without a rollout in between (a failure after env steps counts as a quarter). Within an hour: more failures
+    after env steps than this × (1 + env copies × h + w / 30), where h is the hours since the learner began, at most 1,
+    and w the seconds that the failed workers had worked before. A failure is an exception or an unusable result of the
+    environment or of an `OwnPolicy`, or a worker process that ends unexpectedly, because the environment may have
+    ended it.
     """
 
 
@@ -150,13 +151,14 @@ class TrainKeywords(RolloutKeywords, total=False):
     start_from: str | PathLike[str]
     """Start from the policy of this run folder in place of random weights, with its statistics of observations and
     rewards. A folder with only policy.json and policy.safetensors will do. All other settings are those of the new
-    run, and schedules start anew. A resumed run doesn't read the folder again: see docs/how-to/resume.md.
+    run, and schedules start from the beginning. A resumed run doesn't read the folder again: see
+    docs/how-to/resume.md.
     """
     from_parts: Literal["auto", "policy", "best", "critic", "all"]
-    """What `--from` takes. policy: the newest policy and the statistics. best: the policy of the best evaluation. critic:
-    also the critic, the target networks and the temperature. all: also the optimizers. A replay buffer is never taken.
-    auto: critic with sac and td3 if the run has a checkpoint, because their actors follow the critic at once; else
-    policy.
+    """What `--from` takes over. policy: the newest policy and the statistics. best: the policy of the best evaluation.
+    critic: also the critic, the target networks and the temperature. all: also the optimizers. A replay buffer is
+    never taken over. auto: critic with sac and td3 if the run has a checkpoint, because their actors immediately
+    follow the critic; otherwise policy.
     """
     device: Literal["auto", "cpu", "cuda"]
     """Device of the learner. auto: cuda if PyTorch finds a GPU, else cpu."""
@@ -164,15 +166,15 @@ class TrainKeywords(RolloutKeywords, total=False):
     """Folder in which the run folder is made."""
     eval_episodes: int | None
     """Number of greedy episodes in an evaluation. none: 100. Without eval_every, the evaluation at the end has fewer, but
-    at least 10, if 100 could take more than three quarters of the env steps of training.
+    at least 10, if 100 episodes could take more than three quarters of the env steps of training.
     """
     eval_every: int | float
     """Env steps between evaluations during training. 0: evaluate only at the end."""
     eval_workers: int
-    """Number of workers that only evaluate, so that training continues meanwhile: train starts them in addition to
-    workers; a learner doesn't wait for any, and uses those that `millrace worker --evaluate` starts. The result counts
-    at the next evaluation, or at the end, when the learner waits for it. If no such worker is left by then, the others
-    play. 0: all workers evaluate, and training waits.
+    """Number of workers that only evaluate, so that training continues during evaluations. `millrace train` starts them
+    in addition to workers; `millrace learner` doesn't wait for any, and uses those that `millrace worker --evaluate`
+    starts. The result counts at the next evaluation, or at the end, when the learner waits for it. If no such worker
+    is left by then, the other workers play the episodes. 0: all workers evaluate, and training waits.
     """
     eval_copies: int
     """Number of evaluation episodes that a worker plays at the same time, each on its own env copy. The last bits of
@@ -180,7 +182,7 @@ class TrainKeywords(RolloutKeywords, total=False):
     """
     eval_max_steps: int | float
     """Largest number of env steps of one evaluation. Each episode gets an equal share: with 100 episodes, an episode that
-    reaches 10000 steps is cut. Its return up to that step counts, and the result says how many were cut.
+    reaches 10000 steps is cut. Its return up to that step counts, and the result says how many episodes were cut.
     """
     target_return: float | None
     """Stop as soon as the mean return of an evaluation is at least this. Needs eval_every."""
@@ -188,7 +190,7 @@ class TrainKeywords(RolloutKeywords, total=False):
     """Stop as soon as the mean return of the last 100 training episodes is at least this."""
     self_play: int
     """Self-play in an environment of several agents: the policy plays one team, and opponents play the others. They are
-    drawn from this many snapshots of the policy, the newest ones. 0: the policy plays all agents, or meets only
+    drawn from this many of the policy's newest snapshots. 0: the policy plays all agents, or meets only your own
     opponents.
     """
     self_play_save_steps: int
@@ -200,8 +202,8 @@ class TrainKeywords(RolloutKeywords, total=False):
     the policy meets only them. docs/how-to/self_play.md shows what the factory returns.
     """
     teams: Sequence[str]
-    """The teams, all of the same size: for each a pattern of its agents' names, as in "red_*" "blue_*". Default: each
-    agent is a team. In different env copies, the policy plays different teams.
+    """The teams, all of the same size. Give a pattern of its agents' names for each, as in "red_*" "blue_*". Default:
+    each agent is a team. In different env copies, the policy plays different teams.
     """
     inference: Literal["workers", "learner"]
     """Where the policy acts. workers: in each worker. learner: in a thread of the learner's process, for all env copies
@@ -215,13 +217,13 @@ class TrainKeywords(RolloutKeywords, total=False):
     last bits of results.
     """
     shards: int
-    """Number of parts of a batch whose gradients are computed apart, for several learner processes (ppo, a2c, impala,
-    reinforce). torchrun starts the processes; their number must divide this one, and doesn't change the results. Must
-    divide lanes. See docs/how-to/shards.md.
+    """Number of parts of a batch whose gradients are computed separately, for several learner processes (ppo, a2c,
+    impala, reinforce). torchrun starts the processes; their number must divide the number of shards, and doesn't
+    change the results. Must divide lanes. See docs/how-to/shards.md.
     """
     shard_timeout_s: float
     """Seconds that a learner process waits for the others in an update, or for rank 0 between updates, such as during a
-    callback; then all end with exit code 75.
+    callback. After that, all of them end with exit code 75.
     """
     insecure_shards: bool
     """Let the learner processes of a run with shards connect over a network, without keys and without encryption. Anyone
@@ -236,9 +238,9 @@ class TrainKeywords(RolloutKeywords, total=False):
     update.
     """
     keep_checkpoints: int
-    """Number of checkpoints to keep, the newest ones."""
+    """Number of newest checkpoints to keep."""
     tensorboard: bool
-    """Write the metrics as TensorBoard events too, into the folder tensorboard of the run folder (pip install
+    """Also write the metrics as TensorBoard events, to the folder tensorboard of the run folder (pip install
     tensorboard).
     """
     record: str
@@ -246,16 +248,16 @@ class TrainKeywords(RolloutKeywords, total=False):
     'minari[hdf5]' pillow).
     """
     prior: str
-    """Id of a Minari dataset to learn from too, such as cartpole/ppo-v0 (pip install 'minari[hdf5]' pillow). clone_epochs
-    starts with a policy that acts as it does. Algorithms with a replay buffer draw a share of each minibatch from it,
-    which prior_share sets.
+    """Id of a Minari dataset to learn from in addition, such as cartpole/ppo-v0 (pip install 'minari[hdf5]' pillow). With
+    clone_epochs, the run begins with a policy that imitates the dataset. Algorithms with a replay buffer draw a share
+    of each minibatch from the dataset, which prior_share sets.
     """
     rollout_steps: int
     """ppo, a2c, dqn, rainbow, impala, sac, td3, tqc, crossq, xqc: T, the number of steps of each env copy in a rollout.
     reinforce: T, the steps of each env copy in a rollout. Must be longer than any episode.
     """
     net: Sequence[int]
-    """ppo, a2c, dqn, impala, reinforce: Sizes of the hidden layers, of the actor and of the critic alike, or of the
+    """ppo, a2c, dqn, impala, reinforce: Sizes of the hidden layers of the actor, and likewise of the critic, or of the
     Q-network.
     rainbow: Sizes of the hidden layers of the Q-network.
     sac, td3, tqc: Sizes of the hidden layers: of the actor and of each critic.
@@ -330,8 +332,8 @@ class TrainKeywords(RolloutKeywords, total=False):
     make up this number, but at least 16.
     """
     n_epochs: int
-    """ppo: Number of epochs: how often an update uses each row.
-    impala: Number of epochs: how often an update uses each row. V-trace is computed anew in each epoch.
+    """ppo: Number of epochs: how many times an update uses each row.
+    impala: Number of epochs: how many times an update uses each row. V-trace is recomputed in each epoch.
     """
     gae_lambda: float
     """ppo, a2c: λ of generalized advantage estimation. 1: Monte Carlo return. 0: one-step TD error."""
@@ -407,7 +409,7 @@ class TrainKeywords(RolloutKeywords, total=False):
     so this sets the replay ratio.
     """
     double: bool
-    """dqn, rainbow: Double Q-learning: the network chooses the next action, and the target network values it."""
+    """dqn, rainbow: Double Q-learning: the network chooses the next action, and the target network evaluates it."""
     dueling: bool
     """dqn, rainbow: Dueling network: an action value is the value of the state plus the action's advantage minus the mean
     advantage.
@@ -421,8 +423,8 @@ class TrainKeywords(RolloutKeywords, total=False):
     epsilon_schedule: Literal["linear", "exponential"]
     """dqn, rainbow: How ε falls from its initial to its final value."""
     epsilon_steps: int | float
-    """dqn, rainbow: Number of env steps, summed over all env copies, over which ε falls. With exponential: until the
-    distance to its final value is 1/e of what it was.
+    """dqn, rainbow: Number of env steps, summed over all env copies, over which ε falls. With exponential, the number
+    after which the distance of ε from its final value is 1/e of what it was.
     """
     max_grad_value: float | None
     """dqn, rainbow: Clip each entry of the gradient to ± this, before its norm is clipped. none: no clipping."""
@@ -433,7 +435,7 @@ class TrainKeywords(RolloutKeywords, total=False):
     tqc: Number of quantiles that each critic learns.
     """
     batch_norm: bool
-    """rainbow: Batch normalization of the inputs and in front of each activation of the hidden layers (Bhatt et al.
+    """rainbow: Use batch normalization for the inputs and before each activation of the hidden layers (Bhatt et al.
     2024).
     """
     minibatches: int
@@ -442,11 +444,11 @@ class TrainKeywords(RolloutKeywords, total=False):
     """impala: λ of V-trace. 1: as in the paper. 0: one step."""
     rho_bar: float
     """impala: ρ̄ of V-trace: importance weights of TD errors are clipped to this. The larger it is, the closer the
-    learned values are to those of the newest policy (without clipping: exactly those).
+    learned values are to those of the newest policy (without clipping, they are exactly those).
     """
     c_bar: float
-    """impala: c̄ of V-trace: importance weights of traces are clipped to this. It decides how far back the effect of a TD
-    error reaches.
+    """impala: c̄ of V-trace: importance weights of traces are clipped to this. It determines how far back the effect of a
+    TD error reaches.
     """
     baseline: bool
     """reinforce: Subtract the value that the critic predicts from the return."""
@@ -457,11 +459,11 @@ class TrainKeywords(RolloutKeywords, total=False):
     whatever the size of the rollouts.
     """
     random_shift: int
-    """sac, td3, tqc, crossq, xqc: Largest random shift of images, in pixels, each time they are in a minibatch (DrQ-v2).
-    It has no effect on observations without images.
+    """sac, td3, tqc, crossq, xqc: Largest random shift, in pixels, by which images are moved each time they are in a
+    minibatch (DrQ-v2). It has no effect on observations without images.
     """
     target_entropy: float | None
-    """sac, tqc, crossq, xqc: The entropy that a learned temperature aims at. none: minus the dimension of the action."""
+    """sac, tqc, crossq, xqc: The entropy at which a learned temperature aims. none: minus the dimension of the action."""
     exploration_noise: float
     """td3: Standard deviation of the noise that workers add to actions, which are in [-1, 1]."""
     policy_delay: int
@@ -475,9 +477,7 @@ class TrainKeywords(RolloutKeywords, total=False):
     critics: int
     """tqc: Number of critics."""
     dropped_quantiles: int
-    """tqc: Number of the highest quantiles, for each critic, that targets leave out, so that values are not
-    overestimated.
-    """
+    """tqc: How many of the highest quantiles targets leave out for each critic, so that values are not overestimated."""
     critic_net: Sequence[int]
     """crossq, xqc: Sizes of the hidden layers of each critic."""
     renormalize_after: int

@@ -69,7 +69,7 @@ class Normalizer:
         return self._observations.buffers()
 
     def update(self, batch: Batch) -> None:
-        """Count the observations of a batch. Call it once for each batch, after `normalized`."""
+        """Count the observations of a batch. Call this once for each batch, after `normalized`."""
         self._observations.update(self._features(batch)[:-1], batch.valid)
 
     def normalized(self, batch: Batch) -> Floats:

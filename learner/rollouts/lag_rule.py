@@ -20,10 +20,10 @@ class Rounds:
         """L"""
         self.next = next_round
         """the round of the next update"""
+        # The versions in rounds that were open when the run was interrupted and have not been opened again, by round.
         self._saved = {number: versions[number] for number in sorted(versions) if number <= next_round + max_lag}
-        # by round, the versions in rounds that were open when the run was interrupted, and have not been opened again
+        # The versions in open rounds, which may be collected and have not been taken, by round.
         self._versions: dict[int, int] = {}
-        # by round, the versions in rounds that are open: they may be collected, and were not taken
 
     def begin(self, newest: int) -> range:
         """Begin the next update, with `newest` as the newest version. Returns the rounds that this opens.

@@ -70,7 +70,7 @@ class LoggedLine(msgspec.Struct, frozen=True):
     time: Annotated[datetime, Meta(tz=True)]
     level: str
     message: str
-    """Lines after the first are a traceback."""
+    """The text for people. Lines after the first are a traceback."""
 
 
 @contextmanager

@@ -44,7 +44,7 @@ class Linear(NamedTuple):
 
     @staticmethod
     def stacked(names: Sequence[str], values: Mapping[str, Array], grads: Mapping[str, Array]) -> Linear:
-        """The layers with these names, one of each of one or two networks, as one `Linear`."""
+        """Stack the layers with these names, each of which belongs to another network, into one `Linear`."""
         weight, bias, weight_grad, bias_grad = (
             _stacked_view([of[f"{name}.{kind}"] for name in names]) for of in (values, grads) for kind in ("weight", "bias")
         )
