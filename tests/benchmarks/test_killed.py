@@ -28,14 +28,14 @@ def test_a_killed_run_has_the_policy_of_an_undisturbed_one(tmp_path: Path) -> No
     policies = set()
     for faults in (0, 4):
         folder = tmp_path / f"{faults} faults"
-        command = [
-            *(sys.executable, "-m", "benchmarks.killed", str(folder), "--faults", str(faults), "--victims", "worker", "learner"),
-            *("--", sys.executable, "-m", "millrace", "train", "CartPole-v1", "--steps", "40000", "--seed", "3", "--workers", "2"),
-            *("--lanes", "4", "--envs", "8", "--checkpoint-every-s", "0.2", "--eval-episodes", "1", "--log-json"),
-        ]  # fmt: skip
+        python = [sys.executable, "-m"]
+        flags = f"--faults {faults} --victims worker learner --"
+        run = "CartPole-v1 --steps 40000 --seed 3 --workers 2 --lanes 4 --envs 8 --checkpoint-every-s 0.2 --eval-episodes 1"
+        killed = [*python, "benchmarks.killed", str(folder), *flags.split()]
+        command = [*killed, *python, "millrace", "train", *run.split(), "--log-json"]
         subprocess.run(command, check=True, timeout=240)
         happened = [json.loads(line) for line in (folder / FAULTS).read_text().splitlines()]
         assert len(happened) == faults
-        (run,) = {path.parent for path in folder.glob("*/summary.json")}
-        policies.add(policy_of(run))
+        (summary,) = folder.glob("*/summary.json")
+        policies.add(policy_of(summary.parent))
     assert len(policies) == 1
