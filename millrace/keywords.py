@@ -206,8 +206,8 @@ class TrainKeywords(RolloutKeywords, total=False):
     each agent is a team. In different env copies, the policy plays different teams.
     """
     inference: Literal["workers", "learner"]
-    """Where the policy acts. workers: in each worker. learner: in a thread of the learner's process, for all env copies
-    at once; workers then only step the environments.
+    """Where the policy acts. workers: in each worker. learner: in a thread of the learner's process, for half of the env
+    copies while the other half steps; workers then only step the environments.
     """
     torch_threads: int | None
     """Number of PyTorch threads in the learner. none: chosen when the run starts, and kept in its config.toml. The choice

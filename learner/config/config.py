@@ -103,8 +103,8 @@ class Config(RolloutConfig, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     # ---------------------------------------------------------------------------------------------- the learner's process
 
     inference: Free[Literal["workers", "learner"]] = "workers"
-    """Where the policy acts. workers: in each worker. learner: in a thread of the learner's process, for all env copies at
-    once; workers then only step the environments.
+    """Where the policy acts. workers: in each worker. learner: in a thread of the learner's process, for half of the env
+    copies while the other half steps; workers then only step the environments.
     """
     torch_threads: Free[Count | None] = None
     """Number of PyTorch threads in the learner. none: chosen when the run starts, and kept in its config.toml. The choice is

@@ -1,4 +1,4 @@
-"""A pool whose workers only step env copies: the policy acts in this process, for all copies at once.
+"""A pool whose workers only step env copies: the policy acts in this process, for half of the copies while the rest steps.
 
 The learner collects from a single worker, which is a thread of this process. The env copies of this worker belong to a
 vector environment, whose workers are processes. So tickets, ledger, rows, checkpoints and errors work as in every run, and a
