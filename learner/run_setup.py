@@ -160,7 +160,7 @@ def named_environment(config: Config) -> EnvSpec:
 def known_environment(config: Config, env: EnvSpec, resume: Resumption | None, lobby: Lobby) -> KnownEnvironment:
     """Let a worker in the lobby describe the environment. Meanwhile, another thread imports PyTorch.
 
-    For a run to `resume`, only an environment with the spaces of the run's policy is accepted. Raises `UsageError` if there
+    If `resume` is given, only an environment with the spaces of that run's policy is accepted. Raises `UsageError` if there
     is no such environment, or if no policy can use it; `RunError` if no worker describes it in time; and
     `KeyboardInterrupt` if the user stops the program.
     """

@@ -19,7 +19,7 @@ from pathlib import Path
 FAULTHANDLER_HEADER = "Timeout ("  # the beginning of faulthandler's output
 LONGEST_S = 1e9  # longest time for the timer; faulthandler doesn't accept infinity
 OURS = f"{Path(__file__).parents[1]}/"
-LIBRARIES = ("<", f"{sysconfig.get_path('stdlib')}/", OURS)  # beginnings of paths of code that isn't the user's
+LIBRARIES = ("<", f"{sysconfig.get_path('stdlib')}/", OURS)  # path prefixes of code that isn't the user's
 INSTALLED = "-packages/"  # part of the paths of site-packages, and of Debian's dist-packages
 
 

@@ -216,7 +216,7 @@ class SendRecv:
         return self._sent.take_some(lanes)
 
     def look(self, timeout_s: float) -> None:
-        """Record the results and losses of lanes that are under way. Never waits.
+        """Record which of the lanes under way have returned a result or were lost. Never waits.
 
         Raises `EnvironmentFailed` and `NoWorkers`.
         """

@@ -13,7 +13,8 @@ from contextlib import ExitStack
 
 from millrace.protocol.errors import UsageError, safe_repr
 
-# If the path of the folder for temporary files has more bytes, /tmp is used: the path of a socket file has at most 107.
+# Most bytes in the path of the temporary folder. If it is longer, /tmp is used, because the path of a socket file can have at
+# most 107 bytes.
 LONGEST_FOLDER = 80
 
 

@@ -96,7 +96,7 @@ def overheads(config: Config, env: StoodFor) -> Overheads:
     many_short = _round(config, env, _Size(COPIES, COPIES, SHORT))
     one_lane = _round(config, env, _Size(1, COPIES, LONG))
     awake = _round(config, env._replace(wait_s=0.0), _Size(1, 1, SHORT))
-    # A worker's CPU time is base + l · per_lane + T · (row_s + l · lane_row_s + n · copy_row_s).
+    # For l lanes, n copies and T steps, a worker's CPU time is base + l · per_lane + T · (row_s + l · lane_row_s + n · copy_row_s).
     row_of_one_s = _slope(one_long.worker_s - one_short.worker_s, LONG - SHORT)
     row_of_many_s = _slope(many_long.worker_s - many_short.worker_s, LONG - SHORT)
     base_s = max(0.0, one_long.worker_s - LONG * row_of_one_s)
@@ -104,7 +104,7 @@ def overheads(config: Config, env: StoodFor) -> Overheads:
     copy_row_s = _slope(row_of_one_lane_s - row_of_one_s, COPIES - 1)
     lane_row_s = _slope(row_of_many_s - row_of_one_lane_s, COPIES - 1)
     sending_s = _slope(many_long.worker_s - LONG * row_of_many_s - base_s, COPIES - 1)
-    # The learner's CPU time is base + l · per_lane + n · T · received_s.
+    # The learner's CPU time is base + l · taken_in_s + n · T · received_s.
     received_s = _slope(many_long.learner_s - many_short.learner_s, COPIES * (LONG - SHORT))
     taken_in_s = _slope(many_short.learner_s - one_short.learner_s - (COPIES - 1) * SHORT * received_s, COPIES - 1)
     on_the_way_s = max(0.0, awake.wall_s - awake.worker_s - awake.learner_s)

@@ -166,7 +166,7 @@ class _SteppedCopies(NamedTuple):
 
 
 def _session(env: ProbedEnv, workers: int, seconds: float, give_up_at_s: float, each: int = 1) -> _SteppedCopies:
-    """Step copies for some seconds, `each` of them in each worker.
+    """Step copies for `seconds`, with as many as `each` in every worker.
 
     Raises `UserFacingError` if there is only one copy and it can't be made.
     """

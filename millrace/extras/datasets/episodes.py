@@ -128,7 +128,9 @@ class EpisodeAssembler:
         valid = rollout.valid[:, n]
         ended = rollout.terminated[:, n] | rollout.truncated[:, n]
         for t in np.flatnonzero(ended | ~valid).tolist():
-            if not valid[t]:  # the next row begins an episode; if t is 0, `running` already says whether it does
+            if not valid[
+                t
+            ]:  # the next row begins an episode, unless t is 0: then `running[n]` already says whether one begins
                 lane.running[n] = [] if t else lane.running[n]
                 start = t + 1
                 continue
