@@ -37,7 +37,7 @@ class ShownRun:
     """Shows the progress of a run, and prints how it ended."""
 
     def __init__(self, argv: list[str], new: Config | None = None, command: str = "train") -> None:
-        """`new`: the settings of a new run. Where they come from is shown before the first report. None if the run is resumed.
+        """`new`: the settings of a new run; None if it is resumed. Where they come from is shown before the first report.
 
         `command`: the millrace command that trains the run, and can resume it.
         """

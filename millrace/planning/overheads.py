@@ -96,7 +96,8 @@ def overheads(config: Config, env: StoodFor) -> Overheads:
     many_short = _round(config, env, _Size(COPIES, COPIES, SHORT))
     one_lane = _round(config, env, _Size(1, COPIES, LONG))
     awake = _round(config, env._replace(wait_s=0.0), _Size(1, 1, SHORT))
-    # For l lanes, n copies and T steps, a worker's CPU time is base + l · per_lane + T · (row_s + l · lane_row_s + n · copy_row_s).
+    # For l lanes, n copies and T steps, a worker's CPU time is
+    # base + l · per_lane + T · (row_s + l · lane_row_s + n · copy_row_s).
     row_of_one_s = _slope(one_long.worker_s - one_short.worker_s, LONG - SHORT)
     row_of_many_s = _slope(many_long.worker_s - many_short.worker_s, LONG - SHORT)
     base_s = max(0.0, one_long.worker_s - LONG * row_of_one_s)
