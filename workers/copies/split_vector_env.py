@@ -84,7 +84,7 @@ class SplitVectorEnv:
         self._result: StepResult | None = None
         self._no_workers: NoWorkers | None = None
         self._assigned: dict[tuple[int, str], tuple[slice, bytes]] = {}  # attributes that were set, by first copy and name
-        self._lost = False  # whether copies were lost, so that their replacements need the attributes
+        self._missing: set[tuple[int, str]] = set()  # those of them that replacements of lost copies may lack
 
     def open_lane(self, run: RunSpec, lane: int, pulse: Pulse) -> EnvCopies:
         """The copies of this lane: `OpenEnvCopies` of a `Collector`."""
@@ -146,8 +146,8 @@ class SplitVectorEnv:
         """Order these lanes, which have these copies, to step with their actions."""
         assert self._some is not None
         begin_step = self._some.begin_step
-        if self._lost:
-            self._assign_again(pulse)
+        if self._missing:
+            self._assign_again(set(copies), pulse)
         if self._actions is None:
             self._actions = np.resize(actions, (self.env.num_envs, *actions.shape[1:]))  # any actions of the space
         padded = self._actions
@@ -163,7 +163,8 @@ class SplitVectorEnv:
     def _read_result(self, returned: Any, copies: slice | list[int]) -> StepResult:
         """What a step of these copies returned. It has a row for each copy of the vector environment."""
         observation, reward, terminated, truncated, infos = returned
-        self._lost |= bool(self._assigned) and "worker_lost" in infos
+        if self._assigned and "worker_lost" in infos:
+            self._missing.update(self._assigned)
         facts: Facts = {}
         if self.facts:
             ended = np.zeros(self.env.num_envs, bool)
@@ -211,11 +212,11 @@ class SplitVectorEnv:
 
     def assign(self, copies: slice, name: str, packed: bytes, pulse: Pulse) -> None:
         """Set an attribute of these copies, and of later replacements for lost ones."""
+        self._assigned[copies.start, name] = copies, packed
         try:
             self._wait(lambda: self._assign_now(copies, name, packed), pulse)
         except WorkerLost:
-            self._lost = True
-        self._assigned[copies.start, name] = copies, packed
+            self._missing.update(self._assigned)
 
     def _assign_now(self, copies: slice, name: str, packed: bytes) -> None:
         chosen = range(copies.start, copies.stop)
@@ -237,14 +238,20 @@ class SplitVectorEnv:
         except AttributeError:
             return False
 
-    def _assign_again(self, pulse: Pulse) -> None:
-        """Set the attributes of copies that replace lost ones. If a worker is lost meanwhile, the next step tries again."""
-        self._lost = False
-        for (_, name), (copies, packed) in self._assigned.items():
+    def _assign_again(self, stepped: set[int], pulse: Pulse) -> None:
+        """Set the attributes that these copies may lack, before they are stepped. Others may be stepping, and come later.
+
+        If a worker is lost meanwhile, the next step tries again.
+        """
+        for key in sorted(self._missing):
+            copies, packed = self._assigned[key]
+            if stepped.isdisjoint(range(copies.start, copies.stop)):
+                continue
+            self._missing.discard(key)
             try:
-                self._wait(partial(self._assign_now, copies, name, packed), pulse)
+                self._wait(partial(self._assign_now, copies, key[1], packed), pulse)
             except WorkerLost:
-                self._lost = True
+                self._missing.update(self._assigned)
 
     def raise_if_no_workers(self) -> None:
         """Raise `NoWorkers` once, if a wait ended because no worker was left."""

@@ -13,15 +13,19 @@ import pytest
 from gymnasium.vector import SyncVectorEnv
 
 from millrace.extras.datasets.episodes import EpisodeAssembler
+from millrace.learner.vector_env.settings import VectorEnvSettings
 from millrace.protocol.arrays import Array
+from millrace.protocol.envs.env_actions import action_converter_of
 from millrace.protocol.errors import NoWorkers
 from millrace.protocol.policy.layout import acting_size, buffer_size
 from millrace.protocol.policy.torch_policy import TorchPolicy
 from millrace.protocol.specs import RunSpec
+from millrace.protocol.wire.plain_values import pack
 from millrace.workers.collect.collector import Collector
 from millrace.workers.conversation.held import Assignment
 from millrace.workers.copies.env_loop import Pulse
 from millrace.workers.copies.split_vector_env import SplitVectorEnv
+from tests.support.in_process.any_order import any_order
 from tests.support.in_process.collectors import TOY, bits, collect, no_pulse, random_collector, random_policy, run_of
 
 LANES = 3
@@ -237,3 +241,27 @@ def test_a_dropped_rollout_abandons_the_steps_under_way() -> None:
         collect(Collector(run, random_policy(run.policy), split.open_lane, split), run, lanes=range(LANES))
     assert abandoned
     env.close()
+
+
+@pytest.mark.parametrize("shared", [True, False], ids=["shared memory", "messages"])
+def test_replacements_of_lost_copies_get_the_attributes_when_their_part_is_stepped(shared: bool) -> None:
+    """A part may still step when copies of another part are lost."""
+    run = run_of(f"{TOY}Informs-v0", N=1)
+    with any_order(VectorEnvSettings(f"{TOY}Informs-v0", LANES, lanes=LANES), LANES, shared=shared) as (env, link):
+        split = SplitVectorEnv(env, LANES, some=env)
+        for n in range(LANES):
+            lane = split.open_lane(run, n, no_pulse)
+            lane.reset([n], no_pulse)
+            lane.assign("level", pack(5), no_pulse)
+        chosen = np.zeros((LANES, 1, *run.policy.action.shape), run.policy.action.stored_dtype)
+        actions = action_converter_of(run.policy)(chosen)
+        split.begin([0], actions[:1], no_pulse)
+        split.begin([1, 2], actions[1:], no_pulse)
+        link.frozen = {"w0"}
+        link.leave("w0")
+        split.end([0], no_pulse)
+        assert split.result(slice(0, 1)).truncated.all()
+        split.begin([0], actions[:1], no_pulse)
+        split.end([1, 2], no_pulse)
+        split.end([0], no_pulse)
+        assert env.get_attr("level") == (5,) * LANES
