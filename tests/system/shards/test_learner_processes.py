@@ -18,8 +18,9 @@ from tests.system.stage.processes import free_port, wait_for
 
 WITHIN_S = 120.0
 RUNS = "runs"
+CODE = "tests.support.users_code"
 FLAGS = (
-    *("train", "CartPole-v1", "--shards", "2", "--lanes", "2", "--envs", "4", "--workers", "1", "--rollout-steps", "64"),
+    *("--shards", "2", "--lanes", "2", "--envs", "4", "--workers", "1", "--rollout-steps", "64"),
     *("--torch-threads", "1", "--eval-episodes", "2", "--checkpoint-every-s", "0"),
 )
 OTHER_VERSIONS = """
@@ -60,6 +61,7 @@ def ranks(
     folder: Path,
     count: int,
     *flags: str,
+    env: str = "CartPole-v1",
     steps: int = 4096,
     of_rank: Mapping[int, Sequence[str]] = {},
     program: Mapping[int, Sequence[str]] = {},
@@ -72,7 +74,7 @@ def ranks(
     try:
         for rank in range(count):
             place = {"RANK": rank, "WORLD_SIZE": count, "MASTER_ADDR": "localhost", "MASTER_PORT": port}
-            command = [sys.executable, *program.get(rank, ("-m", "millrace")), *FLAGS, "--steps", str(steps)]
+            command = [sys.executable, *program.get(rank, ("-m", "millrace")), "train", env, *FLAGS, "--steps", str(steps)]
             started.append(
                 subprocess.Popen(
                     [*command, "--run-dir", str(folder / RUNS), *flags, *of_rank.get(rank, ())],
@@ -122,6 +124,27 @@ def test_settings_of_rank_0_count_and_the_policy_is_that_of_one_process(tmp_path
     assert f"rank 1 of 2 takes part in the updates of run {run_in(tmp_path)}" in other_said
     assert "Exception raised from" not in other_said  # PyTorch's traces of tries to connect
     assert policy(tmp_path) == undisturbed
+
+
+def test_the_policy_may_act_in_rank_0(tmp_path: Path, undisturbed: bytes) -> None:
+    with ranks(tmp_path, 2, "--inference", "learner") as started:
+        (code, said), (_, other_said) = started.end()
+    assert code == 0, said + other_said
+    assert policy(tmp_path) == undisturbed
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("env", [f"{CODE}.seat_envs:RandomCrowd", f"{CODE}.mask_envs:Mixed-v0"])
+def test_seats_and_masks_are_divided_among_processes(tmp_path: Path, env: str) -> None:
+    policies = set()
+    for count in (1, 2):
+        folder = tmp_path / str(count)
+        folder.mkdir()
+        with ranks(folder, count, env=env) as started:
+            for code, said in started.end():
+                assert code == 0, said
+        policies.add(policy(folder))
+    assert len(policies) == 1
 
 
 def test_a_rank_that_cannot_see_the_folder_learns_that_the_run_was_finished(tmp_path: Path) -> None:
