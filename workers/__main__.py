@@ -90,7 +90,7 @@ def _supervise(flags: WorkerFlags, token: Token | None, signals: list[int]) -> i
 
 
 def _count_signals() -> list[int]:
-    """Install handlers that append SIGTERM, SIGINT and SIGHUP to the list that this returns.
+    """Install handlers that append each SIGTERM, SIGINT and SIGHUP to the returned list.
 
     The first signal asks the program to leave after the rollout in progress, the second to leave immediately. A SIGHUP that
     is ignored (`nohup`) stays ignored.

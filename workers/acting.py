@@ -1,8 +1,8 @@
 """How the actions of a rollout are chosen: by a built-in policy, for all lanes in one pass, or by a user-defined one.
 
 Rule: the actions of a lane depend on its observations, state and random generator, and not on other lanes. Calls of user
-code are recorded on the worker's page (`workers/activity.py`), so that the supervisor can enforce their timeouts; calls of
-built-in policies aren't, so this doesn't slow them. In a masked run, the last array of an observation is the mask of the
+code are recorded on the worker's page (`workers/activity.py`), so that the supervisor can enforce their timeouts. Calls of
+built-in policies aren't, because recording takes time. In a masked run, the last array of an observation is the mask of the
 allowed actions (`millrace.protocol.policy.masks`).
 """
 
@@ -24,8 +24,8 @@ from millrace.protocol.specs import RunSpec
 from millrace.workers.activity import ACTING, activity
 
 Stream = Callable[[], np.random.Generator]
-"""Returns a random generator, the same one in each call. It is only called if a generator is needed, because greedy actions
-need none, and seeding one takes as long as a step.
+"""Returns a random generator, the same one in each call. Call it only if you need the generator: seeding it takes as long as
+a step, and greedy actions need none.
 """
 
 
@@ -56,7 +56,7 @@ class StepActions(Protocol):
 
 
 class RolloutActions(StepActions, Protocol):
-    """Chooses the actions of one rollout for each of L lanes, and keeps them."""
+    """Chooses the actions of one rollout for each of L lanes, and stores them."""
 
     def columns(self, i: int) -> ActedRows:
         """The arrays of lane i, once all T steps are done."""
@@ -71,7 +71,7 @@ class Acting(Protocol):
         ...
 
     def begin(self, generators: Sequence[np.random.Generator]) -> RolloutActions:
-        """Begin a rollout for each of several lanes, which have these random generators."""
+        """Begin one rollout for each lane. `generators` has the lanes' random generators."""
         ...
 
     def choose(self, obs: Sequence[Array], state: Floats, stream: Stream, *, greedy: bool) -> Array:
@@ -87,8 +87,8 @@ def acting_of(run: RunSpec, policy: Policy | CalledPolicy) -> Acting:
 
 
 class _EncodingPolicy:
-    """A built-in policy with a user-defined encoder. Its calls are recorded on the page, and its errors are raised as
-    `PolicyFailed`.
+    """A built-in policy with a user-defined encoder. Calls of the encoder are recorded on the worker's page, and its errors
+    are raised as `PolicyFailed`.
     """
 
     def __init__(self, encoder: str, policy: Policy) -> None:

@@ -1,10 +1,10 @@
 """A worker's current activity, in a page of memory that the worker shares with its supervisor.
 
 Rule: only the worker writes to the page, and the supervisor only reads it. The worker writes what it is doing, since when,
-and how many calls of the environment have returned; when a learner welcomes it, how long a call may take; before it leaves
-on purpose, its exit code. So the supervisor sees what a worker is doing even while a C extension holds the worker's
-interpreter lock. The memory is an unlinked file that a child process inherits. When the supervisor sends a signal, the
-worker writes the stacks of its threads after the page, into the same file.
+and how many calls of the environment have returned. When a learner welcomes it, it also writes how long a call may take, and
+before it leaves on purpose, it writes its exit code. So the supervisor sees what a worker is doing even while a C extension
+holds the worker's interpreter lock. The memory is an unlinked file that a child process inherits. When the supervisor sends
+a signal, the worker writes the stacks of its threads after the page, into the same file.
 
 A worker in a thread has its own page, which isn't shared.
 """
@@ -27,7 +27,7 @@ from millrace.protocol.call_timeouts import OF_POLICY, OUR_CODE, CallTimeouts, D
 
 PAGE_BYTES = 4096
 MAX_STACK_BYTES = 64_000
-STACK_SIGNAL = getattr(signal, "SIGQUIT", None)  # by convention, a program that gets it writes the stack of each thread
+STACK_SIGNAL = getattr(signal, "SIGQUIT", None)  # by convention, it makes a program write each thread's stack
 DOINGS: tuple[Doing, ...] = get_args(Doing)
 (
     STARTING,
@@ -86,7 +86,7 @@ class Activity:
                 self.begin(before)
 
     def limit(self, timeouts: CallTimeouts) -> None:
-        """Set how long a call of user code may take from now on. Until the first call of this, there is no limit."""
+        """Set how long a call of user code may take from now on. There is no limit until this method is first called."""
         self.seconds[START_TIMEOUT_S] = timeouts.start_s
         self.seconds[STEP_TIMEOUT_S] = timeouts.step_s
 
@@ -108,8 +108,8 @@ def activity() -> Activity:
 
 
 def share_activity(page: Activity) -> None:
-    """Let the worker in this thread write to this page. Call this before the worker is made, because its parts keep the page
-    that they find.
+    """Let the worker in this thread write to this page. Call this before you make the worker, because the worker's parts
+    look up the page only once, when they are made.
     """
     _of_thread.activity = page
 
@@ -147,7 +147,7 @@ class ActivityReader:
             self._seconds = page.seconds
 
     def read(self, now: float) -> Reading:
-        """Read the page. Environment code could write to it too, so every value is forced into its bounds."""
+        """Read the page. Environment code could write to it too, so every value is clipped to its valid range."""
         timeouts = self.timeouts()  # read before the activity, so that a call is never judged by the limits of a later run
         code = self._numbers[DOING]  # read before the time: see `Activity.begin`
         doing = DOINGS[code] if 0 <= code < len(DOINGS) else "waiting"

@@ -1,6 +1,6 @@
 """The collector and the evaluator of a worker, which share a policy that acts in the env copies of a run.
 
-Rule: the policy has the weights of the current task; they are loaded when a task needs other weights than the last one.
+Rule: the policy has the weights of the current task. Weights are loaded only if a task needs others than the task before it.
 """
 
 from __future__ import annotations

@@ -4,9 +4,9 @@ Rule: a copy holds its slot from before it is made until after it was closed, so
 the constructor of a copy raises, it may have started a process; so the slot then becomes free only when this process and its
 children have ended.
 
-Rule: a copy that was only described is reused as the next copy that its thread makes, if the new one would be the same. If
-not, it is closed before. A worker also closes it if it has not made a copy within `UNUSED_S` seconds of a run, because the
-worker may be spare. So no worker keeps a copy for long that it doesn't need.
+Rule: a copy that was only described is reused as the next copy that its thread makes, if the new one would be the same.
+Otherwise, it is closed before the new one is made. A worker also closes it if the worker has made no copy in the first
+`UNUSED_S` seconds of a run, because the run may not need this worker. So no worker long keeps a copy that it doesn't need.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Makes an env copy for a learner that does not know the environment yet, and describes it.
 
-Rule: the environment's code runs here and not in the learner. A copy is made and its attributes are read, nothing more. Then
-the copy is kept for later use (`copy_slots.py`).
+Rule: the environment's code runs here and not in the learner. A copy is made and its attributes are read; it is not reset or
+stepped. Then the copy is kept for later use (`copy_slots.py`).
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Exit codes, besides 0 and 1, that say why a worker left. Only the worker's supervisor sees the last two, and itself exits
-with 1 or 2 instead.
+"""Exit codes, besides 0 and 1, that say why a worker left. Only the worker's supervisor sees the last two; the supervisor
+itself exits with 1 or 2 instead.
 
 The supervisor decides after which exit codes a worker is restarted (`supervise/supervisor.py`).
 """

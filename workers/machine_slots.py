@@ -1,4 +1,4 @@
-"""The slots of this machine: each env copy holds the lowest free number, for its port, folder or display.
+"""The slots of this machine: each env copy takes the lowest free number, from which it can derive a port, folder or display.
 
 Rule: no two live env copies that use the same slots file have the same slot. A slot is a lock on one byte of this file,
 which stays empty. The lock belongs to an open file and not to a process, so a worker and its supervisor hold it together,
@@ -47,7 +47,7 @@ POLL_S = 0.2
 
 
 class NoSlot(UsageError):
-    """All slots of this machine are taken, and have been for a while."""
+    """All slots of this machine have been taken for a while."""
 
 
 class Slots:
@@ -160,7 +160,7 @@ def open_slots() -> int:
     try:
         with suppress(FileExistsError):
             fd = os.open(path, FLAGS | os.O_CREAT | os.O_EXCL, mode)
-            os.fchmod(fd, mode)  # whatever the umask is
+            os.fchmod(fd, mode)  # so that the mode doesn't depend on the umask
             return fd
         fd = os.open(path, FLAGS)
         status = os.fstat(fd)

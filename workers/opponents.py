@@ -2,7 +2,7 @@
 
 Rule: in each env copy, the policy plays one team, and one opponent plays all others, for whole episodes: the opponent
 changes only when the copy is reset. So a lane keeps its opponents from rollout to rollout, even if tickets no longer name
-their weights. An opponent samples its actions with random numbers of the lane that nothing else uses.
+their weights. Opponents sample their actions from a random stream of the lane that nothing else uses.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class Opponent:
     """One opponent: a policy that acts, and the number by which tickets name it."""
 
     def __init__(self, run: RunSpec, number: int, weights: Weights | None) -> None:
-        """`weights` are those of version `number`, or None if the opponent is a user-defined program."""
+        """`weights` are the policy's weights of version `number`, or None if the opponent is a user-defined program."""
         self.number = number
         if weights is None:
             spec = msgspec.structs.replace(run.policy, own=OwnPolicySpec(run.scripted[-1 - number], ()))
@@ -141,8 +141,8 @@ def whole_episode(
     seconds: float,
     of_info: tuple[float, ...],
 ) -> Episode:
-    """The `Episode` that has ended in copy n, given the returns of its seats and the facts `of_info` from the
-    environment.
+    """The `Episode` that has ended in copy n, given the returns of its seats and the facts `of_info` that the environment
+    reported.
     """
     if others is None:
         counted = returns if run.has_seat_returns else ()

@@ -2,7 +2,7 @@
 
 Exit codes: 0 if the worker was drained or asked to leave, or its supervisor has ended; EXIT_NO_LEARNER if no learner
 answered; EXIT_UNSUITABLE if it cannot take part in this run; 1 if it failed; 2 if it was refused, or its flags were wrong.
-The code is also written to the page that the supervisor reads: an exit without this counts as a failure.
+The worker also writes the code to the page that the supervisor reads; if it exits without doing so, it counts as failed.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from millrace.workers.worker import Worker, WorkerOptions, identity, parent_is_g
 
 LEAVE_AT_ONCE = 2  # number of requests to leave after which the rollout in progress is abandoned
 LOOK_FOR_PARENT_S = 0.5
-LEAVE_ORPHANED_WITHIN_S = 2.0  # seconds after the supervisor's death
+LEAVE_ORPHANED_WITHIN_S = 2.0  # time for leaving after the supervisor has died
 CLOSED_WITHIN_S = 1.0  # seconds within which the sockets of a killed process are closed
 AFTER_SUPERVISOR_S = 60.0  # a worker that hangs is ended by the watchdog this long after the supervisor should have done so
 
@@ -119,8 +119,8 @@ def _remove_socket_of_killed_parent(address: str) -> None:
     """Remove the learner's socket and the folder that the learner made for it, because a killed learner could not.
 
     If the parent was the supervisor of a `millrace worker`, the learner is alive, and the next worker needs the socket. So
-    it is removed only if nothing listens any more. This may take a moment: Linux reparents the children of a killed process
-    before the last thread of that process has freed the memory and closed the sockets.
+    the socket is removed only once nothing listens on it. That may take a moment: Linux reparents the children of a killed
+    process before the last thread of that process has freed its memory and closed its sockets.
     """
     scheme, _, path = address.partition("://")
     if scheme == "ipc" and Path(path).parent.name.startswith("millrace-"):

@@ -17,7 +17,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 FAULTHANDLER_HEADER = "Timeout ("  # the beginning of faulthandler's output
-LONGEST_S = 1e9  # longest time for the timer; faulthandler doesn't accept infinity
+LONGEST_S = 1e9  # used instead of infinity, which faulthandler doesn't accept
 OURS = f"{Path(__file__).parents[1]}/"
 LIBRARIES = ("<", f"{sysconfig.get_path('stdlib')}/", OURS)  # path prefixes of code that isn't the user's
 INSTALLED = "-packages/"  # part of the paths of site-packages, and of Debian's dist-packages
@@ -61,7 +61,7 @@ def where_it_hung(log: str) -> str | None:
 def deepest_frame(stacks: str) -> str:
     """Where the main thread is, found in the stacks that faulthandler wrote; empty if it wrote none.
 
-    This is the newest call in the user's own code, which may be waiting for a library; if there is none, the newest call.
+    That is the newest call in the user's own code, even if it is waiting for a library; if there is none, the newest call.
     """
     # In each stack, the newest call comes first. The last stack is that of the main thread.
     each = re.split(r"^(?:Current )?[Tt]hread .*$", stacks, flags=re.MULTILINE)

@@ -1,4 +1,4 @@
-"""Runs a worker: connects its session with the link, the env copies and signals. The session makes all decisions.
+"""Runs a worker: connects its session with the link, the env copies and signals. All decisions are made in the session.
 
 Rule: the worker reads all messages before a rollout or an evaluation starts, and again between env steps, so it answers
 while it works. Every failure of the environment is reported to the learner. A connection that only seems to be open is
@@ -59,11 +59,11 @@ from millrace.workers.vector_env.stepper import Stepper
 
 log = logging.getLogger("millrace.worker")
 
-CONNECT_AGAIN_S = 20.0  # a learner that can be reached answers a Hello before this
+CONNECT_AGAIN_S = 20.0  # a learner that can be reached answers a Hello sooner than this
 PULSE_S = 0.05  # time between two checks for messages while environments are stepped
 IDLE_S = 0.5  # longest wait while idle, so that a signal or the end of the parent process is noticed
-AFTER_WAKE_UP_S = 0.02  # longest wait for a message after a wake-up, which may arrive before the message does
-STATM = Path("/proc/self/statm")  # numbers of pages: all, resident, …
+AFTER_WAKE_UP_S = 0.02  # longest wait for a message after the wake-up that announces it, and that may arrive earlier
+STATM = Path("/proc/self/statm")  # contains numbers of pages: total, resident, …
 
 
 class _Abandoned(Exception):
@@ -83,14 +83,14 @@ def _same_exit_code(code: int, reason: str) -> int:
 
 @dataclass(frozen=True)
 class WorkerOptions:
-    """The options of a worker that depend on its process."""
+    """A worker's options, which depend on the process or thread that runs it."""
 
     code: AllowedCode = AllowedCode.MODULES
     """Which code the learner may make the worker run."""
     stop_requests: Callable[[], int] = _no_stop_requests
     """Returns how many times this worker was asked to leave."""
     feed_watchdog: Callable[[float], None] = _no_watchdog
-    """Called regularly with the time, unless the environment hangs."""
+    """Called regularly with the current time; the calls stop if the environment hangs."""
     shared_memory: InheritedDescriptors | None = None
     """Shared memory and wake pipes, for a vector environment on this machine."""
     shared_weights: SharedWeightsReader | None = None
@@ -128,7 +128,7 @@ class Worker:
         self._heartbeats = HeartbeatThread(lambda: self._do(self._session.heartbeat_if_due(self._clock())))
         self._waited_s = 0.0
         self._statistics = self._earlier = Statistics()  # the newest figures, and those at the end of the previous session
-        # The value of `_waited_s` when the last message of the learner arrived, or when joining or the connection began.
+        # `_waited_s` at the learner's last message, or when this worker last began to join or made a new connection.
         self._unheard_from_s = 0.0
 
     def run(self) -> Leave:
@@ -216,8 +216,9 @@ class Worker:
     def _connect_again_if_unheard(self) -> None:
         """Make a new connection if the learner has not answered for too long while this worker joins.
 
-        A proxy or a tunnel may keep a connection open whose other end is gone. If there is no connection yet, this drops the
-        queued Hellos. Only the time spent listening counts, because nothing is read while a simulator starts or is closed.
+        A proxy or a tunnel may keep a connection open after its other end is gone. If there is no connection yet, a new one
+        drops the queued Hellos. Only time spent listening counts, because no messages are read while a simulator starts or
+        is closed.
         """
         if self._session.state is not WorkerState.JOINING:
             self._unheard_from_s = self._waited_s
@@ -286,7 +287,7 @@ class Worker:
             self._do([SendMessage(answer)])
 
     def _fail(self, error: Exception) -> None:
-        """Report to the learner that the environment, a user-defined policy or millrace's own code raised, and leave.
+        """Report to the learner that the environment, a user-defined policy or millrace's own code raised `error`, and leave.
 
         If the error is that no slot was free, decline the run instead.
         """
@@ -308,8 +309,8 @@ class Worker:
         return isinstance(work, Describe) or (isinstance(work, RolloutTask) and not self._statistics.steps)
 
     def _decline(self, error: UsageError) -> None:
-        """Leave the run. If no slot was free, end only when there is room for a lane: then the supervisor restarts the
-        worker.
+        """Leave the run. If the reason is that no slot was free, exit only once there is room for a lane, because the
+        supervisor then restarts the worker.
         """
         self._close_all()
         *said, leave = self._session.decline(_line(error), 1 if isinstance(error, NoSlot) else EXIT_UNSUITABLE)
@@ -359,8 +360,8 @@ class Worker:
             self._link.send(frames)
 
     def _begin(self, run: WaitSpec | RunSpec | StepSpec) -> None:
-        """Make the actors or the stepper for this run, unless the run has yet to begin. Those of the last session were
-        closed.
+        """Make the actors or the stepper for this run, unless the run has yet to begin. The previous session's were closed
+        before.
         """
         activity().begin(WAITING)
         activity().limit(run.call_timeouts)
@@ -393,7 +394,7 @@ class Worker:
             self._fail(error)
 
     def _describe(self, order: Describe) -> Described:
-        """Describe an environment. A second thread sends heartbeats while the environment's code runs.
+        """Describe an environment. While the environment's code runs, a second thread sends heartbeats.
 
         Raises what `describe` raises, and `UsageError` if this worker isn't allowed to run the environment's code.
         """

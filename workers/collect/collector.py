@@ -41,7 +41,7 @@ from millrace.workers.lanes.runner import LaneRunner, Part, TogetherSteps
 from millrace.workers.opponents import KnownOpponents, Match, Opponents, OtherTeams
 
 OpenEnvCopies = Callable[[RunSpec, int, Pulse], EnvCopies]
-"""Makes the env copies of the lane of this number."""
+"""Makes the env copies of the lane with this number."""
 
 
 def open_env_copies(run: RunSpec, lane: int, pulse: Pulse) -> EnvCopies:
@@ -51,7 +51,7 @@ def open_env_copies(run: RunSpec, lane: int, pulse: Pulse) -> EnvCopies:
 
 
 class Collector:
-    """Collects rollouts. It opens a lane when a rollout of it is first asked for."""
+    """Collects rollouts. It opens a lane when it is asked for the lane's first rollout."""
 
     def __init__(
         self,
@@ -66,7 +66,7 @@ class Collector:
         self.env_attributes = b""
         """attributes that each env copy gets before its next rollout (`Weights.env_attributes`)"""
         self.lanes = OpenLanes[Lane]()
-        """the lanes with a rollout, until they are closed"""
+        """the lanes that were opened for a rollout and have not been closed"""
         self._run = run
         self._runner = LaneRunner(run, policy, together)
         self._open_copies = open_copies
@@ -99,7 +99,7 @@ class Collector:
     ) -> list[Rollout]:
         """Collect one rollout for each assignment. Returns them in the order of the assignments.
 
-        Each assignment must name a different lane. `held`: the available weights, by version, among them those of new
+        Each assignment must name a different lane. `held`: the available weights, by version, including those of new
         opponents. `pulse` is called at every step and may raise. If `pulse` raises, or an environment does
         (`EnvironmentFailed`), these lanes are closed and the unfinished rollouts are dropped.
         """
@@ -135,7 +135,7 @@ class Collector:
         ]
 
     def _part(self, lanes: Sequence[Lane], drawn: Sequence[np.random.Generator]) -> Part:
-        """These lanes and their random numbers, before the first step."""
+        """These lanes as a part that is ready for its first step; `drawn` has a random generator for each lane."""
         return Part(Rows(self._run, lanes, self._run.rollout_steps), self._runner.acting.begin(drawn))
 
     def _lane_for(self, assignment: Assignment, pulse: Pulse) -> Lane:
@@ -178,7 +178,7 @@ class Collector:
     def _rollout(
         self, rows: RowsOfLane, state: Floats, acted: ActedRows, assignment: Assignment, version: int, session: int
     ) -> Rollout:
-        """The rollout of a lane, made of views of its rows. `state`: the policy's state before them."""
+        """The rollout of a lane, made of views of its rows. `state`: the policy's state before the first row."""
         lane = rows.lane
         masked = self._run.masked
         axes = self._run.row_axes

@@ -1,4 +1,4 @@
-"""Whether a worker connects with or without a token, and how long it waits for a learner before `Session.tick` leaves.
+"""Whether a worker connects with or without a token, and how long it waits for a learner before `Session.tick` gives up.
 
 Rule: over TCP to another machine, a worker connects without a token only with --insecure. Pure; imports neither numpy nor
 gymnasium.
@@ -22,9 +22,9 @@ the worker ends when the learner does.
 
 
 def wait_limits_s(join_timeout_s: float, *, stay: bool) -> tuple[float, float]:
-    """How long a worker waits for its first learner, and for a learner that it had joined, in seconds.
+    """How many seconds a worker waits for its first learner, and for the return of a learner that it had joined.
 
-    With `stay`, the first time is unlimited, and after the second, the worker waits for another learner.
+    With `stay`, the first limit is infinite, and when the second has passed, the worker waits for another learner.
     """
     return math.inf if stay else join_timeout_s, max(join_timeout_s, REJOIN_TIMEOUT_S)
 

@@ -68,7 +68,7 @@ class HeldEvaluations(Held[Evaluate, Evaluated]):
     """
 
     def take(self, ticket: int, asked: Evaluate) -> Evaluated | None:  # rule EVALUATE_ENDS
-        """Accept an order; see `Held.take`. Drops the orders of evaluations before the newest, which are over."""
+        """Accept an order; see `Held.take`. Drops the orders of all evaluations but the newest, because those are over."""
         answer = super().take(ticket, asked)
         newest = max(self.asked, default=ticket)
         self.asked = {n: order for n, order in self.asked.items() if order.version == self.asked[newest].version}
@@ -121,7 +121,7 @@ LaneT = TypeVar("LaneT", bound=_HeldLane[Any, Any])
 
 
 class _HeldLanes(Generic[LaneT]):
-    """The requests and answers of one session, by lane. A later incarnation of a lane begins with none."""
+    """The requests and answers of one session, by lane. A new incarnation of a lane begins with no requests or answers."""
 
     _kind: type[LaneT]
 
@@ -173,7 +173,7 @@ class Assignment:
     opponent: int | None = None
     """The opponent that plays the other teams in the episodes that begin in this rollout."""
     past: LanePast | None = None
-    """If the lane isn't open in this incarnation, the past from which it continues; None: it begins its first episodes."""
+    """The past from which the lane continues if it isn't open in this incarnation; None: it begins its first episodes."""
 
 
 class Permitted(NamedTuple):
@@ -199,7 +199,7 @@ class Permitted(NamedTuple):
 
 @dataclass
 class RolloutLane(_HeldLane[Permitted, Rollout]):
-    """The tickets of a lane, each for one rollout, and its rollouts. They are collected in the order of their sequence."""
+    """A lane's tickets, each for one rollout, and its rollouts, which are collected in the order of their `sequence`."""
 
     sequence: int = 0  # sequence number of the next rollout to collect
 
@@ -218,7 +218,7 @@ class HeldRollouts(_HeldLanes[RolloutLane]):
     def take(self, permit: Permit, version: int) -> Rollout | None:  # rule RECEIVED
         """Accept a ticket to collect a rollout with this version of the weights.
 
-        If the rollout was collected already and may be lost, returns it, so that it is sent again.
+        If the rollout was collected already, but may have been lost on the way, returns it, to be sent again.
         """
         lane = self._opened(permit.lane, permit.incarnation)
         if lane is None or (permit.sequence < lane.sequence and permit.ticket not in lane.answered):

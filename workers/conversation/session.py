@@ -379,15 +379,15 @@ class Session:
         return [] if self.state is WorkerState.LEFT else self._drain(StopRequested(), TOLD_TO_STOP)
 
     def fail(self, error: str, traceback: str, lane: int | None, *, of_policy: bool = False) -> list[WorkerEffect]:
-        """Report to the learner that the environment, a user-defined policy (`of_policy`), or this worker
-        raised, and leave.
+        """Report to the learner that the environment, a user-defined policy (`of_policy`), or this worker's own code
+        raised an exception, and leave.
         """
         error = one_line(error)
         failure = Failure(self.session, error, last_text(traceback), lane, of_policy)
         return self._leave(WorkerFailed(), 1, error, failure)
 
     def decline(self, reason: str, exit_code: int = EXIT_UNSUITABLE) -> list[WorkerEffect]:  # rule DECLINED
-        """Leave a run in which this worker can't take part; with another exit code, in which it can't take part now."""
+        """Leave a run in which this worker can't take part. Pass another `exit_code` if it only can't take part now."""
         return self._leave(WorkerFailed(), exit_code, reason, Goodbye(self.session, one_line(reason), ()))
 
     def refused(self, reason: str) -> list[WorkerEffect]:  # rules REFUSE, AFTER_REFUSE
@@ -430,7 +430,7 @@ class Session:
     # ---------------------------------------------------------------- inside
 
     def _join(self, now: float) -> None:  # rules REJOIN, FORGETS
-        """Start to join, with nothing held, as if for the first time."""
+        """Start to join as if for the first time, and forget everything that this worker holds."""
         self._attempt += 1
         self._joining_s = self.due_s = now
         self._backoff_s = HELLO_FIRST_S

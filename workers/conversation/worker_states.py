@@ -1,4 +1,4 @@
-"""A worker's states in the conversation, and a table with the next state for each state and message or event. Plain data."""
+"""A worker's states in the conversation, and a table of the next state, by state and message or event. Plain data."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class WorkFinished:
 
 
 class WorkerFailed:
-    """Event: the environment, or this worker, raised."""
+    """Event: the environment, or this worker's own code, raised an exception."""
 
 
 # The next state. A message that is not listed is ignored in that state (rules STAYS, REFUSE).

@@ -46,19 +46,19 @@ CANNOT_RESTART = (
 
 
 class SeatColumns(NamedTuple):
-    """The result of a step of N copies with A seats each, as far as it exists only with seats."""
+    """The part of a step's result that exists only with seats, for N copies with A seats each."""
 
     complete: Bools
     """[N · A] whether a row of the seat is complete"""
     acts: Bools
     """[N · A] whether the seat acts in the next step"""
     outside: Doubles
-    """[N · A] rewards outside of any row"""
+    """[N · A] rewards that belong to no row"""
     over: Bools
     """[N] whether the copy's episode is over, so that its next step only resets it"""
 
     def first(self, copies: int, columns: int) -> SeatColumns:
-        """The columns of the first copies."""
+        """The part that belongs to the first `copies` copies, which have the first `columns` columns."""
         return SeatColumns(
             complete=self.complete[:columns],
             acts=self.acts[:columns],
@@ -75,8 +75,8 @@ class StepResult(NamedTuple):
     terminated: Any
     truncated: Any
     lost: Array | None = None
-    """[N] bool, True for copies that were lost with their worker: this step was not made on them, and the next one begins an
-    episode on new copies
+    """[N] bool, True for copies that were lost with their worker: they did not make this step, and the next step begins
+    episodes on new copies in their place
     """
     facts: Facts = {}
     """facts of the episodes that ended in this step, if the run has facts"""
@@ -84,7 +84,7 @@ class StepResult(NamedTuple):
     """None without seats; with seats, the arrays above have N · A entries"""
 
     def first(self, copies: int, columns: int) -> StepResult:
-        """The result for only the first copies, which have the first columns."""
+        """The part that belongs to the first `copies` copies, which have the first `columns` columns."""
         return self._replace(
             leaves=[leaf[:columns] for leaf in self.leaves],
             reward=self.reward[:columns],
@@ -160,7 +160,7 @@ def check_spaces(run: RunSpec, copies: EnvCopies) -> None:  # rule OTHER_AGENTS
 
 
 def copy_seed(seed: int, lane: int, start: int, copy: int) -> int:  # rule INDEPENDENT
-    """The reset seed of a copy of a lane, for the copy's start with this number."""
+    """The seed with which a copy of a lane is reset at its start with this number."""
     return env_seed(seed, Purpose.COPIES, lane, start, copy)
 
 
@@ -306,16 +306,16 @@ class LoopedCopies:
         try:
             with self._activity.during(STEPPING):
                 load(self.envs[copy], state)
-        except Exception as error:  # the state may be from another version of the environment; this costs only the replay
+        except Exception as error:  # perhaps another version of the environment saved the state
             return f"load_state raised {type(error).__name__}: {first_line(error, 'no message')}"
         return ""
 
     def begun(self, over: Sequence[int]) -> dict[int, bytes | None]:
         """The random states from which episodes begin, by copy.
 
-        For each copy that a step has reset since the last call of this, it is the state from which its newest episode began.
-        For copies that are `over`, it is the state from which the next one will begin. It is None if the copy has no
-        readable generator.
+        For each copy that a step has reset since `begun` was last called, it is the state from which the copy's newest
+        episode began. For copies that are `over`, it is the state from which the next episode will begin. It is None if the
+        copy has no readable generator.
         """
         loop = self._loop
         states = loop.random_states | {n: loop.random_state(n) for n in over}

@@ -71,7 +71,7 @@ def _what_it_did(cause: BaseException) -> str:
 
 
 def _about_action(says: str, raised_by: str) -> str:
-    """The end of a line: what to write if the environment needs a Python int as its action; else empty.
+    """Advice at the end of an error's line if the environment needs a Python int as its action; else empty.
 
     Environments get a numpy integer as the action, just as from gymnasium's vector environments and `Discrete.sample`.
     """
@@ -84,8 +84,8 @@ def _about_action(says: str, raised_by: str) -> str:
 
 
 def _about_answer(says: str, raised_by: str) -> str:
-    """The end of a line: the form that a wrapper expected, if it could not unpack the result of `reset` or `step`; else
-    empty.
+    """Advice at the end of an error's line if a wrapper could not unpack the result of `reset` or `step`: the form that it
+    expected. Else empty.
     """
     called = re.search(r"= .*\b(reset|step)\(", raised_by) if "unpack" in says else None
     if called is None:

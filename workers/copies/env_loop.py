@@ -285,8 +285,8 @@ class EnvLoop:
 
 
 def _kept(info: Any) -> Any:
-    """The info, in which dicts and arrays are copied, as gymnasium does. Other values aren't, because some
-    can't be copied.
+    """The info with its dicts and arrays copied, just as gymnasium copies them. Other values aren't copied, because some
+    can't be.
     """
     if isinstance(info, dict):
         return {key: value if type(value) in _IMMUTABLE else _kept(value) for key, value in info.items()}

@@ -1,4 +1,4 @@
-"""A loop over N env copies with A seats each. They have N · A columns, where those of a copy are adjacent.
+"""A loop over N env copies with A seats each. They have N · A columns; the columns of one copy are adjacent.
 
 Rule: a column has the mask of the last observation, in this episode, in which the column's seat acts. Until there is one,
 all actions are allowed.
@@ -38,7 +38,7 @@ class SeatedCopies(LoopedCopies):
         first: EnvCopy = FIRST_COPY,
         restart_episodes: int = 0,
     ) -> None:
-        """`seats` are the names of the A agents. `facts` don't include the returns of seats. For the others, see
+        """`seats` are the names of the A agents. `facts` don't include the returns of seats. For the other parameters, see
         `LoopedCopies`.
         """
         super().__init__(

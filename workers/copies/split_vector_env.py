@@ -1,4 +1,4 @@
-"""One vector environment split into lanes: its workers step the env copies, and a collector acts.
+"""One vector environment split into lanes: its workers step the env copies, and a collector chooses the actions.
 
 Rule: a lane returns, bit for bit, what a loop over its copies would return. The lane chooses its copies' seeds and actions,
 and the vector environment's autoreset is NextStep, like the loop's. If the vector environment can step some lanes while
@@ -27,7 +27,7 @@ from millrace.workers.copies.env_loop import Pulse
 from millrace.workers.copies.episode_facts import Facts, facts_of_copies, of_ended
 from millrace.workers.copies.mask_reader import MaskReader
 
-METHODS = ("close", "render", "reset", "step")  # of every environment
+METHODS = ("close", "render", "reset", "step")  # every environment has these methods
 Result = TypeVar("Result")
 
 
@@ -37,17 +37,17 @@ class StepsSomeLanes(Protocol):
     calls: Any
 
     def begin_step(self, lanes: Sequence[int], actions: Any) -> None:
-        """Order the copies of these lanes to step. Actions have a row for every copy of the vector environment."""
+        """Order the copies of these lanes to step. `actions` has a row for every copy of the vector environment."""
 
     def end_step(self, lanes: Sequence[int]) -> Any:
-        """Wait for them. Returns what gymnasium's `step` does, of which only the rows of these lanes count."""
+        """Wait until these lanes have stepped. Returns what gymnasium's `step` returns; only these lanes' rows are valid."""
 
     def abandon(self) -> None:
         """Wait for nothing any more."""
 
 
 class SplitVectorEnv:
-    """Lanes of equally many copies each. Lane 0 has the first copies of the vector environment."""
+    """Lanes with the same number of copies each. Lane 0 has the first copies of the vector environment."""
 
     def __init__(
         self,
@@ -61,21 +61,21 @@ class SplitVectorEnv:
     ) -> None:
         """`before_wait` is called before each wait for the vector environment, with the `pulse` to call during the wait.
 
-        `some`: the same vector environment, if it can step some lanes: then it may have more lanes than these, for
-        evaluation. `facts`: names of the numbers in `info` that belong to an episode. `masked`: read masks of the allowed
+        `some`: the same vector environment, if it can step some lanes while others wait; it may then have further lanes, for
+        evaluation. `facts`: names of the numbers in `info` that describe an episode. `masked`: read masks of the allowed
         actions.
         """
         self.env = env
         self.in_parts = 1 if some is None else min(lanes, 2)
-        """in how many parts the lanes are stepped"""
+        """number of parts in which the lanes are stepped"""
         self.facts = facts
         observation = env.single_observation_space
         action = env.single_action_space
         self._masks = MaskReader(observation, action) if masked else None
         self.observation_space = without_mask(observation, action) if masked else observation
-        """of one copy"""
+        """observation space of one copy"""
         self._lanes = lanes
-        self._count = 0  # number of copies of a lane, once one is opened
+        self._count = 0  # number of copies per lane, set when the first lane is opened
         self._before_wait = before_wait
         self._some = some
         self._actions: Array | None = None  # [num_envs, *action]
@@ -87,7 +87,7 @@ class SplitVectorEnv:
         self._missing: set[tuple[int, str]] = set()  # those of them that replacements of lost copies may lack
 
     def open_lane(self, run: RunSpec, lane: int, pulse: Pulse) -> EnvCopies:
-        """The copies of this lane: `OpenEnvCopies` of a `Collector`."""
+        """The copies of this lane. A `Collector` takes this method as its `open_copies`."""
         self._count = run.copies
         return SplitLane(self, lane * run.copies, run.copies)
 
@@ -101,9 +101,10 @@ class SplitVectorEnv:
         return [slice(begin, end) for begin, end in zip([0, *ends[:-1]], ends, strict=True) if end > begin]
 
     def begin(self, lanes: Sequence[int], actions: Array, pulse: Pulse) -> None:
-        """Order the copies of these lanes to step, with actions [L, N, *action]: `TogetherSteps` of a `Collector`.
+        """Order the copies of these lanes to step, with actions [L, N, *action]; see `TogetherSteps`.
 
-        Raises `ValueError` unless they are all lanes of a part: the policy's rounding may depend on who acts together.
+        Raises `ValueError` unless these are all the lanes of one part: the rounding of the policy's results may depend on
+        which lanes act together.
         """
         order = sorted(range(len(lanes)), key=lanes.__getitem__)
         in_order = actions[order].reshape(-1, *actions.shape[2:])  # [L · N, *action]
@@ -118,13 +119,13 @@ class SplitVectorEnv:
         self._result = self._read_result(returned, slice(None))
 
     def end(self, lanes: Sequence[int], pulse: Pulse) -> None:
-        """Wait for the copies of these lanes. `SplitLane.step` returns what they gave."""
+        """Wait for the copies of these lanes. Then `SplitLane.step` returns their results."""
         if self._some is not None:
             with self._errors_of_lanes():
                 self._result = self._ended(lanes, self._copies_of(lanes), pulse)
 
     def step_evaluation(self, first: int, copies: Sequence[int], actions: Array, pulse: Pulse) -> None:
-        """Step these of the copies for evaluation, the first of which is `first`."""
+        """Step copies that are used for evaluation; `copies` are counted from the first of these, which is copy `first`."""
         lanes = [self._lanes + n for n in copies]
         chosen = [first + n for n in copies]
         self._order(lanes, chosen, actions, pulse)
@@ -135,7 +136,7 @@ class SplitVectorEnv:
 
     @contextmanager
     def _errors_of_lanes(self) -> Iterator[None]:
-        """While it is entered, errors of copies become errors of their lanes."""
+        """A context in which errors of copies become errors of their lanes."""
         try:
             yield
         except CopyFailed as error:
@@ -143,19 +144,19 @@ class SplitVectorEnv:
             raise environment_failed(lane, CopyFailed(copy, "step", error.line)) from error
 
     def _order(self, lanes: Sequence[int], copies: list[int], actions: Array, pulse: Pulse) -> None:
-        """Order these lanes, which have these copies, to step with their actions."""
+        """Order these lanes to step with these actions. `copies` are the copies of the lanes."""
         assert self._some is not None
         begin_step = self._some.begin_step
         if self._missing:
             self._assign_again(set(copies), pulse)
         if self._actions is None:
-            self._actions = np.resize(actions, (self.env.num_envs, *actions.shape[1:]))  # any actions of the space
+            self._actions = np.resize(actions, (self.env.num_envs, *actions.shape[1:]))  # arbitrary, but valid
         padded = self._actions
         padded[copies] = actions
         self._wait(lambda: begin_step(lanes, self._batched(padded)), pulse)
 
     def _ended(self, lanes: Sequence[int], copies: list[int], pulse: Pulse) -> StepResult:
-        """Wait for these lanes, which have these copies. The result has a row for each copy of all lanes."""
+        """Wait for these lanes. `copies` are their copies. The result has a row for each copy of all lanes."""
         assert self._some is not None
         end_step = self._some.end_step
         return self._read_result(self._wait(lambda: end_step(lanes), pulse), copies)
@@ -272,7 +273,7 @@ class SplitVectorEnv:
 class SplitLane:
     """The env copies of one lane, or those for evaluation.
 
-    If a copy is lost, the running episodes of an evaluation are lost.
+    If a copy is lost during an evaluation, all its running episodes are lost.
     """
 
     def __init__(self, split: SplitVectorEnv, first: int, count: int) -> None:
@@ -305,15 +306,15 @@ class SplitLane:
         raise ValueError("render: copies of a vector environment cannot be filmed; use millrace evaluate --video")
 
     def close(self) -> None:
-        """The copies belong to the vector environment, and are reset when the lane starts anew.
+        """Stop waiting for a step. The copies belong to the vector environment, and are reset when the lane starts again.
 
-        A lane is closed when its rollout is dropped, so the step of any lane that is under way isn't wanted any more.
+        A lane is closed when its rollout is dropped. Then no lane needs the result of a step in progress.
         """
         self._split.abandon()
 
     @contextmanager
     def _own_numbers(self) -> Iterator[None]:
-        """While it is entered, errors of the vector environment's copies become errors of this lane's copies."""
+        """A context in which errors name a copy by its number in this lane, instead of that in the vector environment."""
         try:
             yield
         except CopyFailed as error:

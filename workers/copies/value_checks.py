@@ -1,4 +1,4 @@
-"""Checks that the values of rows are finite and within their spaces before they are sent. `row_writers` has checked shapes.
+"""Checks, before rows are sent, that their values are finite and within their spaces. `row_writers` has checked the shapes.
 
 If not, each function raises `EnvironmentFailed`, which names the lane (or an evaluation if `lane` is None), and the step and
 the copy of the first wrong value. Arrays are [rows, N, …] with the axes `RunSpec.row_axes`; row 0 is step `first_step`.
@@ -34,7 +34,7 @@ def check_rewards(lane: int | None, reward: Array, axes: Axes, first_step: int =
 
 
 def check_acted(lane: int | None, name: str, array: Array, obs: Sequence[Array], axes: Axes, first_step: int = 0) -> None:
-    """Check that the policy's outputs are finite. If not, the cause is taken to be observations that are too large."""
+    """Check that the policy's outputs are finite. If they aren't, the error blames observations that are too large."""
     if why := wrong_values(array, None, axes, first_step):
         largest = max((float(np.abs(leaf).max(initial=0)) for leaf in obs if leaf.dtype.kind == "f"), default=0)
         line = f"{name} of the policy: {why}, from observations up to {largest:g}"

@@ -1,1 +1,1 @@
-"""Evaluating a policy: whole episodes on env copies of their own, apart from the lanes of training."""
+"""Evaluating a policy: playing whole episodes on separate env copies, which don't belong to the lanes of training."""

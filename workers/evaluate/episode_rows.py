@@ -1,6 +1,6 @@
 """Sends the rows of the episodes of one evaluation, in messages of bounded size.
 
-Rule: a message contains consecutive rows of one episode. It is sent when it has `CHUNK_BYTES`, and when the episode ends.
+Rule: a message contains consecutive rows of one episode. It is sent when it reaches `CHUNK_BYTES`, or the episode ends.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ class RowSender:
         self._bytes += sum(leaf.nbytes for leaf in obs)
 
     def add(self, rows: RowsOfEpisode) -> None:
-        """Add rows, which are copied. While frames are wanted, add one row at a time."""
+        """Add copies of these rows. While frames are wanted, add one row at a time."""
         was_last_frame = bool(self._frames) and self._frames_so_far == MOST_FRAMES
         ends = was_last_frame or bool(rows.terminated[-1] or rows.truncated[-1])
         L = len(rows.reward)

@@ -43,11 +43,11 @@ ROWS_AT_ONCE = 16
 """Number of rows that are played before a check: enough to amortize its cost, and few enough to find wrong values early."""
 
 OpenEvaluationCopies = Callable[[RunSpec, int, str | None, Pulse], EvaluationCopies]
-"""Makes a number of copies of a run's environment, with a render mode."""
+"""Makes this many copies of a run's environment, with this render mode (None: none)."""
 
 
 def open_looped_copies(run: RunSpec, count: int, render_mode: str | None, pulse: Pulse) -> EvaluationCopies:
-    """Make copies in this process. Raises `UsageError` if the environment does not render in this mode, `rgb_array`."""
+    """Make copies in this process. Raises `UsageError` if the environment does not support the render mode."""
     make = EnvMaker(run.env.for_evaluation(), render_mode)
     with warnings.catch_warnings():
         if render_mode is not None:
@@ -176,7 +176,7 @@ class Evaluator:
         return copies
 
     def _show_frame(self, sender: RowSender, copies: EvaluationCopies) -> None:
-        """Pass the frame that the sender's copy renders to the sender, if it wants one."""
+        """If the sender wants a frame, render its copy and pass the frame to the sender."""
         if not sender.wants_frame:
             return
         n = sender.episode
@@ -188,8 +188,8 @@ class Evaluator:
     def _played(self, n: int, L: int, rows: RowsOfLane, chosen: Array, ended: EndedEpisode | None) -> RowsOfEpisode:
         """The first L of these rows for copy n.
 
-        `chosen` [T, k · A, *action] are the actions of all copies. `ended` is the copy's episode if it ended in the last of
-        these rows, else None.
+        `chosen` [T, k · A, *action] are the actions of all copies. `ended` is the copy's episode if it ended in row L - 1,
+        else None.
         """
         cut = ended is not None and ended.cut
         if self._run.seats:

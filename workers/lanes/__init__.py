@@ -1,1 +1,1 @@
-"""Lanes: env copies that are stepped together, and the one piece of code that steps a policy over them."""
+"""Lanes: env copies that are stepped together, and the only code that steps them with a policy's actions."""

@@ -74,9 +74,9 @@ class _Repeated:
         self, run: RunSpec, lane: Lane, copies: LoopedCopies, past: LanePast, continued: list[int], pulse: Pulse
     ) -> None:
         self.continued = continued
-        """the copies that can still be continued, because they haven't differed from the past so far"""
+        """the copies that can still be continued, because they have matched the past so far"""
         self.why = ""
-        """how the first copy that differed from the past did so; empty if none has"""
+        """how the first copy that didn't match the past differed from it; empty if all have matched"""
         self._run = run
         self._lane = lane
         lane.starts = [last.start for last in past.copies]
@@ -166,12 +166,12 @@ class _Repeated:
         return self._past.copies[n].first
 
     def _begins_with_start(self, n: int) -> bool:
-        """Whether the episode of copy n began with the seed of its start."""
+        """Whether the episode of copy n began with a reset with the seed of the copy's start."""
         last = self._past.copies[n]
         return last.is_repeated and last.random == b""
 
     def _follows(self, n: int) -> bool:
-        """Whether the episode of copy n began with a reset without a seed, in a step."""
+        """Whether the episode of copy n began in a step, with a reset without a seed."""
         last = self._past.copies[n]
         return bool(last.random) and last.is_repeated
 

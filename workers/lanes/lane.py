@@ -61,7 +61,7 @@ class Lane:
         self.starts: list[int] = []
         """[N] the number of each copy's start, which determines its seed; empty in an evaluation"""
         self.new_starts: Sequence[int] = ()
-        """the copies that have started since the last call of `begun`"""
+        """the copies that have started since `begun` was last called"""
         self.remembers = isinstance(copies, LoopedCopies) and not run.teams
         """whether the lane's episodes can be continued on other copies"""
         self.columns = self.count * run.seats_of_copy
@@ -80,13 +80,13 @@ class Lane:
         self.others: OtherTeams | None = None
         """the players of the other teams; None if the policy plays all seats"""
         self.opponent: Opponent | None = None
-        """the opponent in the episodes that begin from now on; None: the same as before"""
+        """the opponent in episodes that begin from now on; None: it doesn't change"""
         self.writer = ObservationWriter(leaves, self.columns, run.seats)
         self._run = run
         self._attributes = b""  # the attributes that were set on the copies last, packed
 
     def set_attributes(self, packed: bytes, pulse: Pulse) -> None:
-        """Set these attributes, packed, on all copies, except those that have the same value already.
+        """Set these packed attributes on all copies, except attributes that already have the same value.
 
         Raises `EnvironmentFailed` if a copy lacks one.
         """
@@ -122,7 +122,7 @@ class Lane:
             self.add_outside(first.outside[: self.columns], 0)
 
     def add_outside(self, rewards: Doubles, step: int) -> None:
-        """Add rewards [N · A] of this step that don't belong to any row to the returns.
+        """Add this step's rewards [N · A] that belong to no row to the returns.
 
         They are checked here, because they aren't in the rows that are checked later.
         """
@@ -136,7 +136,7 @@ class Lane:
         return slice(None) if self.others is None else np.flatnonzero(self.others.mine)
 
     def begun(self) -> tuple[EpisodeBegin, ...]:  # rule PAST
-        """How the newest episode began in each copy that has begun one since the last call of this."""
+        """For each copy that has begun an episode since `begun` was last called, how its newest episode began."""
         random: dict[int, bytes | None] = dict.fromkeys(self.new_starts, b"" if self.remembers else None)
         self.new_starts = ()
         if self.remembers and isinstance(self.copies, LoopedCopies):

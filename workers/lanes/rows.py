@@ -40,7 +40,7 @@ class Rows:
         shape = (L, T, columns)
         self.steps = steps
         self.first_step = 0
-        """the number of the first row's step, as errors name it"""
+        """the number of the first row's step in error messages"""
         self.obs = tuple(np.empty((L, T + 1, columns, *leaf.shape), leaf.dtype) for leaf in stored_leaves(run))
         """[L, T+1, N · A, *leaf] each; in a masked run the last one is the mask"""
         self.state: Floats = np.array([lane.state for lane in lanes])
@@ -53,10 +53,10 @@ class Rows:
         self.resets = np.zeros((L, T + 1, lanes[0].count), bool)
         """[L, T+1, N] whether step t belongs to no episode: it only resets the copy, or leaves it as it is"""
         self.step_end_s: list[float] = []
-        """[T] by perf_counter"""
+        """[T] when each step ended, in seconds of `perf_counter`"""
         self.of_lanes = [RowsOfLane(run, self, i, lane) for i, lane in enumerate(lanes)]
         self.numbers = [lane.number for lane in lanes if lane.number is not None]
-        """of the lanes"""
+        """numbers of the lanes; none in an evaluation"""
         self._calls = activity().numbers
         self._calls_before_row = 0
 
@@ -75,7 +75,7 @@ class Rows:
         self._calls_before_row = self._calls[ENV_CALLS]
 
     def begin_again(self) -> None:
-        """Begin the next rows, in the same arrays, where these rows end."""
+        """Begin the next rows, which follow these rows and reuse their arrays."""
         self.first_step += self.steps
         self.step_end_s.clear()
         for array in self.obs:
@@ -92,13 +92,13 @@ class Rows:
         if self.filled == self.steps:
             return before
         after = self._of_rows(self.filled + 1)
-        # Calls in this row that have returned. In the worst case, the copies that it resets were called first.
+        # Calls in this row that have returned. Assume that the first of them were resets, so that the count never falls.
         calls = self._calls[ENV_CALLS] - self._calls_before_row
         resets = sum(each.lane.count for each in self.of_lanes) - (after - before)
         return min(after, before + max(0, calls - resets))
 
     def _of_rows(self, rows: int) -> int:
-        """Env steps of this many rows. Which copies a row only resets is known before the row is made."""
+        """Env steps in this many rows. Before a row is made, it is known which copies it only resets."""
         return sum(rows * each.lane.count - each.resets_in(rows) for each in self.of_lanes)
 
 
@@ -117,9 +117,9 @@ class RowsOfLane:
         self.valid: Bools = np.zeros(self.reward.shape, bool)
         """[T, N · A]"""
         self.ended: list[EndedEpisode] = []
-        """ordered by step, then by copy"""
+        """the episodes that ended, ordered by step, then by copy"""
         self.columns: SeatColumns | None = None
-        """of the newest step, with seats"""
+        """columns of the newest step; None without seats"""
         self._rows = rows
         self._seats = run.seats_of_copy
         self._numbers = (self.reward, self.terminated, self.truncated)
@@ -142,7 +142,7 @@ class RowsOfLane:
         self.lane.state = self.state.copy()
 
     def resets_in(self, rows: int) -> int:
-        """How many steps of the copies, in this many rows, belong to no episode."""
+        """How many steps of copies in this many rows belong to no episode."""
         if self.lane.seats is not None or not self.lane.autoresets:
             return int(np.count_nonzero(self.resets[:rows]))
         if not rows:
@@ -151,9 +151,9 @@ class RowsOfLane:
         return int(np.count_nonzero(self.resets[0]) + np.count_nonzero(ended))
 
     def acted(self, t: int, written: Sequence[Array], before: Floats, taken: Array) -> None:
-        """With seats: take the policy's row t, before which its state was `before`. Opponents act, too.
+        """With seats: keep what the policy wrote at step t only for seats that act, and let the opponents act.
 
-        `taken`: the actions [N · A, *action] for the environment.
+        `before`: the policy's state before this step. `taken`: the actions [N · A, *action] for the environment.
         """
         lane = self.lane
         assert lane.seats is not None

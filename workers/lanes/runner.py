@@ -1,4 +1,4 @@
-"""Steps a policy over the env copies of lanes, in rollouts as in evaluations.
+"""Steps the env copies of lanes with a policy's actions, in rollouts and in evaluations.
 
 Rule: lanes that are run together are stepped in lock-step, with one forward pass for all of them [L, N · A, ·]. The result
 of a lane depends only on the lane and the weights, not on the other lanes. An evaluation differs in its lane
@@ -34,7 +34,7 @@ class TogetherSteps(Protocol):
     """
 
     def parts(self, lanes: int) -> Sequence[slice]:
-        """Into which parts this many lanes are divided: the policy acts for one part while the copies of the others step."""
+        """Divide this many lanes into parts: the policy acts for one part while the copies of the other parts step."""
 
     def begin(self, lanes: Sequence[int], actions: Array, pulse: Pulse) -> None:
         """Order the copies of these L lanes to step, with actions [L, N, *action]."""
@@ -47,7 +47,7 @@ class NoneTogether:
     """Each lane steps its own copies."""
 
     def parts(self, lanes: int) -> Sequence[slice]:
-        """All in one part."""
+        """A single part with all lanes."""
         return (slice(None),)
 
     def begin(self, lanes: Sequence[int], actions: Array, pulse: Pulse) -> None:
@@ -92,7 +92,7 @@ class LaneRunner:
             for each in stepped:
                 each.end(pulse)
         except (EnvironmentFailed, PolicyFailed, IndexError):
-            # An invalid observation or reward may have caused the error. Then these checks raise a clearer one.
+            # An invalid observation or reward may have caused the error. In that case, these checks raise a clearer error.
             for part in parts:
                 self.check(part.rows)
             raise
@@ -168,7 +168,7 @@ class _SteppedPart:
             self._resets = rows.terminated[:, t] | rows.truncated[:, t]
 
     def complete(self) -> None:
-        """All rows are filled."""
+        """Finish the part, now that all rows are filled."""
         if not self._counts_rows:
             for each in self._rows.of_lanes:
                 each.count_all()

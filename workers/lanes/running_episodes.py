@@ -35,7 +35,7 @@ class EndedEpisode(NamedTuple):
 
 
 class RunningEpisodes:
-    """The returns and lengths so far of the running episodes of N copies, with A seats each."""
+    """The running episodes of N copies with A seats each: their returns and lengths so far."""
 
     def __init__(self, run: RunSpec, copies: int, lane: int | None, most_steps: int = LARGEST) -> None:
         """`lane` is the lane's number for errors, or None for an evaluation. An episode that reaches `most_steps` is cut."""

@@ -16,13 +16,13 @@ class Ending:
     on_purpose: bool = False
     """Whether the worker announced that it would leave with this code."""
     failed: bool = False
-    """Whether the environment, the policy, or the worker is to blame: it did not end on purpose, nor before it ran any of
-    their code.
+    """Whether the environment, the policy, or the worker is to blame: the worker did not end on purpose, and had begun to
+    run their code.
     """
     of_policy: bool = False
-    """Whether it failed in a call of the policy."""
+    """Whether the worker failed in a call of the policy."""
     hung: bool = False
-    """Whether it was ended because a call of the environment, or of the policy, took too long."""
+    """Whether the worker was ended because a call of the environment, or of the policy, took too long."""
     worked: bool = False
     """Whether any calls of the environment have returned."""
     last_lines: str | None = None

@@ -1,9 +1,9 @@
 """Reports to the learner, over the supervisor's own connection, which workers are alive, what they do, and how others ended.
 
 Rule: a report is sent about every second, and more often while a call of an environment takes long. It names an ended worker
-for a while, because a message may be lost: a worker that failed is named immediately, one that left on purpose a moment
-later, so that its own last messages arrive first. Nothing is sent before a worker has joined, because the worker itself
-reports a wrong address or key. This file imports neither numpy nor gymnasium.
+for a while, because a message may be lost. A worker that failed is named immediately; a worker that left on purpose is named
+a moment later, so that its own last messages arrive first. Nothing is sent before a worker has joined, because the worker
+itself reports a wrong address or key. This file imports neither numpy nor gymnasium.
 
 If the workers share weights, the learner sends each version once, over this connection. It answers each report, so that both
 sides know what has arrived. Its answer also says to which learner the weights belong, as a Welcome does on a worker's
@@ -50,7 +50,7 @@ class AliveSender:
         self._address = address
         self._token = token
         self._weights = weights
-        self._first_session = self._replies = 0  # values in the learner's last answer
+        self._first_session = self._replies = 0  # as in the learner's last answer
         self._socket: zmq.Socket[bytes] | None = None
         self._due_s = 0.0
         self._ended: list[tuple[float, WorkerExit]] = []

@@ -1,13 +1,13 @@
 """Starts, watches, restarts and stops the workers of this machine.
 
-The supervisor doesn't follow their conversation with the learner; it only learns when the run is over.
+The supervisor doesn't follow their conversation with the learner; it is only told when the run is over.
 
 Rule: a worker that left on purpose with exit code 0, was refused (2), found no learner (EXIT_NO_LEARNER) or cannot take part
 in this run (EXIT_UNSUITABLE) is not started again. Any other worker is restarted with backoff: the pause doubles with each
 death, and is reset once calls of the environment have returned, or the worker has run for `HEALTHY_S` seconds. So a
 simulator that works and then dies is restarted quickly; the learner counts its failures. A worker counts as having left on
-purpose only if it has announced this: an exit code that an environment causes is a failure. No worker outlives its
-supervisor.
+purpose only if it has announced this; if an environment makes the process exit, that is a failure, whatever the exit code.
+No worker outlives its supervisor.
 
 A worker that has never joined a run, and has ended early `MOST_FAILED_STARTS` times in a row, is not started again: its
 problem, such as a broken installation, won't go away by itself.
@@ -42,9 +42,9 @@ MOST_FAILED_STARTS = 4
 GIVEN_UP = f"; after {MOST_FAILED_STARTS} such ends it is not started again"
 POLL_S = 0.1
 ENFORCE_EVERY_S = 0.2
-STOP_WITHIN_S = 3.0  # time for ending after SIGTERM at the end of a run, before local workers are killed
-FINISH_ROLLOUT_WITHIN_S = 30.0  # time for finishing a rollout after the request to leave, if calls of the environment return
-HANGS_AFTER_S = 8.0  # longest call of the environment once workers were asked to leave, or the run is over
+STOP_WITHIN_S = 3.0  # how long local workers may take to end after SIGTERM at the end of a run, before they are killed
+FINISH_ROLLOUT_WITHIN_S = 30.0  # time for the rollout in progress after a request to leave, if environment calls return
+HANGS_AFTER_S = 8.0  # once workers were asked to leave, or the run is over: a longer call of the environment hangs
 
 
 class Running(Protocol):
@@ -183,7 +183,7 @@ class Supervisor:
     def _restart(self, worker: _NamedWorker, now: float) -> None:
         try:
             worker.running = self._start(worker.name)
-        except (OSError, UsageError) as error:  # for example, the system lacks memory, processes or files now
+        except (OSError, UsageError) as error:  # for example, the system has run out of memory, processes or files
             log.warning("worker %s cannot be started and will be tried again: %s", worker.name, error)
             self._schedule(worker, now)
             return
@@ -194,7 +194,7 @@ class Supervisor:
 
     def _record_end(self, worker: _NamedWorker, end: Ending, now: float) -> None:
         left = end.on_purpose and end.code in (0, EXIT_REFUSED, EXIT_NO_LEARNER, EXIT_UNSUITABLE)
-        told_early = self._stopping and end.code == -signal.SIGTERM  # asked to leave before it could handle signals
+        told_early = self._stopping and end.code == -signal.SIGTERM  # SIGTERM arrived before the worker could handle it
         worker.running = None
         worker.exit_code = end.code if left else 0 if told_early else 1
         healthy = end.worked or now - worker.started_s > HEALTHY_S or (left and end.code == 0)
@@ -301,7 +301,7 @@ class Supervisor:
                 leave_by_s = kill_hanging_from_s if self._stopping else leave_by_s
             if now > kill_hanging_from_s:
                 self._kill_hanging(HANGS_AFTER_S, now)
-                if not self._stopping:  # the remaining workers are those of the next run
+                if not self._stopping:  # with `stay`, the workers that remain wait for the next run
                     kill_hanging_from_s = float("inf")
             if now > leave_by_s:
                 self.stop(0.0)

@@ -34,16 +34,16 @@ from millrace.workers.watchdog import deepest_frame, where_it_hung
 
 log = logging.getLogger("millrace.worker")
 
-popen = subprocess.Popen  # a name of its own, so that a test can start workers in another way
+popen = subprocess.Popen  # tests replace this to start workers in another way
 
 NONCE_VARIABLE = "MILLRACE_WORKER_NONCE"
 WRITE_STACKS_S = 0.3  # time for writing stacks, from the signal until the worker is killed
-CLOSE_ENVS_WITHIN_S = 5.0  # time for closing its environments and ending, once a worker has announced that it leaves
+CLOSE_ENVS_WITHIN_S = 5.0  # once a worker has announced that it leaves: time for closing its environments and ending
 KILLED_WITHIN_S = 5.0  # how long to wait for processes to end after SIGKILL
 POLL_S = 0.02
-LONGEST_OUTPUT = 1 << 20  # bytes that are read from the end of a log
-MOST_LAST_LINES = 12  # lines of the log that are shown if a worker cannot start
-MAX_LAST_TEXT = 2_000  # characters of these lines
+LONGEST_OUTPUT = 1 << 20  # at most this many bytes are read, from the end of a log
+MOST_LAST_LINES = 12  # at most this many lines of the log are shown if a worker cannot start
+MAX_LAST_TEXT = 2_000  # and at most this many characters of those lines
 LOWEST_PRIORITY = 19  # niceness
 SINGLE_THREADED = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
@@ -72,7 +72,7 @@ class WorkerProcess:
         self.process_nonce = int.from_bytes(os.urandom(6), "little")
         self._slots = open_slots()
         self._page = ActivityReader()
-        self._because = ""  # why the supervisor ends the worker
+        self._because = ""  # why the supervisor ended the worker, if it did
         self._kill_at_s = float("inf")
         self._end: Ending | None = None
         self._exit_code: int | None = None  # set when the worker has ended; processes that it started may still run
@@ -83,7 +83,7 @@ class WorkerProcess:
         command += ["--slots", str(self._slots), *start.flags]
         # The child must find the modules that its parent found: a user's environment may be in the folder of their script.
         path = os.pathsep.join(entry or os.getcwd() for entry in [*sys.path, str(Path(__file__).parents[3])])
-        # The variable is removed: a token in it is not for this learner, or the worker would get it as `start.token`.
+        # Remove the variable: a token in it is for another learner. A token for this learner is passed as `start.token`.
         environment = {name: value for name, value in os.environ.items() if name != TOKEN_VARIABLE}
         environment |= SINGLE_THREADED | {NONCE_VARIABLE: str(self.process_nonce), "PYTHONPATH": path}
         if start.token is not None:
@@ -130,9 +130,9 @@ class WorkerProcess:
     def activity(self, now: float) -> WorkerActivity | None:
         """What the worker is doing.
 
-        None if it has ended. None if its process is stopped, so that the learner considers the worker silent. While
-        processes that it started still run, its last activity is reported: if the learner considered it silent during that
-        time, it would not count the failure.
+        None if it has ended, or if its process is stopped, so that the learner considers the worker silent. While processes
+        that an ended worker started still run, the worker's last activity is reported: if the learner considered the worker
+        silent during that time, it would not count the failure.
         """
         if self.ended() is not None or _is_stopped(self.pid):
             return None
@@ -168,7 +168,7 @@ class WorkerProcess:
         """Give the worker's main thread, which steps the environments, the lowest CPU priority.
 
         With Linux's autogroup, the niceness of a process matters only within its session, and a worker has its own session.
-        So the session gets the same niceness.
+        So the session gets the lowest priority too.
         """
         if self._runs():
             os.setpriority(os.PRIO_PROCESS, self.pid, LOWEST_PRIORITY)
@@ -254,7 +254,7 @@ class WorkerProcess:
             line = f"ended{meanwhile}; its exit code is not known"
         else:
             line = f"ended with exit code {code}{meanwhile}{last if code else ''}"
-        # In `close`, an environment has done its work already. If the process ends there, that doesn't count as a failure.
+        # When an environment is closed, its work is done. If the process ends in `close`, that doesn't count as a failure.
         failed = page.doing != "closing" and (worked or page.doing not in OUR_CODE)
         of_policy = failed and page.doing in OF_POLICY
         last_lines = _end_of(output) if page.doing == "starting" else None

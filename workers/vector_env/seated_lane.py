@@ -1,4 +1,4 @@
-"""The env copies of one lane of a vector environment with seats. They have N · A rows, where those of a copy are adjacent.
+"""The env copies of one lane of a vector environment with seats. They have N · A rows; the rows of one copy are adjacent.
 
 Rule: rows are, bit for bit, those of a loop over the same copies (`millrace.protocol.envs.seats`). With SameStep, the step
 in which a copy's last agent leaves returns the last rows of the episode, but with the first observations of the next
@@ -53,7 +53,7 @@ class SeatedLane(SteppedLane):
 
 
 def _reset(last: SeatStep, first: SeatStep) -> SeatStep:
-    """The result of a step that ended an episode (`last`), and in which SameStep then reset the copy (`first`)."""
+    """Combine the step that ended an episode (`last`) with the reset by which SameStep began the next one (`first`)."""
     infos: list[Mapping[str, Any]] = [
         {"final_obs": seen, "final_info": info, **new}
         for seen, info, new in zip(last.observations, last.infos, first.infos, strict=True)

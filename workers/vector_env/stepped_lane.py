@@ -51,7 +51,7 @@ class SteppedLane:
         self.incarnation = incarnation
         self.rows = rows
         self.executed = 0
-        """number of the newest order in shared memory that was executed"""
+        """number of the last order from shared memory that was executed"""
         first = spec.first_copy(lane)
         self.count = spec.lanes[lane]
         makes = [EnvMaker(spec.envs[of], spec.render_mode) for of in spec.copies[first : first + self.count]]
@@ -95,7 +95,7 @@ class SteppedLane:
         return map(self._nest, zip(*actions, strict=True)) if self._nested_actions else actions[0]
 
     def _write(self, infos: CopyInfos) -> CopyInfos:
-        """Write the rows of all copies, for which the loop returned these infos. Returns the infos by row."""
+        """Write the rows of all copies. `infos` are the infos that the loop returned; returns them by row."""
         leaves = read_leaves(self._read, self._observations) if self._nested_observations else (self._observations,)
         self._writer.write(self._joined, 0, leaves)
         self._write_numbers()
@@ -131,7 +131,7 @@ class SteppedLane:
         return [describe_env(self._loop.envs[n]) for n in copies]
 
     def assign(self, copies: Sequence[int], name: str, values: Sequence[Any]) -> None:
-        """Set the attribute with this name on these copies, to one of `values` on each."""
+        """Set the attribute with this name on these copies; `values` has a value for each of them."""
         for n, value in zip(copies, values, strict=True):
             self._loop.envs[n].set_wrapper_attr(name, value)
 

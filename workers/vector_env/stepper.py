@@ -82,8 +82,8 @@ class Stepper:
         """Execute the orders in shared memory for `timeout_s` seconds. Returns True early if the wake pipe announces a
         message.
 
-        Spinning is faster than waiting for the pipe. At most `cores - 1` workers spin: those that finish first. The last
-        worker does not spin, so that its core is free for the learner, which it wakes.
+        Checking the memory in a loop (spinning) is faster than waiting for the pipe. At most `cores - 1` workers spin: those
+        that finish first. The last worker wakes the learner and does not spin, so that its core is free for the learner.
         """
         assert self._memory is not None
         assert self._wake_in is not None
@@ -101,7 +101,7 @@ class Stepper:
 
     @property
     def uses_shared_memory(self) -> bool:
-        """Whether `serve_shared_memory` has lanes to serve."""
+        """Whether this process has lanes whose orders arrive in shared memory."""
         return self._memory is not None and bool(self.lanes)
 
     def _has_order(self) -> bool:
