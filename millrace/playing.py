@@ -28,7 +28,7 @@ from millrace.protocol.envs.wrappers import WrapperLike
 from millrace.protocol.errors import UsageError, did_you_mean
 from millrace.terminal import count_line
 
-NOT_KEYWORDS = ("wrappers",)  # may be objects in Python, so functions take them as parameters of their own
+NOT_KEYWORDS = ("wrappers",)  # Python code may pass objects for these flags, so functions declare them as parameters
 ShowPlayed = Callable[[str], None]
 """Takes the progress as text, and shows it."""
 _Flags = TypeVar("_Flags", bound=PlayFlags)

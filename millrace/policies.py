@@ -159,7 +159,7 @@ class Piece(NamedTuple):
 
     @property
     def size(self) -> int:
-        """Number of its elements."""
+        """Number of elements."""
         return math.prod(self.shape)
 
 
@@ -235,7 +235,7 @@ class PolicyParameters:
         return _flat(parameters, self._fields, "parameters")
 
     def flat_buffers(self, buffers: Mapping[str, Array] | Array | None) -> Floats:
-        """A flat float32 copy of the buffers, given flat or by name. None stands for mean 0 and standard deviation 1.
+        """A flat float32 copy of `buffers`, which may be flat or by name. None stands for mean 0 and standard deviation 1.
 
         Raises `UsageError` if an array is missing, has a wrong shape, or isn't finite.
 

@@ -1,4 +1,4 @@
-"""A Dict or Tuple of actions as one row of numbers, and the way back to its structure. Pure.
+"""Converts a Dict or Tuple of actions to one row of numbers, and back. Pure.
 
 Rule: a row has the choices of all Discrete and MultiDiscrete parts, then the bits of all MultiBinary parts, then the numbers
 of all Box parts. Within each of these three groups, the parts are in the order of the space. So a mixed action has at most
@@ -21,7 +21,7 @@ Path = tuple[str | int, ...]
 
 
 class PlacedPart(NamedTuple):
-    """A part of a mixed action, described as an action of its own, and where it is in the mixed action."""
+    """A part of a mixed action: its spec as an action by itself, and its place in the mixed action."""
 
     path: Path
     spec: ActionSpec

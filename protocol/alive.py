@@ -38,7 +38,7 @@ class WorkerExit(msgspec.Struct, frozen=True, array_like=True):
     reason: Line
     """how it ended: an exit code, a signal, or the name of the timeout flag that its supervisor enforced"""
     failed: bool
-    """whether the environment, the policy, or the worker is to blame, rather than that it left on purpose"""
+    """whether the environment, the policy, or the worker is to blame for the worker's end"""
     of_policy: bool = False
     """whether it failed in a call of a user-defined policy, so that no environment is to blame"""
     hung: bool = False
@@ -61,7 +61,8 @@ class StartFailed:
 class Alive(Message, frozen=True):
     """A supervisor reports which of its workers are running, and which have ended.
 
-    The learner believes what it says about a worker if it gives the `process_nonce` of that worker and uses the same key.
+    The learner believes what a report says about a worker if it contains the worker's `process_nonce` and comes from a peer
+    with the worker's key.
     Once the run is over, the learner answers with `Drain`, and the supervisor ends the workers that don't leave by
     themselves.
     """

@@ -1,7 +1,7 @@
 """What a worker is doing, and how long a call of user code may take. Imports neither numpy nor gymnasium. Pure.
 
 Rule: every call of user code has a limit, and a worker that exceeds it is ended (by `WorkerProcess.end_if_hung`). Millrace's
-own code has none.
+own code has no limit.
 """
 
 from __future__ import annotations

@@ -52,7 +52,7 @@ class LastEpisode(msgspec.Struct, frozen=True, array_like=True):
     first: Natural
     """index of the episode's first row in `LanePast.action`"""
     over: bool
-    """whether the episode before it is over, and the next step begins it"""
+    """whether the previous episode is over, so that the next step begins this one"""
     saved: bool = False
     """whether `LanePast.memory` has the state of the copy after the last row, so that nothing needs to be repeated"""
 
@@ -68,7 +68,7 @@ class LastEpisode(msgspec.Struct, frozen=True, array_like=True):
 
 
 class AttributesFrom(msgspec.Struct, frozen=True, array_like=True):
-    """Attributes that were set on the env copies, and the row from which on they had them (`Weights.env_attributes`)."""
+    """Attributes that were set on the env copies before a row (`Weights.env_attributes`)."""
 
     row: Natural
     """index of that row in `LanePast.action`"""
@@ -77,13 +77,13 @@ class AttributesFrom(msgspec.Struct, frozen=True, array_like=True):
 
 
 class LanePast(msgspec.Struct, frozen=True, array_like=True):
-    """The past of a lane of N env copies with A columns each, up to the round that its next rollout is for."""
+    """The past of a lane of N env copies with A columns each, up to the round of its next rollout."""
 
     lane: Natural
     copies: Annotated[tuple[LastEpisode, ...], Meta(max_length=MAX_COPIES)]
     """one for each env copy"""
     action: Array
-    """[K, N · A, *action], as in rollouts: the actions of the K rows since the earliest of these episodes began"""
+    """[K, N · A, *action], as in rollouts: the actions of the K rows since the earliest episode in `copies` began"""
     attributes: tuple[AttributesFrom, ...]
     """ascending by row; no attributes were set before the first of these rows"""
     obs: tuple[Array, ...]

@@ -110,7 +110,7 @@ class Weights(Message, frozen=True):
 
 
 def versions_of(version: int, opponents: Iterable[int | None]) -> set[int]:
-    """The versions of all weights that are needed: the weights that act, and those opponents that are weights."""
+    """All versions of the weights that are needed: `version`, and those of opponents that are weights of the policy."""
     return {version, *(number for number in opponents if number is not None and number >= 0)}
 
 
@@ -132,8 +132,8 @@ class Permit(msgspec.Struct, frozen=True, array_like=True):
     starts (rule PAST)"""
 
     def of_new_episodes(self, copies: int) -> Permit:
-        """The same ticket for a lane of `copies` copies that can't be continued: each begins a new episode, unlike its
-        first.
+        """The same ticket for a lane of `copies` copies that can't be continued: each begins a new episode, which differs
+        from its first one.
         """
         return msgspec.structs.replace(self, past=LanePast.unknown(self.lane, copies))
 
@@ -192,7 +192,7 @@ class Heartbeat(Message, frozen=True):
     """number of the last HeartbeatReply received; what the learner sent before that has arrived or is lost
     (rule HEARTBEAT_REPLIES)"""
     versions: Versions
-    """of the weights held, ascending (rule HEARTBEAT_VERSIONS)"""
+    """versions of the weights held, ascending (rule HEARTBEAT_VERSIONS)"""
     tickets: Tickets
     """tickets that the worker holds and has not finished: those that wait, and those of the work in progress
     (rule HEARTBEAT_TICKETS)"""
@@ -280,7 +280,7 @@ class Evaluate(Message, frozen=True):
     ticket: Natural
     version: Natural
     seeds: Annotated[tuple[Natural, ...], Meta(min_length=1, max_length=MAX_SEEDS)]
-    """reset seed of each episode; all are stepped together as one batch, in which those that have ended stay, unused"""
+    """reset seed of each episode; all episodes are stepped as one batch, in which those that have ended stay, unused"""
     greedy: bool
     """true: take the most probable actions; false: draw them, with random numbers that are derived from the first seed and
     differ from those that an environment with this seed draws (rule GREEDY)"""

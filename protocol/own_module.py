@@ -30,8 +30,8 @@ def is_name(text: str) -> bool:
 def own_callable(name: str, what: str, example: str) -> Callable[..., Any]:
     """Import `module:name`, a function or class.
 
-    Raises `UsageError` if that fails. In it, `what` quotes the setting, for example `callback mine:Stop`, and `example` is a
-    valid name.
+    Raises `UsageError` if that fails. In the error, `what` quotes the setting, for example `callback mine:Stop`, and
+    `example` shows a valid name.
     """
     if not is_name(name):
         raise UsageError(f"{what}: {module_of_file(name, 'NAME') or f'expected module:factory, as in {example}'}")

@@ -44,7 +44,7 @@ class Purpose(IntEnum):
     RECORDING = 12
     """reset seeds of a recording; episode"""
     PLAYED_ACTIONS = 13
-    """actions of a played episode, where the seed is the episode's reset seed; also actions of a loaded policy"""
+    """actions of a played episode, derived from the episode's reset seed; also actions of a loaded policy"""
     REPLACEMENT = 14
     """reset seed of an env copy that replaces a lost one, derived from the lost one's seed; incarnation"""
     SECOND_INSTANCE = 15
@@ -56,7 +56,7 @@ class Purpose(IntEnum):
     MATCHES = 18
     """the opponent of a rollout; lane, round"""
     PLAYED_OPPONENTS = 19
-    """actions of opponents in a played episode, where the seed is the episode's reset seed"""
+    """actions of opponents in a played episode, derived from the episode's reset seed"""
     ROUNDS = 20
     """durations of the rounds that `millrace plan` simulates"""
 
@@ -85,7 +85,7 @@ class RoundStreams:
 
 
 def env_seed(seed: int, purpose: Purpose, *indices: int) -> int:
-    """A reset seed. It has 31 bits, because environments pass seeds to C. In practice, other indices give another seed."""
+    """A reset seed of 31 bits, because environments pass seeds to C. Different indices almost never give the same seed."""
     return int(_sequence(seed, purpose, indices).generate_state(1)[0] >> 1)
 
 

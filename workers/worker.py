@@ -287,7 +287,7 @@ class Worker:
             self._do([SendMessage(answer)])
 
     def _fail(self, error: Exception) -> None:
-        """Report to the learner that the environment, a user-defined policy or millrace's own code raised `error`, and leave.
+        """Tell the learner that the environment, a user-defined policy or millrace's own code raised this error, and leave.
 
         If the error is that no slot was free, decline the run instead.
         """

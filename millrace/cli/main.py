@@ -135,7 +135,7 @@ def _print_error(line: str) -> None:
 
 
 def _elsewhere(argv: list[str]) -> bool:
-    """Whether this command line starts a learner without local workers; to resume its run, the same command is needed."""
+    """Whether this command line starts a learner without local workers. Its run must be resumed by the same command."""
     return argv[:1] == ["learner"]
 
 

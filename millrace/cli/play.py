@@ -10,7 +10,7 @@ from millrace.terminal import count_line
 def evaluate(argv: list[str]) -> int:
     """Play the episodes, and print the evaluation. Returns the exit code."""
     flags = parse_flags(EvaluateFlags, argv, "evaluate")
-    from millrace.playing import play  # takes 0.2 s, so only if the flags are right
+    from millrace.playing import play  # takes 0.2 s, so imported only once the flags are valid
 
     with count_line("evaluating") as watch:
         evaluation, videos = play(flags, watch)

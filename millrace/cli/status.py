@@ -104,7 +104,7 @@ def last_state(run: Path) -> RunLine | None:
 
 
 def whom_to_ask(where: str, token: Token | None, *, insecure: bool) -> tuple[str, Token | None]:
-    """The address of a learner, and the token to connect with. `where`: the learner's address, or the folder of its run.
+    """The address of a learner, and the token with which to connect. `where`: its address, or the folder of its run.
 
     A run folder names the learner's key folder. If `token` is None, a token from that folder is used. Raises `UsageError`.
     """

@@ -37,7 +37,7 @@ class ShownRun:
     """Shows the progress of a run, and prints how it ended."""
 
     def __init__(self, argv: list[str], new: Config | None = None, command: str = "train") -> None:
-        """`new`: the settings of a new run; None if it is resumed. Where they come from is shown before the first report.
+        """`new`: the settings of a new run; None if a run is resumed. Their origin is shown before the first report.
 
         `command`: the millrace command that trains the run, and can resume it.
         """
@@ -47,7 +47,7 @@ class ShownRun:
 
     @contextmanager
     def progress(self) -> Iterator[Watch]:
-        """A context manager that yields a function, which shows each progress that it is called with."""
+        """A context manager that yields a function. Call the function with each `Progress`, to show it."""
         with unfailing("stdout"), progress_view(self._log_json) as watch:
             yield watch if self._new is None else _after_origin(self._new, self._command, watch)
 

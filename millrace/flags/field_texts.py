@@ -25,7 +25,7 @@ def field_texts(record: type) -> dict[str, str]:
 
 
 def _class_body(record: type) -> list[ast.stmt]:
-    """The statements of a class; none if its source code can't be read, as for a class typed into a Python prompt."""
+    """The statements of a class; none if its source can't be read, for example because it was typed at a Python prompt."""
     try:
         source = inspect.getsource(record)
         # The source of a nested class is indented.

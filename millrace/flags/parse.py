@@ -83,7 +83,7 @@ def typed_flags(argv: Sequence[str]) -> list[Typed]:
 
 
 def first_words(flags: Sequence[Typed], *names: str) -> dict[str, str]:
-    """The value, or the first word, of each of these flags that was typed with one, by name."""
+    """By name, the first value of each of these flags. Flags that weren't typed, or have no value, are left out."""
     words = {}
     for typed in flags:
         if typed.name in names and (typed.value is not None or typed.words):

@@ -1,4 +1,4 @@
-"""A pool whose workers only step env copies: the policy acts in this process, for half of the copies while the rest steps.
+"""A pool whose workers only step env copies: the policy acts in this process, for half of the copies while the others step.
 
 The learner collects from a single worker, which is a thread of this process. The env copies of this worker belong to a
 vector environment, whose workers are processes. So tickets, ledger, rows, checkpoints and errors work as in every run, and a
@@ -212,7 +212,7 @@ def acting_policy(spec: PolicySpec, device: str, images: ActingDtype) -> Policy:
 
 
 class _BeforeWaits:
-    """Call it before each wait for `env`: it calls the pulse during the wait.
+    """Call this before each wait for `env`, so that the pulse is called during the wait.
 
     The first wait is for workers to join. Rule: a wait raises `NoWorkers` once there has been no worker for `timeout_s`,
     however long an order may take.
@@ -222,7 +222,7 @@ class _BeforeWaits:
         self._env = env
         self._workers = workers
         self._timeout_s = timeout_s
-        self._there_s = 0.0  # when there was last a worker, or the wait began
+        self._there_s = 0.0  # the last time at which there was a worker, or the beginning of the wait
 
     def __call__(self, pulse: Pulse) -> None:
         """Begin a wait."""

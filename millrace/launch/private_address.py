@@ -13,8 +13,8 @@ from contextlib import ExitStack
 
 from millrace.protocol.errors import UsageError, safe_repr
 
-# Most bytes in the path of the temporary folder. If it is longer, /tmp is used, because the path of a socket file can have
-# at most 107 bytes.
+# Largest length of the temporary folder's path, in bytes. If the path is longer, /tmp is used, because the path of a socket
+# file can have at most 107 bytes.
 LONGEST_FOLDER = 80
 
 

@@ -87,7 +87,7 @@ def _train(
     env = env or named_environment(config)
     acts = config.inference == "learner"
     if not elsewhere:
-        check_copies(config, LIMIT_VARIABLE, copies_per_machine())  # this machine will have all env copies of the run
+        check_copies(config, LIMIT_VARIABLE, copies_per_machine())  # all env copies of the run will be on this machine
         if not acts and (line := uneven_lanes(config)):
             log.warning("%s", line)
     here = local_workers(config)
@@ -108,7 +108,7 @@ def _train(
         lobby = pool.begin(known.described, masked=known.spaces.masked)
         interrupts = Interrupts(config.grace_s)
         stack.callback(lambda: pool.stop(interrupts.at_most(STOP_WITHIN_S)))
-        folder = folder or stack.enter_context(run_folder(config, None))  # if workers are elsewhere, once one has joined
+        folder = folder or stack.enter_context(run_folder(config, None))  # with workers elsewhere, made once one has joined
         from millrace.learner.open_run import (
             open_run,  # imports PyTorch, unless it was imported while a worker described the environment
         )

@@ -5,7 +5,7 @@ log how to start one elsewhere; let a worker in the lobby describe the environme
 
 Rule: whatever happens, no worker or thread outlives the context of `start`, and no socket file or folder outlives the pool.
 Workers that still run at the end of this context are stopped almost at once. To give them time to finish their work, call
-`stop` before.
+`stop` first.
 """
 
 from __future__ import annotations
@@ -110,7 +110,7 @@ class ActingPool:
 
 
 def _started(bound: Bound, token: Token | None, crew: Crew, name: str) -> Running:
-    """Start the worker of this name: a thread if the address is within this process, otherwise a process."""
+    """Start the worker with this name: a thread if the address is within this process, otherwise a process."""
     address = bound.link.address
     if address.startswith("inproc://"):
         return WorkerThread(address, name, bound.context, evaluates=crew.evaluates(name))

@@ -11,7 +11,7 @@ WORKER_BYTES = 50 << 20
 """Memory of a worker without an env copy."""
 
 ActionKind = Literal["box", "discrete", "other"]
-"""box: a Box with finite bounds"""
+"""Kind of action space; `box` means a Box with finite bounds."""
 
 
 class StepCosts(msgspec.Struct, frozen=True, kw_only=True):

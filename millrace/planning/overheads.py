@@ -85,7 +85,7 @@ class _Round(NamedTuple):
     learner_s: float
     """CPU time of the learner"""
     wall_s: float
-    """wall time; of several rounds, the shortest"""
+    """wall time of the shortest of several rounds"""
 
 
 def overheads(config: Config, env: StoodFor) -> Overheads:

@@ -46,8 +46,8 @@ MOST_AT_LEAST = 16  # number of workers to try even if `MOST_PER_CORE` allows fe
 SHORT_S = 1e-3  # shorter steps are measured in workers with several copies, because a run steps them in this way
 COPIES_OF_SHORT = 8  # number of copies in a worker if steps are short
 OF_ITS_OWN = "if a copy needs a port, a folder or a licence of its own, see docs/how-to/simulators.md"
-GROWTH = 4  # factor between two numbers of workers that are tried
-WORTH_WHILE = 1.1  # if more workers don't make more env steps/s by this factor, no more are tried
+GROWTH = 4  # each number of workers to try is this many times the one before
+WORTH_WHILE = 1.1  # if more workers don't increase the env steps/s by this factor, even larger numbers aren't tried
 OF_MEMORY = 0.7  # share of the free memory that is used
 
 
@@ -166,7 +166,7 @@ class _SteppedCopies(NamedTuple):
 
 
 def _session(env: ProbedEnv, workers: int, seconds: float, give_up_at_s: float, each: int = 1) -> _SteppedCopies:
-    """Step copies for `seconds`, with as many as `each` in every worker.
+    """Step copies for this many seconds. Every worker has `each` of them.
 
     Raises `UserFacingError` if there is only one copy and it can't be made.
     """

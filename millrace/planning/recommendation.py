@@ -147,7 +147,7 @@ def candidates(learning: Learning, measured: Measurements, machine: Machine) -> 
 
 
 def _lanes_for(workers: int, envs: int) -> int:
-    """The least number of lanes that divides `envs` and gives all workers equally many; `envs` if there is none."""
+    """The least number of lanes that divides `envs` and is a multiple of `workers`; `envs` if there is none."""
     return next((lanes for lanes in range(workers, envs + 1, workers) if envs % lanes == 0), envs)
 
 

@@ -1,8 +1,8 @@
 """An environment that has the spaces of another one and does nothing, so that only the time of millrace itself is measured.
 
-Rule: it returns the same observation at each step, and its episode never ends. A step waits if those of the real environment
-wait, because a process that was asleep computes more slowly for a while. The sum of rewards in a step is the CPU time in
-seconds that the worker has used since the step before.
+Rule: it returns the same observation at each step, and its episode never ends. A step waits if steps of the real environment
+wait, because a process that was asleep computes more slowly for a while. The sum of the rewards of a step is the CPU time in
+seconds that the worker has used since the previous step.
 """
 
 from __future__ import annotations

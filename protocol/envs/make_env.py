@@ -42,7 +42,7 @@ def _names_a_module(env_id: str) -> bool:
 
 @words_an_error
 def _newer_or_older(module: str) -> str:
-    """The end of a line that suggests another version of a module in the same package; empty if no name is similar."""
+    """A suggestion of another version of a module in the same package, as the end of a line; empty if no name is similar."""
     package, _, name = module.rpartition(".")
     beside = [each.name for each in pkgutil.iter_modules(getattr(sys.modules.get(package), "__path__", []))]
     return "".join(f"; did you mean {package}.{close}?" for close in difflib.get_close_matches(name, beside, 1, cutoff=0.75))

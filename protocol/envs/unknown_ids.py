@@ -132,7 +132,7 @@ def what_to_write(env_id: str, why_not: Callable[[str], str]) -> str:
 
 
 def most_similar(env_id: str, examples: Iterable[str], why_not: Callable[[str], str]) -> str | None:
-    """The end of a line that suggests the most similar registered id, or one of `examples`; None if none is similar.
+    """A suggestion of the most similar registered id, or one of `examples`, as the end of a line; None if none is similar.
 
     Only an id that can be made is suggested, or one that lacks only a package, which the line then says how to install.
     """

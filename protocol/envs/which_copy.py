@@ -51,7 +51,7 @@ class EnvCopy:
     """Whether the copy plays evaluations or recordings."""
     slot: int = 0
     """The lowest number, from 0, that no other live copy on this machine has; use it for ports, folders and displays. It may
-    be another after a resume, and is free again when the copy is closed or its process has ended.
+    differ after a resume, and is free again when the copy is closed or its process has ended.
     """
 
 

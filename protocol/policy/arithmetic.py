@@ -30,7 +30,7 @@ def multiply_adds(spec: PolicySpec) -> int:
 
 
 def _places(spec: PolicySpec) -> dict[str, int]:
-    """The number of places in its input at which each weight of a convolution is used, by the name of the field."""
+    """How many times a pass uses each weight of a convolution: once at each position. The keys are names of fields."""
     places: dict[str, int] = {}
     if not spec.convolves:
         return places

@@ -12,8 +12,8 @@ one array [N, *shape] for each name that was declared. If there is a method `act
 it in place of `act`. In a run with action masks, both are called with `mask=` [N, choices] bool, which is True where a
 choice is allowed.
 
-Rule: `act` is called once for each lane and step, with exactly the copies of that lane. So if `state` is all that it keeps
-between calls, a rollout has the same bits whatever else the worker does.
+Rule: `act` is called once for each lane and step, with exactly the copies of that lane. So if the policy keeps nothing but
+`state` between calls, a rollout has the same bits whatever else the worker does.
 """
 
 from __future__ import annotations

@@ -39,7 +39,7 @@ class Convolutions(NamedTuple):
     channels_last: bool
     parameters: list[tuple[Tensor, Tensor]]  # weight and bias of each convolution, then of the linear layer
     strides: list[int]
-    divisor: int  # the values of the image are divided by it
+    divisor: int  # values of the image are divided by this
     bfloat16: bool = False  # parameters are bfloat16, and the first weight is divided by `divisor`
 
     def in_bfloat16(self) -> Convolutions:

@@ -1,4 +1,4 @@
-"""The networks in torch. The learner trains them, and workers with images act with them.
+"""The networks in torch. The learner trains them. Workers act with them if a policy has images or a user-defined encoder.
 
 All parameters are in one flat float32 tensor, in the layout of `millrace.protocol.policy.layout`, and all gradients in a
 second one. The named arrays are views of these two. So the gradient norm is the norm of one tensor, Adam is one kernel, and
@@ -292,9 +292,9 @@ class QNetwork(FlatNetwork):
 class ActorAndCritics(FlatNetwork):
     """An actor whose actions are in [-1, 1], and two critics, which map an observation and an action to a value.
 
-    `actor` and `critics` are two parts of the flat tensor, with their parts of the gradients: one for each optimizer. The
-    encoder, if there is one, is trained with the critics, and the actor uses its output (Yarats et al. 2022). So methods for
-    losses take the encoder's outputs h [B, H], which are the features if there is no encoder.
+    `actor` and `critics` are two parts of the flat tensor. Each has its part of the gradients, and its own optimizer. The
+    encoder, if there is one, is trained with the critics, and the actor uses its output (Yarats et al. 2022). So the methods
+    that compute losses take the encoder's outputs h [B, H], which are the features if there is no encoder.
     """
 
     def __init__(self, spec: PolicySpec, device: str | torch.device = "cpu", *, seed: int = 0) -> None:

@@ -56,9 +56,9 @@ def make_encoder(spec: PolicySpec, seed: int) -> torch.nn.Module:
 
 
 def multiply_adds_of_encoder(spec: PolicySpec) -> int:
-    """Multiply-adds of a forward pass of one observation: for each module, its weights times the places of its output.
+    """Multiply-adds of a forward pass of one observation: for each module, its weights times the positions in its output.
 
-    This is exact for linear layers and convolutions. LSTM cells and attention use their weights more often than that.
+    This is exact for linear layers and convolutions, but too low for LSTM cells and attention, which use weights more often.
     """
     assert spec.encoder is not None
     encoder = _make(spec.encoder.factory, spec, seed=0)

@@ -28,8 +28,8 @@ class Policy(Protocol):
 
 
 def make_policy(spec: PolicySpec, images: ActingDtype = "float32") -> Policy:
-    """The policy of this spec: in numpy if it is an MLP. With images or an encoder, it is in torch, which is only then
-    imported.
+    """The policy of this spec: in numpy if it is an MLP; in torch, which is imported only then, if it has images or an
+    encoder.
 
     `images` is the precision in which images are processed.
     """

@@ -1,6 +1,6 @@
 """The forward pass of policies that need torch (images, user-defined encoders), with which workers act.
 
-Rule: it does not depend on the defaults that the program, or an environment, has chosen for its own use of torch.
+Rule: a pass does not depend on the torch defaults that the program, or an environment, has set for its own purposes.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from millrace.protocol.wire.weight_dtypes import ActingDtype
 
 
 class TorchPolicy:
-    """Like `NumpyPolicy`, for images and encoders. Lanes are computed one by one, so that a lane's result does not depend on
-    other lanes.
+    """Like `NumpyPolicy`, for policies with images or encoders. Lanes are computed one by one, so that a lane's result does
+    not depend on other lanes.
     """
 
     def __init__(

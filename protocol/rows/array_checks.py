@@ -32,7 +32,7 @@ class Expected(NamedTuple):
 
 
 def wrong_arrays(expected: Iterable[Expected], axes: Axes | None = STEP_AND_COPY) -> str:
-    """What is wrong with the first wrong one of these arrays. If `axes` is None, only shapes and dtypes are checked."""
+    """What is wrong with the first invalid array; empty if all are valid. If `axes` is None, values aren't checked."""
     for each in expected:
         array = each.array
         if why := _misfit(array, each.shape, each.dtype) or (axes is not None and wrong_values(array, each.space, axes)):

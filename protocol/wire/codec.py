@@ -195,7 +195,7 @@ def _decode(frames: Sequence[Buffer], kinds: MessageTypes, packed_bytes_limit: i
 
 
 def _explain_validation_error(error: str, head: object, kinds: Any) -> str:
-    """The error text of msgspec, with names of fields in place of positions, and without the type's name in their number."""
+    """The error text of msgspec, with fields named instead of numbered. Counts of fields exclude the type's name."""
     match head:
         case [str() as name, *given]:
             kind = next((kind for kind in get_args(kinds) or (kinds,) if kind.__name__ == name), None)

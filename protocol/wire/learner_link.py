@@ -131,7 +131,7 @@ class LearnerLink:
         return "" if self.keyring is None else self.name_for_log(peer)
 
     def _peer(self, routing_id: bytes, key: str) -> bytes:
-        """The id of the peer with this routing id and key, which is recorded as the one that uses the routing id now."""
+        """The id of the peer with this routing id and key. Records that this key is the last one to use the routing id."""
         self._last_keys.pop(routing_id, None)  # so that the dict stays in the order of last messages
         self._last_keys[routing_id] = key
         if len(self._last_keys) > MAX_REMEMBERED_KEYS:
@@ -139,8 +139,8 @@ class LearnerLink:
         return b"%s\0%s" % (routing_id, key.encode())
 
     def _refuse_key(self, peer: bytes) -> bool:
-        """If the peer's key is no longer allowed, count its message and answer with a `Refuse`. Returns whether
-        that was so.
+        """If the peer's key is no longer allowed, count its message and answer with a `Refuse`. Returns whether the
+        key was refused.
         """
         why = self.rejection_reason(peer)
         if why:

@@ -142,7 +142,7 @@ class SharedMemory:
         return fits
 
     def unanswered_orders(self) -> int:
-        """The number of lanes with an unfinished order. A worker calls this after it has finished one.
+        """The number of lanes with an unfinished order. A worker calls this after it has finished an order.
 
         If the last workers finish at the same moment, at least one of them gets 0: taking the lock makes the worker's own
         answer visible before it reads those of the others. This does not hold on every processor: see `CAN_SPIN`.
@@ -157,7 +157,7 @@ class SharedMemory:
         return None if size == INFOS_IN_MESSAGE else bytes(self.lanes[lane].infos[:size])
 
     def close(self) -> None:
-        """Close the descriptor. The memory is freed when its last view is."""
+        """Close the descriptor. The memory is freed once the last view of it is gone."""
         if self.fd >= 0:
             os.close(self.fd)
             self.fd = -1

@@ -67,7 +67,7 @@ LONGEST_STEPS = 50_000  # largest T of a long rollout
 NET = (16, 16)
 LONG_NET = (256, 256)  # for long rollouts: with a small net, a compiled client would make 50,000 steps in milliseconds
 EVALUATED_STEPS = 40
-APART_ROLLOUTS = 3  # number of rollouts of each lane after which env copies must differ
+APART_ROLLOUTS = 3  # after this many rollouts of each lane, env copies must differ
 
 
 class Collecting:
@@ -97,7 +97,7 @@ class Collecting:
         self._sequences[lane, incarnation] += 1
         permit = Permit(next(self.learner.tickets), lane, incarnation, sequence, round=sequence)
         if incarnation and not sequence and self.learner.hello is not None and self.learner.hello.continues:
-            return permit.of_new_episodes(self.run.copies)  # a client that can't continue lanes restarts them anyway
+            return permit.of_new_episodes(self.run.copies)  # a client that doesn't continue lanes restarts its copies anyway
         return permit
 
     def order(self, *permits: Permit, version: int = 1, keep: Iterable[int] = ()) -> None:
@@ -144,7 +144,7 @@ class Collecting:
         return (yield from self.rollout(permit))
 
     def nothing_of(self, permit: Permit, rule: Rule, whose: str) -> Script[None]:
-        """Check that no rollout for this permit has arrived in this session, and that none arrives for a while."""
+        """Check that no rollout for this permit has arrived in this session, and wait a while to see that none arrives."""
         expected = f"no rollout of ticket {permit.ticket}, {whose}"
         if (answer := self.learner.watch.answers.get(permit.ticket)) is not None:
             raise Broken(rule, expected, brief(answer))
@@ -470,7 +470,7 @@ def forgets_what_arrived(learner: Learner) -> Script[None]:
 
 
 def says_no_rollout_twice(learner: Learner) -> Script[None]:
-    """Ask for nothing more after a rollout, without confirming that it has arrived."""
+    """After a rollout, ask for nothing more, and don't confirm that the rollout has arrived."""
     session = yield from collecting(learner)
     learner.watch.confirms = False
     permit = session.permit()

@@ -46,8 +46,8 @@ from millrace.protocol.specs import StepSpec
 from millrace.protocol.wire.codec import encode
 from millrace.protocol.wire.plain_values import pack, unpack
 
-WALK_STEPS = 300  # number of random steps within which an episode should end
-APART_STEPS = 8  # number of steps after which copies with different actions observe different things
+WALK_STEPS = 300  # an episode should end within this many random steps
+APART_STEPS = 8  # after this many steps, copies with different actions observe different things
 LANES = 2
 
 
@@ -334,8 +334,8 @@ def _same(one: Stepped, other: Stepped) -> bool:
 
 
 def keeps_copies_apart(learner: Learner) -> Script[None]:
-    """Give all copies the same seed and actions; then all another seed and other actions; then half of them the first, and
-    half the second. Each copy must observe the same as before.
+    """Give all copies the same seed and actions (plan 0). Then give all of them another seed and other actions (plan 1).
+    Then give half of them plan 0 and the others plan 1. A copy must observe the same whenever it has the same plan.
     """
     steps = yield from stepping(learner)
     N = steps.spec.lanes[0]

@@ -10,7 +10,7 @@ from millrace.terminal import count_line
 def run(argv: list[str]) -> int:
     """Write the dataset, and print its size. Returns the exit code."""
     flags = parse_flags(RecordFlags, argv, "record")
-    from millrace.extras.datasets.record import write_dataset  # takes 0.2 s, so only if the flags are right
+    from millrace.extras.datasets.record import write_dataset  # takes 0.2 s, so imported only once the flags are valid
 
     with count_line("recording") as watch:
         dataset = write_dataset(flags, watch)

@@ -41,7 +41,7 @@ class SelfContainedHDF5:
             yield cls(file, os.fstat(opened.fileno()).st_size * MOST_EXPANSION)
 
     def group(self, parent: Any, name: str) -> Any:
-        """The group of this name inside another."""
+        """The group with this name inside another group."""
         import h5py
 
         if not isinstance(member := self._member(parent, name), h5py.Group):
@@ -49,7 +49,7 @@ class SelfContainedHDF5:
         return member
 
     def array(self, parent: Any, name: str) -> Any:
-        """The array of this name inside a group, as h5py's `Dataset`, whose data isn't read yet."""
+        """The array with this name inside a group, as h5py's `Dataset`. Its data isn't read yet."""
         import h5py
 
         dataset = self._member(parent, name)

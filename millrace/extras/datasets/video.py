@@ -92,10 +92,10 @@ def record_videos(
 def _write(path: Path, frames: list[Array], frames_per_s: float) -> None:
     """Encode each of these frames [H, W, 3] once.
 
-    moviepy's own clips have a length in seconds, and by rounding lose the last frame.
+    moviepy's own clips have a length in seconds, and would lose the last frame by rounding.
     """
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # they come from packages that moviepy uses
+        warnings.simplefilter("ignore")  # packages that moviepy uses give warnings
         from moviepy.video.io.ffmpeg_writer import FFMPEG_VideoWriter
     height, width, _ = frames[0].shape
     with FFMPEG_VideoWriter(str(path), (width, height), frames_per_s) as writer:

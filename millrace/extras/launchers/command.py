@@ -33,7 +33,7 @@ def run(argv: list[str]) -> int:
 def _ray(argv: list[str]) -> int:
     flags, learner = read_flags(RayFlags, argv, "ray", ("bind", "advertise", "insecure", "launched-workers"))
     try:
-        from millrace.extras.launchers.ray import launch  # only here: Ray need not be installed
+        from millrace.extras.launchers.ray import launch  # imported here, because only this launcher needs Ray
     except ModuleNotFoundError as error:
         if error.name != "ray":
             raise

@@ -12,7 +12,7 @@ from typing import Any
 from millrace import Progress
 from millrace.extras.monitoring.run_rows import RowCallback, flat_settings, run_name, tool
 
-MOST_PARAMETERS = 100  # largest number in one request
+MOST_PARAMETERS = 100  # largest number of parameters in one request
 MOST_CHARACTERS = 500  # largest length of a parameter's value
 RUN_TAG = "millrace.run"
 

@@ -62,7 +62,7 @@ class MetricsCollector(Collector):
     """Keeps the newest snapshot and turns it into metrics."""
 
     def __init__(self, config: Config, clock: Callable[[], float] = time.time, observed: Observed | None = None) -> None:
-        """`clock`: seconds since 1970. `observed`: the snapshot to show until the hub is observed."""
+        """`clock`: seconds since 1970. `observed`: the snapshot to show before the first call of `observe`."""
         self._clock = clock
         self._observed = observed
         self._updates_before: int | None = None  # updates of earlier learners, if the run was resumed

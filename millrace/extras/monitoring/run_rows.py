@@ -1,4 +1,4 @@
-"""The data of a run that callbacks send to other programs: flattened settings, and at most one row of numbers in `every_s`.
+"""The data of a run that callbacks send to other programs: settings, and at most one row of numbers in `every_s` seconds.
 
 Rule: rows with an evaluation and the last row are always sent, including the numbers that callbacks before this one logged.
 Missing numbers are left out.

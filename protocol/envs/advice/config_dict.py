@@ -30,7 +30,7 @@ def wants_a_dict(name: str, factory: Callable[..., object], kwargs: Mapping[str,
         return ""
     raised_by = extract_tb(error.__traceback__)[-1].line or ""
     if not re.search(rf"\b({parameters[0].name}|\w*config)\b", raised_by):
-        return ""  # something else was None
+        return ""  # the failing line is about another variable
     return (
         f"its argument {parameters[0].name} is a dict, as RLlib passes it; name a function of your own in place of {name}: "
         f"def make_env(**config): return {last_part(name)}(config), and give entries of the dict as --env-kwargs NAME VALUE"

@@ -10,7 +10,7 @@ _FILE = re.compile(r"(?P<folder>.*/)?(?P<module>[^\W\d]\w*)\.py(?::(?P<name>.*))
 def module_of_file(text: str, example: str) -> str:
     """What to write instead of `mine.py` or `mine.py:Mine`, as the end of a line; empty if `text` isn't such a path.
 
-    `example` is the name in the module that the line shows if `text` has none.
+    `example` is a name within a module; the line shows it if `text` contains no such name.
     """
     found = _FILE.fullmatch(text)
     if found is None:

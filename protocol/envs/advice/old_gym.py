@@ -62,7 +62,7 @@ def _class_of(spec: object) -> object:
 
 
 def _about_seed(of: object, version: str) -> str:
-    """The end of a line: what to do about an environment, or its class, that shimmy can't seed; else empty."""
+    """What to do about an environment, or its class, that shimmy can't seed, as the end of a line; else empty."""
     if version != "V21" or attribute(of, "seed") is not None:
         return ""
     return "; it also needs a method seed(seed), as under 'Old gym environments' in docs/how-to/third_party_environments.md"

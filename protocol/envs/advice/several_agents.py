@@ -10,7 +10,7 @@ MARKS = ("possible_agents", "agents", "agent_iter", "agent_selection", "observat
 
 @words_an_error
 def what_it_lacks(made: object) -> str:
-    """The end of a line: what an object lacks to be a PettingZoo environment; empty if it doesn't look like one."""
+    """What an object lacks to be a PettingZoo environment, as the end of a line; empty if it doesn't look like one."""
     if not any(_has(made, name) for name in MARKS) and not callable(getattr(made, "observation_space", None)):
         return ""
     if not _has(made, "possible_agents"):

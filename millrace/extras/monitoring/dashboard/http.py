@@ -54,7 +54,7 @@ class PageRequest(NamedTuple):
 
 
 class StoredBody(NamedTuple):
-    """The body of an answer in a file, of which only the requested part is read."""
+    """The body of an answer that is stored in a file. Only the requested part is read."""
 
     tag: str
     """entity tag: it differs if the content differs"""

@@ -91,7 +91,7 @@ class KnownRuns:
                 raise UsageError(f"run {run}: {METRICS_FILE} cannot be read: {reason(error)}") from error
             rows = tail.rows
             content = RunContent(read_run(run, rows), rows)
-        self._read[run] = changed, content  # at the end: the first run in the table is the least recently requested one
+        self._read[run] = changed, content  # added at the end, so the first run is the least recently requested one
         while len(self._read) > MOST_KEPT:
             oldest = next(iter(self._read))
             del self._read[oldest]

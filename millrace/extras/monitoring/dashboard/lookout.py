@@ -28,7 +28,7 @@ ASK_EVERY_S = 0.5
 LOOKED_AT_S = 10.0  # a page counts as open for this long after its last request; an open page requests once a second
 FORGOTTEN_S = 300.0  # after this time without an open page, the answers are freed
 SILENT_S = 5.0  # after this time without an answer, the connection is closed
-PAUSE_S = 10.0  # time until the next connection; a message without an end would fill the memory while a connection is open
+PAUSE_S = 10.0  # time until the next connection; only while one is open can an endless message fill the memory
 SAMPLES = 400  # number of answers to keep
 MOST_LANES = 64  # largest number of lanes shown
 ANSWER_WITHIN_S = 0.5
@@ -40,7 +40,7 @@ LEARNER: dict[str, str] = {
     "evaluating": "evaluating",
     "starting": "starting",
 }
-"""What the picture says that a learner is doing, for each phase of its progress"""
+"""The picture's word for what a learner is doing, for each phase of its progress"""
 WORKER = {
     "stepping": "collecting",
     "repeating": "resetting",
@@ -54,7 +54,7 @@ WORKER = {
     "closing": "resetting",
     "waiting": "waiting",
 }
-"""What the picture says that a lane is doing, for each activity of its worker"""
+"""The picture's word for what a lane is doing, for each activity of its worker"""
 
 
 class LaneSample(NamedTuple):

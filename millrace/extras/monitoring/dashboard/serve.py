@@ -23,7 +23,7 @@ from millrace.learner.interrupts import Interrupts, Stopped
 from millrace.protocol.errors import UserFacingError
 
 LOOK_FOR_SIGNALS_S = 0.1
-LINGER_S = 2.5  # time that is left for open pages to show the end of the run
+LINGER_S = 2.5  # how long the dashboard stays after the run, so that open pages can show how it ended
 
 
 def serve(folders: Sequence[Path], host: str, port: int, listening: Callable[[str], None]) -> None:

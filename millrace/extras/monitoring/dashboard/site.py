@@ -36,7 +36,7 @@ MOST_COMPARED = 50
 MEDIA = {".mp4": "video/mp4", ".png": "image/png"}
 
 Look = Callable[[Path], Seen]
-"""Returns what is known about the learner of a run, and has the learner asked from now on"""
+"""Returns what is known about the learner of a run. From then on, the learner is asked regularly."""
 
 
 class Site:

@@ -40,7 +40,7 @@ class Series(NamedTuple):
 
 
 def ticks(low: float, high: float, about: int) -> list[float]:
-    """About `about` round numbers from `low` to `high`, whose distance is 1, 2 or 5 times a power of ten."""
+    """Round numbers from `low` to `high`, 1, 2 or 5 times a power of ten apart. Their number is close to `about`."""
     span = high - low
     if not LEAST_SPAN < span < math.inf:
         return [low]

@@ -1,8 +1,8 @@
 """Reads a growing metrics.jsonl, each time from where the last read ended, and keeps a bounded number of its rows.
 
-Rule: of a long file, it keeps rows at equal distances, rows with an evaluation (all of them as long as they are few), and
-the newest row. The newest row is read again each time, because a run may add numbers to it. If the file was replaced, as a
-resumed run does, it is read from the beginning.
+Rule: of a long file, it keeps rows at equal intervals, rows with an evaluation (all of them as long as they are few), and
+the newest row. The newest row is read again each time, because a run may add numbers to it. If the file was replaced, as it
+is when a run is resumed, it is read from the beginning.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ class MetricsTail:
 
 
 class _Thinned:
-    """Keeps at most `2 * most` of the lines that are added, at equal distances."""
+    """Keeps at most `2 * most` of the lines that are added, at equal intervals."""
 
     def __init__(self, most: int) -> None:
         self._most = most
