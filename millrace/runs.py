@@ -64,7 +64,7 @@ class Metrics(dict[str, Array]):
     """
 
     unreadable: int
-    """Number of unreadable rows, which are left out."""
+    """Number of rows that are left out because they are unreadable."""
 
     def __init__(self, rows: list[dict[str, Any]], unreadable: int = 0) -> None:
         names = dict.fromkeys(name for row in rows for name in row)

@@ -96,7 +96,7 @@ def progress_view(
 def count_line(
     doing: str, clock: Callable[[], float] = time.monotonic, *, show: bool = True
 ) -> Iterator[Callable[[str], None]]:
-    """A context manager that yields a function, which shows `doing` and a text.
+    """A context manager that yields a function. Call the function with a text, to show `doing` and the text.
 
     The text is updated in place on a terminal or in a notebook; elsewhere a line is printed now and then. Outside a notebook
     it goes to stderr. `show`: whether to show anything at all.

@@ -88,7 +88,7 @@ def make_nest(paths: Sequence[Path]) -> Nest:
 
 
 def _nest(placed: Sequence[tuple[int, Path]]) -> Nest:
-    """Like `make_nest`, for some of the values. `placed` has the index of each of them, and the rest of its path."""
+    """Like `make_nest`, for some of the values. `placed` has each value's index, and the rest of its path."""
     number, path = placed[0]
     if not path and len(placed) == 1:
         return itemgetter(number)

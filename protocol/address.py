@@ -1,4 +1,4 @@
-"""Addresses: which are valid, which only this machine can reach, and which to type on another machine.
+"""Addresses: whether one is valid, whether only this machine can reach it, and what to type on another machine.
 
 Rule: an address counts as reachable by others unless it certainly is not. An IPv6 address is in brackets. Pure,
 except for `needs_ipv6` and `resolves`, which ask the system's resolver about names.

@@ -290,7 +290,7 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def _why_not(env_id: str) -> str:
-    """Why a registered environment, which may be the one that the user meant, can't be made; empty if it can.
+    """Why a registered environment that the user may have meant can't be made; empty if it can.
 
     For an id with a module, returns an empty string, so that no function is called.
     """

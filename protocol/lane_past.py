@@ -26,7 +26,7 @@ from millrace.protocol.bounds import MAX_COPIES, Natural
 MAX_RANDOM_BYTES = 64
 
 RandomState = Annotated[bytes, Meta(max_length=MAX_RANDOM_BYTES)]
-"""State of an environment's random generator (`workers/copies/random_state.py`), from which a reset without a seed begins an
+"""State of the environment's random generator (`workers/copies/random_state.py`) just before a reset without a seed began the
 episode. It is empty if the episode began with the seed of the copy's start.
 """
 
@@ -48,7 +48,7 @@ class LastEpisode(msgspec.Struct, frozen=True, array_like=True):
     start: Natural
     """number of the copy's start"""
     random: RandomState | None
-    """None if the episode cannot be repeated; unless `saved`, a new copy is then started, with the next start number"""
+    """None if the episode cannot be repeated; then, unless `saved`, a new copy is started, with the next start number"""
     first: Natural
     """index of the episode's first row in `LanePast.action`"""
     over: bool

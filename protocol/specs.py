@@ -344,7 +344,7 @@ class RunSpec(msgspec.Struct, frozen=True, tag=True):
 
     @property
     def policy_code(self) -> tuple[str, ...]:
-        """The user-defined callables that make policies, or parts of them, in the workers, as errors name them."""
+        """Names, for errors, of the user-defined callables that make policies, or parts of policies, in the workers."""
         called = [("encoder", self.policy.encoder), ("policy", self.policy.own)]
         if self.opponent is not None:
             called.append(("encoder", self.opponent.encoder))

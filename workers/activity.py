@@ -132,8 +132,8 @@ class ActivityReader:
     """The supervisor's side of the page."""
 
     def __init__(self, page: Activity | None = None) -> None:
-        """`page` is the page of a worker in a thread; if it is None, make a page for a child process, which
-        inherits `fd`.
+        """`page` is the page of a worker in a thread. If it is None, make a page for a child process to inherit
+        through `fd`.
         """
         self.fd = -1
         if page is None:

@@ -1,4 +1,4 @@
-"""The collector and the evaluator of a worker, which share a policy that acts in the env copies of a run.
+"""A worker's collector and evaluator. They share a policy that acts in the env copies of a run.
 
 Rule: the policy has the weights of the current task. Weights are loaded only if a task needs others than the task before it.
 """

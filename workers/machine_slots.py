@@ -127,7 +127,7 @@ def slots() -> Slots:
 
 
 def share_slots(fd: int) -> None:
-    """Let this process, a worker, hold its slots together with its supervisor, which has opened the file `fd`."""
+    """Let this worker process hold its slots together with its supervisor. `fd` is the file that the supervisor opened."""
     os.set_inheritable(fd, False)
     _of_processes[os.getpid()] = Slots(fd, copies_per_machine())
 

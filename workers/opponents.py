@@ -60,7 +60,7 @@ class KnownOpponents:
     def among(self, weights: Mapping[int, Weights]) -> Opponents:
         """Return a function that finds an opponent by its number.
 
-        `weights` are the available weights by version, which must include those of opponents that aren't known yet.
+        `weights` has the available weights by version. It must include those of opponents that aren't known yet.
         """
 
         def find(number: int) -> Opponent:

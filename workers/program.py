@@ -1,4 +1,4 @@
-"""Runs one worker in this process, which a supervisor has started. Imports torch only if the policy needs it.
+"""Runs one worker in a process that a supervisor has started. Imports torch only if the policy needs it.
 
 Exit codes: 0 if the worker was drained or asked to leave, or its supervisor has ended; EXIT_NO_LEARNER if no learner
 answered; EXIT_UNSUITABLE if it cannot take part in this run; 1 if it failed; 2 if it was refused, or its flags were wrong.
@@ -88,7 +88,7 @@ def work(flags: WorkerFlags, token: Token | None, signals: list[int]) -> int:
 
 
 def _exit_code(code: int, reason: str) -> int:
-    """The exit code of this process, which tells the supervisor more than that of the conversation."""
+    """The exit code of this process. It tells the supervisor more than the conversation's exit code would."""
     return EXIT_NO_LEARNER if reason.startswith(NO_LEARNER) else code
 
 

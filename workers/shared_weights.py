@@ -21,7 +21,7 @@ from millrace.protocol.wire.wake_up import WakePipe
 
 SUPPORTED = hasattr(os, "memfd_create") and hasattr(os, "pipe2")
 PLACE_BYTES = 1 << 33  # more than the largest message; only pages that were written use memory
-FRAMES = 4  # largest number of frames of a message
+FRAMES = 4  # largest number of frames in a message
 ENTRY = struct.Struct("<7Q")  # first session, version, number of frames, lengths of the frames
 SESSIONS = 1 << 24  # a learner has fewer sessions than this; the number of its first one is random, below 2**48
 

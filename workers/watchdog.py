@@ -27,7 +27,7 @@ class Watchdog:
     """A watchdog timer. A process can have only one, because faulthandler has only one timer."""
 
     def __init__(self, timeout_s: Callable[[], float]) -> None:
-        """`timeout_s` returns the time after which the process is ended, which depends on the run; infinity means never."""
+        """`timeout_s` returns how many seconds the run allows before the process is ended; infinity means never."""
         self._timeout_s = timeout_s
         self._set_to_s = math.inf
         self._due_s = -math.inf

@@ -62,7 +62,7 @@ log = logging.getLogger("millrace.worker")
 CONNECT_AGAIN_S = 20.0  # a learner that can be reached answers a Hello sooner than this
 PULSE_S = 0.05  # time between two checks for messages while environments are stepped
 IDLE_S = 0.5  # longest wait while idle, so that a signal or the end of the parent process is noticed
-AFTER_WAKE_UP_S = 0.02  # longest wait for a message after the wake-up that announces it, and that may arrive earlier
+AFTER_WAKE_UP_S = 0.02  # longest wait for a message that a wake-up has announced
 STATM = Path("/proc/self/statm")  # contains numbers of pages: total, resident, …
 
 
@@ -380,7 +380,7 @@ class Worker:
         try:
             match run:
                 case RunSpec():
-                    with activity().during(PREPARING):  # it may import torch and user modules, which takes long
+                    with activity().during(PREPARING):  # may take long, because it may import torch and user modules
                         self._actors = self._options.make_actors(run)
                     self._packing = replace(self._link.packing, zstd=run.zstd and self._link.packing.zstd)
                 case StepSpec():

@@ -1,4 +1,4 @@
-"""Reads the string under each field of a record in the source code, which is the help of the field's flag."""
+"""Reads from a record's source code the string under each field. It is the help text of the field's flag."""
 
 from __future__ import annotations
 

@@ -51,9 +51,9 @@ class ActingSettings:
 
     copies: VectorEnvSettings
     lanes: int
-    """number of lanes for rollouts, whose copies come first"""
+    """number of lanes for rollouts; their copies come first"""
     evaluation_copies: int
-    """number of copies for evaluations, which come last"""
+    """number of copies for evaluations; these copies come last"""
     facts: Sequence[str]
     """names of the facts that are read"""
     workers: int
@@ -64,7 +64,7 @@ class ActingSettings:
 
 
 def settings_of_run(config: Config, env: EnvSpec, where: BindSettings, workers: int) -> ActingSettings:
-    """The settings of a training run, whose workers join at `where` if they are started elsewhere.
+    """The settings of a training run. Workers that are started elsewhere join at `where`.
 
     `workers`: how many to wait for.
     """

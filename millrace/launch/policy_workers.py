@@ -106,5 +106,5 @@ def _pool(policy: SavedPolicy, which: PlayingWorkers) -> AbstractContextManager[
 
 
 def _log_folder(which: PlayingWorkers, stack: ExitStack) -> Path | None:
-    """A folder for the logs of local workers, which `stack` removes; None if there are no local workers."""
+    """A folder for the logs of local workers; `stack` removes it. None if there are no local workers."""
     return None if which.bind else Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="millrace-")))

@@ -128,7 +128,7 @@ def _train(
 
 
 def _tell_finished(config: Config, place: Place) -> None:
-    """Tell the other learner processes, which don't have the run folder, that the run was already finished."""
+    """Tell the other learner processes that the run was already finished. They can't see this, without the run folder."""
     with _learners(config, place, lambda: None) as learners:
         if learners is not None:
             learners.end("the run was finished before")

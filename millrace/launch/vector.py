@@ -148,7 +148,7 @@ def make_vec(
 
 
 def start_vector_env(settings: VectorEnvSettings, crew: Crew) -> ZmqVectorEnv:
-    """Start a vector environment and wait for its workers, which get the log files and cores of `crew`.
+    """Start a vector environment and wait for its workers. They get the log files and cores of `crew`.
 
     Raises `UsageError`, `NoWorkers` and `EnvironmentFailed`.
     """

@@ -99,7 +99,7 @@ def _share_of_steps(measured: Measurements) -> float:
 
 
 def _lanes_of_workers(sizes: Sizes) -> list[int]:
-    """The number of lanes of each worker that has any."""
+    """How many lanes each worker has; workers without lanes are left out."""
     least, more = divmod(sizes.lanes, sizes.workers)
     return [lanes for lanes in [least + 1] * more + [least] * (sizes.workers - more) if lanes]
 
@@ -125,7 +125,7 @@ def _worker(sizes: Sizes, situation: Situation, lanes: int) -> _RoundOfWorker:
 
 
 def _times_of_rounds(worker: _RoundOfWorker, sampled: np.random.Generator) -> Doubles:
-    """Sample the durations of the rounds of a worker: [ROUNDS] seconds."""
+    """Sample how long a worker's rounds take: [ROUNDS] seconds."""
     steps_s = np.maximum(worker.mean_s / 2, sampled.normal(worker.mean_s, worker.std_s, ROUNDS))
     times_s: Doubles = steps_s + worker.reset_s * sampled.poisson(worker.resets, ROUNDS)
     return times_s

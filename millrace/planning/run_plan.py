@@ -106,7 +106,7 @@ def train_command(
 
 
 def screen(plan: RunPlan) -> RenderableType:
-    """The plan for a terminal, which fits on one screen."""
+    """The plan in a form that fits on one terminal screen."""
     found = Table.grid(padding=(0, 2))
     for name, value in _found(plan.measured):
         found.add_row(Text(name, style="dim"), Text(value))

@@ -106,7 +106,7 @@ class _Timed(gymnasium.Wrapper[Any, Any, Any, Any]):
 
 
 class _TimedAgents:
-    """Times an environment of several agents, which has one of PettingZoo's interfaces."""
+    """Times an environment of several agents that has one of PettingZoo's interfaces."""
 
     def __init__(self, env: Any, notes: Notes) -> None:
         self.env = env

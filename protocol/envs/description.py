@@ -40,7 +40,7 @@ class DescribedEnv:
     """time limit of an episode in env steps; None if there is none"""
     render_mode: str | None = None
     wrappers: frozenset[str] = frozenset()
-    """the names of the classes of the environment's wrappers (`class_name`)"""
+    """the class names of the environment's wrappers (`class_name`)"""
     seats: tuple[str, ...] = ()
     """the names of the agents, if it is an environment with seats; the spaces above are then those of each seat"""
     takes_turns: bool = False

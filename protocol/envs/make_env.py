@@ -129,7 +129,7 @@ def why_not_made(
 
 @words_an_error
 def _why_not_made(env_id: str, error: Exception, failed: Sequence[str], why_not: Callable[[str], str]) -> str:
-    """One line for an unknown environment, or one whose package is missing; empty for other errors.
+    """One line for an environment that is unknown or lacks a package; empty for other errors.
 
     `failed` has lines about installed packages that could not register their environments. For `why_not`, see
     `what_to_write`.

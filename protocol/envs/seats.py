@@ -33,7 +33,7 @@ STATE = "state"
 MAX_AGENT_NAME = MAX_NAME - len("return_")  # characters; leaves room for the prefix of the agent's return
 _NO_INFO: Mapping[str, Any] = {}
 RETURNED_WRONGLY = AttributeError, KeyError, TypeError, ValueError, OverflowError
-"""Exceptions raised while reading an environment's results if a dict lacks an agent, or values aren't dicts or numbers."""
+"""Exceptions of code that reads an environment's results if a dict lacks an agent, or values aren't dicts or numbers."""
 
 
 class SeatStep(NamedTuple):
@@ -278,8 +278,8 @@ class ParallelSeats(SeatedEnv):
 
 
 class TurnSeats(SeatedEnv):
-    """One agent acts at a time (`pettingzoo.AECEnv`). A step is the action of one agent, after which agents whose part of
-    the episode has ended leave.
+    """One agent acts at a time (`pettingzoo.AECEnv`). A step is the action of one agent. After it, the agents leave whose
+    part of the episode has ended.
     """
 
     takes_turns = True

@@ -17,7 +17,7 @@ from millrace.protocol.errors import BadMessage
 
 
 def generator_states(*given: gymnasium.Space[Any]) -> tuple[str, ...]:
-    """The state of the generator of each of these spaces and the spaces inside them; empty if none has one."""
+    """The generator states of these spaces and the spaces inside them; empty if no space has a generator."""
     states = [_state(space) for outer in given for space in _with_inner(outer)]
     return tuple(states) if any(states) else ()
 

@@ -84,7 +84,7 @@ def wrapper_name(wrapper: WrapperLike) -> str:
 
 
 def wrapper_names(wrappers: Sequence[WrapperLike]) -> tuple[str, ...]:
-    """The `wrapper_name` of each wrapper. Raises `UsageError` if there is none for one of them."""
+    """The `wrapper_name` of each wrapper. Raises `UsageError` if a wrapper has none."""
     return tuple(map(wrapper_name, wrappers))
 
 

@@ -95,7 +95,7 @@ class KeyFolder:
         return self.token_path(name)
 
     def new_for_other_learner(self, name: str, server: bytes) -> tuple[Path, bytes]:
-        """Create a client's key for a learner on another machine, whose public key is `server`.
+        """Create a client's key for a learner on another machine. `server` is the learner's public key.
 
         Returns the path of the client's token, and the public half of the client's key.
         """
@@ -108,7 +108,7 @@ class KeyFolder:
         return self.token_path(name), client.public
 
     def allow(self, name: str, public: bytes, now: datetime) -> None:
-        """Allow a client that created its own key, of which `public` is the public half, to connect."""
+        """Allow a client to connect that created its own key. `public` is the public half of this key."""
         self._ensure_folder()
         with self._locked():
             _replace(self.list_path, self.allowed().with_client(name, public, now).to_toml())

@@ -14,7 +14,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
-ALL = ""  # stands for all controllers: version 2 has one tree for all of them, and doesn't name them
+ALL = ""  # stands for all controllers: in version 2 they share one tree, and aren't named
 
 
 class _Tree(NamedTuple):

@@ -10,13 +10,13 @@ from millrace.protocol.policy.layout import Field, named_views
 
 
 def trainable(values: Tensor, gradient: Tensor | None) -> Tensor:
-    """A leaf of autograd's graph that shares the memory of `values`, and whose gradient is `gradient`."""
+    """A leaf of autograd's graph that shares the memory of `values`. Its gradient is `gradient`."""
     leaf = values.detach().requires_grad_()
     leaf.grad = gradient
     return leaf
 
 
 def named_leaves(values: Tensor, gradient: Tensor, fields: Sequence[Field]) -> dict[str, Tensor]:
-    """A leaf of autograd's graph for each field, by name: views of `values`, whose gradients are views of `gradient`."""
+    """A leaf of autograd's graph for each field, by name. Leaves are views of `values`, their gradients of `gradient`."""
     gradients = named_views(gradient, fields)
     return {name: trainable(view, gradients[name]) for name, view in named_views(values, fields).items()}

@@ -1,6 +1,6 @@
 """A user-defined policy that acts in a worker: it is made, called and checked here. Imports no torch.
 
-The callable `factory(**kwargs)` returns an object with two methods, of which the second acts for N env copies:
+The callable `factory(**kwargs)` returns an object with two methods. The second one acts for N env copies:
 
     load(arrays)             {name: float32 array} as declared; called for each version of the weights
     act(obs, state, rng)     -> action, state, extras

@@ -52,7 +52,7 @@ class Distribution(Protocol):
         ...
 
     def log_prob(self, params: Floats, action: Array, noise: Floats | None = None) -> Floats:
-        """Log-probability [...] of the action, which was sampled with this noise."""
+        """Log-probability [...] of an action that was sampled with this noise."""
         ...
 
 

@@ -29,7 +29,7 @@ def stored_leaves(run: RunSpec) -> tuple[Leaf, ...]:
 
 
 def forbid(params: Floats, mask: Bools) -> Floats:
-    """A copy of distribution params [..., P], in which the logits or values of choices that are not allowed are FORBIDDEN.
+    """A copy of distribution params [..., P] with FORBIDDEN as the logit or value of each choice that is not allowed.
 
     ε, which follows the action values, stays as it is.
     """

@@ -57,7 +57,7 @@ def defaults_of_thread() -> Iterator[None]:
 
 
 def refuse_second_derivatives() -> None:
-    """Raise `RuntimeError` in a backward pass with `create_graph`, whose result would lack the terms of hidden layers."""
+    """Raise `RuntimeError` in a backward pass with `create_graph`: its result would lack the terms of hidden layers."""
     if torch.is_grad_enabled():
         raise RuntimeError("millrace's networks have no second derivatives; call backward without create_graph")
 
@@ -121,7 +121,7 @@ class StackedMLP(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *outputs: Tensor) -> tuple[Tensor | None, ...]:
-        """Gradients with respect to x and to `flat`, as far as they are needed."""
+        """Gradients with respect to x and to `flat`, each only if it is needed."""
         refuse_second_derivatives()
         (g,) = outputs
         half = len(ctx.saved_tensors) // 2

@@ -1,4 +1,4 @@
-"""The forward pass of MLP policies in numpy, with which workers act. Imports no torch.
+"""The forward pass in numpy with which workers act if the policy is an MLP. Imports no torch.
 
 A pass processes several lanes at once, [L, N, ·]. numpy's stacked matmul gives each lane the same bits that it would get
 alone, so a run does not depend on the number of its workers.

@@ -1,4 +1,4 @@
-"""The forward pass of policies that need torch (images, user-defined encoders), with which workers act.
+"""The forward pass in torch with which workers act if the policy needs it (images, user-defined encoders).
 
 Rule: a pass does not depend on the torch defaults that the program, or an environment, has set for its own purposes.
 """

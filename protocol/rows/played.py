@@ -42,8 +42,8 @@ def reason_to_reject(
 def _wrong_frames(frames: Array | None, end: int, L: int, first: Sequence[Array | None], wanted: bool) -> str:
     """What is wrong with the frames of L rows.
 
-    `end` is the number of observations of the episode up to the last of these rows. `first` has the frames of the episode's
-    first rows, and is empty if these are the first.
+    `end` is how many observations the episode has up to the end of these rows. `first` has the frames of the episode's first
+    rows, and is empty if these are the first.
     """
     if frames is None:
         return "frames: expected those of the first observations" if wanted and not first else ""

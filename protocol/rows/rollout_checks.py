@@ -24,7 +24,7 @@ LARGEST_REWARD = float(np.finfo(np.float32).max) * (1 + 2**-25)
 """The largest number that is still finite when it is rounded to float32. Returns are sums of rewards before
 this rounding.
 """
-OF_SAVED_BYTES = 1_000  # bytes of overhead of each saved state
+OF_SAVED_BYTES = 1_000  # overhead in bytes for each saved state
 
 
 def validate(rollout: Rollout, run: RunSpec, most_steps: int = LARGEST) -> None:
@@ -125,7 +125,7 @@ def _check_mask(mask: Array, rollout: Rollout, action: ActionSpec, axes: Axes) -
 
 
 def wrong_episode(episode: Episode, run: RunSpec, most_steps: int) -> str:
-    """What is wrong with an episode; empty if it can be one of the run, whose episodes have at most `most_steps` steps."""
+    """What is wrong with an episode; empty if it is possible in this run. An episode has at most `most_steps` steps."""
     whole = 0 < episode.length <= most_steps and 0 <= episode.seconds < math.inf
     if not (whole and abs(episode.reward) <= episode.length * run.seats_of_copy * LARGEST_REWARD):  # also wrong for NaN
         return f"expected a finite return of 1 to {most_steps} float32 rewards and a duration, got {episode}"

@@ -37,7 +37,7 @@ def receive_frames(socket: zmq.Socket[bytes], sender_keys: list[str] | None = No
 
 
 def send_frames(socket: zmq.Socket[bytes], frames: Sequence[Buffer]) -> None:
-    """Like `send_multipart`, but faster, because it skips the checks of each frame, which are half the cost of sending."""
+    """Like `send_multipart`, but faster: it skips the checks of each frame, which take half of the time."""
     for frame in frames[:-1]:
         socket.send(frame, AND_MORE, copy=False)
     socket.send(frames[-1], NOT_WAITING, copy=False)
@@ -46,7 +46,7 @@ def send_frames(socket: zmq.Socket[bytes], frames: Sequence[Buffer]) -> None:
 def _user(frame: zmq.Frame) -> str:
     try:
         return str(frame.get("User-Id"))
-    except zmq.ZMQError:  # there is no key, which should never happen; "" is not the key of any client
+    except zmq.ZMQError:  # should never happen: there is no key. No client has the key ""
         return ""
 
 

@@ -139,7 +139,7 @@ class Collector:
         return Part(Rows(self._run, lanes, self._run.rollout_steps), self._runner.acting.begin(drawn))
 
     def _lane_for(self, assignment: Assignment, pulse: Pulse) -> Lane:
-        """The lane in this incarnation, which is opened if it isn't open."""
+        """The lane in this incarnation; opened here if it isn't open yet."""
         number = assignment.lane
         incarnation = assignment.incarnation
         if (lane := self.lanes.here(number, incarnation)) is not None:

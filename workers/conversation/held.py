@@ -129,7 +129,7 @@ class _HeldLanes(Generic[LaneT]):
         self._lanes: dict[int, LaneT] = {}
 
     def _opened(self, number: int, incarnation: int) -> LaneT | None:  # rule INCARNATION
-        """The lane in this incarnation, which begins here if it is new. None if the lane has a later incarnation."""
+        """The lane in this incarnation; created here if it is new. None if the lane has a later incarnation."""
         lane = self._lanes.get(number)
         if lane is None or incarnation > lane.incarnation:
             lane = self._lanes[number] = self._kind(incarnation)

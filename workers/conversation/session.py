@@ -397,7 +397,7 @@ class Session:
     # ---------------------------------------------------------------- working
 
     def next_work(self) -> Work | None:
-        """The next piece of work, which is in progress until `work_ended` is called.
+        """Begin the next piece of work, and return it. It is in progress until `work_ended` is called.
 
         None if there is no work, or a piece of work is in progress.
         """
@@ -452,8 +452,8 @@ class Session:
 
     # rules REPEATED_WELCOME, BEGINS
     def _welcome_again(self, run: WaitSpec | RunSpec | StepSpec, now: float) -> list[WorkerEffect]:
-        """Handle another Welcome of this session: either the run for which this worker waits has begun, or the Welcome is a
-        repeat, which is ignored.
+        """Handle another Welcome of this session. Either the run for which this worker waits has begun, or the Welcome is a
+        repeat; a repeat is ignored.
         """
         if not isinstance(self.run, WaitSpec) or isinstance(run, WaitSpec):
             return []

@@ -232,7 +232,7 @@ class EnvLoop:
         """Close copy n, and recreate it. If `seed` is None, its next reset does what the old copy's would have done."""
         state = state_of(self._inner[n])
         if seed is None and state is None:
-            return  # a new environment could not continue where this one is
+            return  # without a seed and a random state, a new environment couldn't continue like this one
         close_copy(self.envs[n])
         env = self.envs[n] = self._made(n)
         self._step_functions[n] = env.step

@@ -47,7 +47,7 @@ def facts_of_copies(names: Sequence[str], infos: Mapping[str, Any], count: int) 
 
 
 def of_ended(table: Array, ended: Array) -> Facts:
-    """The rows of a table [N, names] for those copies whose episodes have `ended` [N]."""
+    """The table's rows [N, names] of the copies whose episodes have ended, as `ended` [N] says."""
     return {int(n): tuple(table[n].tolist()) for n in np.flatnonzero(ended)}
 
 

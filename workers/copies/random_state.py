@@ -1,4 +1,4 @@
-"""The state of an environment's own random generator, which determines a reset without a seed in deterministic environments.
+"""The state of an environment's own random generator. In deterministic environments, it determines a reset without a seed.
 
 Rule: it is read only from gymnasium's `np_random`, which `super().reset(seed=...)` creates. If an environment draws from
 another generator, or has none, the state cannot be read.

@@ -129,7 +129,7 @@ class ObservationWriter:
 
 
 def of_seat(error: CopyFailed, seats: Sequence[str]) -> CopyFailed:
-    """The error of a column as an error that names the copy and the seat. Without seats, it is returned as it is."""
+    """Convert an error that names a column to one that names the copy and the seat. Without seats, return it unchanged."""
     if not seats or error.copy is None:
         return error
     copy, seat = divmod(error.copy, len(seats))

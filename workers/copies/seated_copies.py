@@ -1,7 +1,7 @@
 """A loop over N env copies with A seats each. They have N · A columns; the columns of one copy are adjacent.
 
-Rule: a column has the mask of the last observation, in this episode, in which the column's seat acts. Until there is one,
-all actions are allowed.
+Rule: a column's mask comes from the last observation of this episode in which the column's seat acts. Until there is such an
+observation, all actions are allowed.
 """
 
 from __future__ import annotations
@@ -77,12 +77,12 @@ class SeatedCopies(LoopedCopies):
         return self._result(copies)
 
     def _forget_masks(self, copies: Iterable[int]) -> None:
-        """Forget the masks of these copies, which begin an episode."""
+        """Forget the masks of these copies, because they begin an episode."""
         for n in copies:
             self._allowed[n * self._seats : (n + 1) * self._seats] = [None] * self._seats
 
     def _result(self, stepped: Sequence[int]) -> StepResult:
-        """The result of a step of the copies `stepped`.
+        """The result of a step in which the copies `stepped` were stepped.
 
         The others keep their last rows; copies that were never reset are left out.
         """

@@ -162,7 +162,7 @@ class Evaluator:
         return others
 
     def _opened(self, count: int, render_mode: str | None, pulse: Pulse) -> EvaluationCopies:
-        """At least `count` copies with this render mode, which are opened if necessary.
+        """At least `count` copies with this render mode; opened if necessary.
 
         Raises `UsageError` if their spaces are not those of the run.
         """

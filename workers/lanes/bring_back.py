@@ -37,7 +37,7 @@ NOT_REPEATED = (
 def bring_back(
     run: RunSpec, lane: Lane, past: LanePast, attributes: bytes, pulse: Pulse, written: Sequence[Array] = ()
 ) -> str:
-    """Continue a lane from its past on a new `Lane`, whose copies have not been reset yet.
+    """Continue a lane from its past on a new `Lane`. The copies of the new lane must not have been reset yet.
 
     At the end, the copies have these `attributes` (packed). With seats, `written` has arrays [T, N · A, …] of the shapes and
     dtypes that the policy writes. A past that doesn't fit the lane is not continued; new episodes begin instead. Returns a

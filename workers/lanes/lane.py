@@ -68,9 +68,9 @@ class Lane:
         """N · A"""
         leaves = stored_leaves(run)
         self.obs = tuple(np.empty((self.columns, *leaf.shape), leaf.dtype) for leaf in leaves)
-        """[N · A, *leaf] each, the observations with which the next rows begin"""
+        """[N · A, *leaf] each, the observations at the beginning of the next rows"""
         self.state = zero_state(run.policy, self.columns)
-        """[N · A, S] recurrent state of the policy, with which the next rows begin"""
+        """[N · A, S] recurrent state of the policy at the beginning of the next rows"""
         self.playing = np.ones(self.count, bool)
         """[N] whether the copy's episode continues; if not, the next step only resets the copy, or, in an evaluation, does
         nothing with it

@@ -209,8 +209,8 @@ class RowsOfLane:
     def _lose(self, t: int, lost: Bools) -> None:
         """Truncate the episodes of these copies [N], which were lost in step `t`, at the last step that was made.
 
-        Rows `t` and `t + 1` are then not valid, because step `t` was not made. Raises `EpisodesLost` in an evaluation, whose
-        episodes must be complete.
+        Rows `t` and `t + 1` are then not valid, because step `t` was not made. In an evaluation, raises `EpisodesLost`,
+        because its episodes must be complete.
         """
         if not self.lane.autoresets:
             if (lost & self.lane.playing).any():
@@ -220,7 +220,7 @@ class RowsOfLane:
         if t:
             self.truncated[t - 1] |= lost & ~self.terminated[t - 1]
         else:
-            self.resets[0] |= lost  # the last rollout is already delivered, so no rollout contains the end of the episode
+            self.resets[0] |= lost  # the episode's last row is in a rollout that was already sent, so no rollout has its end
 
     def count(self, t: int, now_s: float) -> None:
         """Add row t to the running episodes."""

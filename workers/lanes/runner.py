@@ -121,7 +121,7 @@ class _SteppedPart:
         self._counts_rows = self._with_seats or not self._rows.of_lanes[0].lane.autoresets
         self._forgets = self._rows.state.size > 0 and not self._counts_rows
         self._resets = self._rows.resets[:, 0].copy()  # [L, N] whether the next row only resets
-        self._row: int | None = None  # the row whose step has begun
+        self._row: int | None = None  # the row of the step that has begun
         self._taken: Array  # [L, N · A, *action] of this row
         self._over = False
 

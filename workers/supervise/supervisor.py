@@ -134,7 +134,7 @@ class Supervisor:
         prefix: str = "w",
         stay: bool = False,
     ) -> None:
-        """Start `count` workers, each by calling `start` with its name, which consists of `prefix` and a number.
+        """Start `count` workers, each by calling `start` with its name. A name consists of `prefix` and a number.
 
         With `stay`, they serve one run after another.
         """

@@ -82,7 +82,7 @@ class SteppedLane:
         return self._write_some(copies, self._loop.reset(copies, seeds, self._observations, pulse, each))
 
     def step(self, actions: Sequence[Array], pulse: Pulse) -> CopyInfos:
-        """Step each copy with its row of the actions, which are [N, *leaf] for each leaf. Returns the infos by row."""
+        """Step each copy with its row of `actions`, an array [N, *leaf] for each leaf. Returns the infos by row."""
         step = self._loop.steps
         infos = self._loop.step(self._of_each(actions), self._observations, pulse)
         try:
@@ -102,7 +102,7 @@ class SteppedLane:
         return infos
 
     def _write_some(self, copies: Sequence[int], infos: CopyInfos) -> CopyInfos:
-        """Write the rows of these copies, which were reset. Returns the infos by row."""
+        """Write the rows of these copies after they were reset. Returns the infos by row."""
         for n in copies:  # only these: a copy may overwrite its earlier observation
             leaves = read_leaves(self._read, [self._observations[n]])
             self._writer.write_some(self.rows.obs, [n], [{n: value} for (value,) in leaves])

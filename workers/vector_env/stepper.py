@@ -191,7 +191,7 @@ def _stepped(order: Reset | Step, rows: ResultRows, infos: bytes) -> Stepped:  #
 
 
 def _private_name(order: Call, arguments: Any) -> str:
-    """The private name that a call uses: its own name, or an argument of one of gymnasium's methods. Empty if
+    """The private name that a call uses: its own name, or the name that it passes to a method of gymnasium. Empty if
     there is none.
     """
     names = [order.name]

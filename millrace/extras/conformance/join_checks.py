@@ -37,7 +37,7 @@ from millrace.protocol.specs import RunSpec, StepSpec, WaitSpec
 from millrace.protocol.wire.socket_options import routing_id
 
 MOST_LIMIT_STEPS = 2000  # the longest time limit that a check tries to reach, in steps
-POLE_GAINS = (0.1, 0.2, 1.0, 0.6)  # of a linear controller that balances CartPole until the time limit
+POLE_GAINS = (0.1, 0.2, 1.0, 0.6)  # gains of a linear controller that balances CartPole until the time limit
 SILENCE_S = 1.5  # learner_timeout_s in the check in which the learner falls silent
 
 
@@ -52,7 +52,7 @@ def describe(learner: Learner) -> Describe:
 
 
 def described(learner: Learner) -> Script[DescribedEnv]:
-    """The client's environment. If it isn't known yet, let the client join and describe it."""
+    """The client's environment. If the client hasn't described it yet, let the client join and do so."""
     if learner.env is None:
         yield from in_any_session(learner)
         yield from describes_on_order(learner)
@@ -159,7 +159,7 @@ def accepts_only_its_welcome(learner: Learner) -> Script[None]:
 
 
 def describes(learner: Learner) -> Script[None]:
-    """Repeat an order to describe, as if its answer had been lost; then send a new one, and one of another session."""
+    """Repeat a Describe, as if its answer had been lost. Then send a new Describe, and one of another session."""
     yield from in_any_session(learner)
     order = yield from describes_on_order(learner)
     learner.send(order)
@@ -317,14 +317,14 @@ def leaves_when_refused_later(learner: Learner) -> Script[None]:
 
 
 def drains_while_joining(learner: Learner) -> Script[None]:
-    """Answer Hello with Drain, whose reason has the largest length that is allowed."""
+    """Answer Hello with a Drain that has the longest allowed reason."""
     yield from learner.newly_started()
     learner.send(Drain("…" * MAX_LINE))
     yield from learner.left(Rule.DRAIN_JOINING, "Drain while joining")
 
 
 def drains_while_idle(learner: Learner) -> Script[None]:
-    """Send Drain while the client has nothing to do. Its reason has the largest length that is allowed."""
+    """While the client has nothing to do, send a Drain that has the longest allowed reason."""
     yield from in_any_session(learner)
     learner.send(Drain("…" * MAX_LINE))
     goodbye = yield from learner.expect(Goodbye, Rule.DRAIN, "Goodbye after Drain")

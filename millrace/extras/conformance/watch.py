@@ -95,7 +95,7 @@ class WatchedSession:
         """the newest answer to each Evaluate, by ticket"""
         self.said_goodbye = False
         self._refused = self._drains = False  # whether the learner has sent Refuse, or Drain
-        self._welcomed = -1  # number of the last reply before the Welcome with the run; -1 if that was the first Welcome
+        self._welcomed = -1  # number of the last reply before the Welcome with the run; -1 if the first Welcome had the run
         self._described: dict[int, Described] = {}  # the first answer to each Describe
         self._ignored: dict[int, tuple[Rule, str]] = {}  # tickets that must not be answered: the rule, and why
         self._lanes: dict[int, int] = {}  # the highest incarnation of each of the client's lanes
@@ -165,7 +165,7 @@ class WatchedSession:
             self._due[ticket] = self.replies
 
     def loses(self) -> None:
-        """Record that messages which were sent may be lost, because the connection is cut."""
+        """Record that messages that were sent may be lost, because the connection is cut."""
         self._due.clear()
 
     def _asks(self, order: Order | Permit) -> None:
@@ -180,7 +180,7 @@ class WatchedSession:
         self._ignored[ticket] = UNREADABLE
 
     def received(self) -> tuple[Received, ...]:
-        """For each lane of the client, the number of rollouts whose arrival the learner confirms."""
+        """For each lane of the client, which rollouts the learner confirms to have received."""
         arrived = self._next_sequence if self.confirms else {}
         return tuple(Received(*place, arrived.get(place, 0)) for place in sorted(self._lanes.items()))
 
@@ -372,7 +372,8 @@ class WatchedSession:
     def _is_first(self, message: Answer | Rollout, too_often: Rule, differs: Rule) -> bool:
         """Whether this is the first answer to its ticket.
 
-        Raises `Broken` with the rule `too_often` if there are too many answers, or `differs` if it isn't like the first one.
+        Raises `Broken`: with the rule `too_often` if there are too many answers, with `differs` if this one differs from the
+        first.
         """
         ticket = message.ticket
         self._answered[ticket] += 1
@@ -436,7 +437,7 @@ class WatchedSession:
 
 
 def fields_that_differ(one: Answer | Rollout, other: Answer | Rollout) -> list[str]:
-    """Names of the fields that differ between two messages, bit for bit."""
+    """Names of the fields in which two messages differ in at least one bit."""
     return [name for name in one.__struct_fields__ if _bits(getattr(one, name)) != _bits(getattr(other, name))]
 
 

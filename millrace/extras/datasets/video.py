@@ -21,7 +21,7 @@ from millrace.playing import RecordVideos
 from millrace.protocol.arrays import Array
 from millrace.protocol.errors import EnvironmentFailed, RunError, UsageError, first_line
 
-AT_ONCE = 2  # number of episodes whose frames are in memory at the same time
+AT_ONCE = 2  # number of episodes that are in memory, with their frames, at the same time
 LONGEST_EPISODE = 20_000  # env steps; the worker sends frames of the first 1,500
 FRAMES_PER_S = 30  # used if the environment's metadata has no render_fps
 # Bounds of the frame rate that a worker reports for its environment. moviepy writes two decimals.
@@ -47,7 +47,7 @@ def prepare_videos() -> RecordVideos:
 def record_videos(
     player: PolicyPlayer, run: Path, episodes: int, seed: int, max_steps: int, prefix: str = ""
 ) -> tuple[Evaluation, list[Path]]:
-    """Let the workers of `player` play episodes, and write a video of each, whose name begins with `prefix`.
+    """Let the workers of `player` play episodes, and write a video of each. Names of videos begin with `prefix`.
 
     `seed`: seed of the episodes; see `EvaluationPlan.of`. `max_steps`: largest number of env steps of all episodes together;
     each episode gets an equal share, but at most `LONGEST_EPISODE`. Returns the evaluation and the paths of the videos.

@@ -39,7 +39,7 @@ def read_flags(
 
 
 def learner_flags(env: str, rest: Sequence[str], workers: int, *, bind: str, runs: str) -> list[str]:
-    """The flags of a learner on a cluster, for which `workers` worker processes are started.
+    """The flags of a learner on a cluster that starts `workers` worker processes for it.
 
     With these flags, the learner resumes the newest run, and waits ten minutes for workers. `bind`: the address where they
     join. `runs`: the folder of runs.

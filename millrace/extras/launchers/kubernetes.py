@@ -1,7 +1,7 @@
 """`millrace launch kubernetes`: makes a manifest with a learner and workers. Pure, except that it reads a key folder.
 
 The learner is a Job, which ends with the run. If its pod is lost, another pod resumes the run from the newest checkpoint.
-The workers are a Deployment, whose size may change at any time, and which stays for the next learner. The manifest contains
+The workers are a Deployment. Its size may change at any time, and it stays for the next learner. The manifest contains
 secrets only if the user named a key folder.
 """
 

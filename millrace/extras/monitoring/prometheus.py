@@ -129,7 +129,7 @@ def _of_progress(hub: HubSnapshot, updates: int) -> Iterator[Metric]:
 
 
 def _of_facts(facts: Mapping[str, FactMean]) -> Iterator[Metric]:
-    """The numbers of `info_keys`. Each name is the value of a label, which may be any text, because it is escaped."""
+    """The numbers of `info_keys`. Their names are values of a label. They may be any text, because labels are escaped."""
     means = GaugeMetricFamily(
         "millrace_episode_info_mean",
         "Numbers in info, by name: of those of the last 100 training episodes that have it.",

@@ -14,6 +14,6 @@ def preprocessed(env_id: str) -> str:
 
 
 def instead_of_vector(env_id: str) -> str:
-    """What to do about an id whose copies can't be stepped in the way that the run asks for."""
+    """What to do if copies of this id can't be stepped in the way that the run asks for."""
     ours = preprocessed(env_id)
     return f"take {ours}, or use --vector loop" if ours else "use --vector loop"

@@ -11,7 +11,7 @@ from millrace.protocol.envs.space_records import describe_space
 from millrace.protocol.errors import words_an_error
 
 IMAGES_ONLY = {"minigrid": "minigrid.wrappers:ImgObsWrapper", "babyai": "minigrid.wrappers:ImgObsWrapper"}
-"""The wrapper that keeps only the image, for each package whose observations contain text as well as an image."""
+"""For packages whose observations contain an image and text: the wrapper that keeps only the image."""
 
 
 @words_an_error

@@ -236,7 +236,7 @@ def _worker(worker: WorkerStatus, status: Status) -> str:
 
 
 def who_waits(seen: Seen) -> str:
-    """The picture with a row for the learner and for each lane, which shows their activities in the last minutes."""
+    """The picture of who waits: a row for the learner and for each lane, with their activities in the last minutes."""
     if not seen.samples:
         return ""
     end_s = seen.samples[-1].at_s

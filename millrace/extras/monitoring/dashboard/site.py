@@ -172,7 +172,7 @@ def comparison(report: ReportData) -> list[str]:
 
 
 def all_runs(lines: Sequence[RunLine], home: str) -> str:
-    """The table of all runs, in which several can be chosen to compare them."""
+    """The table of all runs. The user can select several of them for a comparison."""
     training = sum(line.state == "training" for line in lines)
     about = f"{len(lines)} run{'s' * (len(lines) != 1)}, {training} training"
     header = f'<header><p class="kicker">millrace</p><h1>Runs</h1><p>{about}</p></header>'

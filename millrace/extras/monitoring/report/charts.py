@@ -40,7 +40,7 @@ class Series(NamedTuple):
 
 
 def ticks(low: float, high: float, about: int) -> list[float]:
-    """Round numbers from `low` to `high`, 1, 2 or 5 times a power of ten apart. Their number is close to `about`."""
+    """Round numbers from `low` to `high`, roughly `about` of them. Their spacing is 1, 2 or 5 times a power of ten."""
     span = high - low
     if not LEAST_SPAN < span < math.inf:
         return [low]
@@ -99,7 +99,7 @@ def chart(all_series: Sequence[Series], width: int, height: int, x_label: str, d
 
 
 def chart_for_all_widths(all_series: Sequence[Series], wide: tuple[int, int], x_label: str, describe: str) -> str:
-    """The chart in two sizes, one of which the style sheet shows, because text must not shrink with its chart."""
+    """The chart in two sizes. The style sheet shows the one that fits, because text must not shrink with its chart."""
     sizes = {"for-wide": wide, "for-narrow": ON_A_PHONE}
     return "".join(f'<div class="{css}">{chart(all_series, *size, x_label, describe)}</div>' for css, size in sizes.items())
 
@@ -158,7 +158,7 @@ def _svg(series: Series, x: Doubles, y: Doubles) -> str:
 
 
 def _subsampled(x: Doubles, y: Doubles) -> tuple[Doubles, Doubles]:
-    """About 500 of the points, including the last one, because more wouldn't be visible."""
+    """Keep about 500 of the points, because more wouldn't be visible. The last point is always kept."""
     every = math.ceil(len(x) / MOST_POINTS)
     keep = np.unique([*range(0, len(x), every), len(x) - 1])
     return x[keep], y[keep]

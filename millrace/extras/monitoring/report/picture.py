@@ -29,7 +29,7 @@ MARGIN = 28
 HEAD = 50
 LINE = 20
 LETTERS = 92  # about the number of letters that fit into WIDTH
-ZOOM = 2  # size of the PNG, as a multiple of the size of the SVG
+ZOOM = 2  # the PNG is this many times as large as the SVG
 OWN_STYLE = (
     ".picture { font: 13px system-ui, sans-serif; color: var(--soft); }",
     ".picture text { fill: currentColor; }",
