@@ -95,7 +95,7 @@ class LoadedPolicy:
         check_at_least("reset: seed", seed or 0, 0)
         try:
             self._state = zero_state(self.spec, 1, copies)
-        except (MemoryError, ValueError) as error:  # ValueError: longer than any numpy array can be
+        except (MemoryError, ValueError) as error:  # numpy raises ValueError for arrays that are longer than it supports
             raise UsageError(f"reset: copies: expected a number whose states fit into memory, got {copies}") from error
         if seed is not None and self._generator is not None:
             self._generator = generator(seed, Purpose.PLAYED_ACTIONS)
@@ -170,7 +170,7 @@ class LoadedPolicy:
         size = action.choices
         try:
             given = np.asarray(mask)
-        except (ValueError, TypeError):  # rows of different lengths
+        except (ValueError, TypeError):  # raised for rows of different lengths
             given = np.asarray(None)
         if not size or given.dtype.kind not in "biu" or given.shape not in ((size,), (n, size)):
             expected = f"{size} zeros and ones of int8 or bool, or [{n}, {size}]" if size else "none for this action space"
@@ -242,7 +242,7 @@ def _checked(value: Any, leaf: Leaf) -> Array:
     """The value as an array [*leaf] or [n, *leaf] of its space's dtype. Raises `UsageError` if it isn't in the space."""
     try:
         given = np.asarray(value)
-    except (ValueError, TypeError):  # rows of different lengths; a tensor on a GPU
+    except (ValueError, TypeError):  # raised for rows of different lengths, or a tensor on a GPU
         given = np.asarray(None)
     expected = f"{leaf.dtype}{list(leaf.shape)}, or [n, …] of them"
     if leaf.shape not in (given.shape, given.shape[1:]) or not np.can_cast(given.dtype, leaf.dtype, "same_kind"):

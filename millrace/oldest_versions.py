@@ -39,7 +39,7 @@ def check_versions() -> None:
         line = _too_old(name, oldest)
         if not line:
             continue
-        # With `python -m`, argv[0] is "-m" while it looks for the module.
+        # With `python -m`, argv[0] is "-m" while Python looks for the module.
         if sys.argv and Path(sys.argv[0]).name in ("-m", "millrace"):
             sys.stderr.write(f"millrace: {line}\n")
             sys.exit(2)

@@ -142,7 +142,7 @@ def record(
 
 
 def flags_of(kind: type[_Flags], name: str, **keywords: Any) -> _Flags:
-    """The record `kind` made of these keyword arguments. Raises `UsageError`, which names the wrong keyword.
+    """Make a record of type `kind` from these keyword arguments. Raises a `UsageError` that names the wrong keyword.
 
     `name`: the function that was called, for errors.
     """

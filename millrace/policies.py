@@ -285,7 +285,7 @@ def _numbers(value: Any, what: str) -> Floats:
     """The value as a float32 array, in which too large a number becomes infinite. Raises `UsageError` unless it is real."""
     try:
         array = np.asarray(value)
-    except ValueError:  # rows of different lengths
+    except ValueError:  # raised for rows of different lengths
         array = np.asarray(None)
     if not np.can_cast(array.dtype, np.float32, "same_kind"):
         raise UsageError(f"{what}: expected real numbers, got an array of {array.dtype}")

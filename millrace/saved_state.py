@@ -94,7 +94,7 @@ def read(path: Path) -> tuple[ServiceState, dict[str, Array]]:
         # The file is opened here, because numpy wouldn't close a damaged one.
         with os.fdopen(descriptor, "rb") as opened, np.load(opened, allow_pickle=False) as file:
             if any(entry.compress_type != zipfile.ZIP_STORED for entry in file.zip.infolist()):
-                raise ValueError("it is compressed, which millrace never does")  # few such bytes could fill the memory
+                raise ValueError("it is compressed, which millrace never does")  # a few of its bytes could fill the memory
             arrays = {name: file[name] for name in file.files}
         state = msgspec.json.decode(arrays.pop(OURS).tobytes(), type=ServiceState)
         state.ledger.end_outstanding()

@@ -26,8 +26,8 @@ from millrace.protocol.bounds import MAX_COPIES, Natural
 MAX_RANDOM_BYTES = 64
 
 RandomState = Annotated[bytes, Meta(max_length=MAX_RANDOM_BYTES)]
-"""State of the environment's random generator (`workers/copies/random_state.py`) just before a reset without a seed began the
-episode. It is empty if the episode began with the seed of the copy's start.
+"""State of the environment's random generator (`workers/copies/random_state.py`) just before the reset without a seed that
+began an episode. It is empty if the episode began with the seed of the copy's start.
 """
 
 

@@ -476,7 +476,7 @@ class Status(Message, frozen=True):
     workers: tuple[WorkerStatus, ...]
     """the workers in the order in which they joined; if there are too many, only the first of them"""
     workers_wanted: int = 0
-    """the number of workers with which each lane has a worker of its own and no worker is spare; 0 while the environment is
+    """the number of workers at which each lane has a worker of its own and no worker is spare; 0 while the environment is
     being described"""
     workers_left_out: int = 0
     """number of workers that are not in `workers`, because the message would be too long"""

@@ -257,7 +257,7 @@ class VectorEnvPool:
         if inherited is None:
             return None
         memory = SharedMemory(spec, inherited.memory_fd, resize=True)
-        spin_s = SPIN_S if self.expected < usable_cores() else 0.0  # only if one core is free for the learner
+        spin_s = SPIN_S if self.expected < usable_cores() else 0.0  # spin only if a core stays free for the learner
         return SharedSteps(memory, inherited.to_workers, inherited.to_learner, spin_s)
 
 

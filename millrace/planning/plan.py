@@ -42,7 +42,7 @@ OF_PROBE = 0.7  # share of the time in which the environment is measured; millra
 LEAST_S = 5.0
 EVALUATION_COPIES = Config().eval_copies
 MACHINES = (1, 2, 10)
-BUSY = 0.5  # load average divided by the number of cores, above which the machine counts as busy
+BUSY = 0.5  # if the load average divided by the number of cores is larger, the machine counts as busy
 RESETS_COUNT = 1.1  # resets in the background are advised if they make a run faster by at least this factor
 SLOW_START_S = 10.0
 

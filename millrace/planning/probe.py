@@ -41,14 +41,14 @@ WARM_UP = 2  # number of first steps of a copy that aren't counted
 OF_ALONE = 0.15  # share of the time in which one copy steps alone
 OF_SIDE_BY_SIDE = 0.9  # share of the time after which no more copies are started
 EACH_S = 2.0  # how long each number of workers is measured
-MOST_PER_CORE = 8  # largest number of workers to try, for each core
+MOST_PER_CORE = 8  # largest number of workers to try per core
 MOST_AT_LEAST = 16  # number of workers to try even if `MOST_PER_CORE` allows fewer
 SHORT_S = 1e-3  # shorter steps are measured in workers with several copies, because a run steps them in this way
 COPIES_OF_SHORT = 8  # number of copies in a worker if steps are short
 OF_ITS_OWN = "if a copy needs a port, a folder or a licence of its own, see docs/how-to/simulators.md"
 GROWTH = 4  # each number of workers to try is this many times the one before
 WORTH_WHILE = 1.1  # if more workers don't increase the env steps/s by this factor, even larger numbers aren't tried
-OF_MEMORY = 0.7  # share of the free memory that is used
+OF_MEMORY = 0.7  # the probe uses at most this share of the free memory
 
 
 class ProbedEnv(NamedTuple):
@@ -297,7 +297,7 @@ def _with_all(measured: Measurements, sessions: Sequence[_SteppedCopies]) -> Mea
     times = [each for session in sessions for each in session.times]
     later = [each.resets[1:] for each in times if len(each.resets) > 1]
     resets = np.concatenate(later or [each.resets for each in times])
-    steps = sum(int(np.count_nonzero(each.steps[:, 0] < each.resets[-1, 0])) for each in times)  # of complete episodes
+    steps = sum(int(np.count_nonzero(each.steps[:, 0] < each.resets[-1, 0])) for each in times)  # steps of complete episodes
     share = max(each.others_cpu_share for each in times)
     return msgspec.structs.replace(
         measured,

@@ -165,7 +165,7 @@ def read_notes(folder: Path) -> list[CopyTimes]:
 
 def _times(numbers: Array) -> CopyTimes:
     rows = numbers[: len(numbers) // 5 * 5].reshape(-1, 5)
-    # A call may be interrupted just before its wall time begins. Its delay then exceeds its waiting time, so it is clipped.
+    # A call may be interrupted just before its wall time begins. Then the delay exceeds the waiting time, so clip the delay.
     kinds = rows[:, 0]
     rows[:, 4] = np.where(kinds == PROCESSES, rows[:, 4], np.clip(rows[:, 4], 0.0, np.maximum(0.0, rows[:, 2] - rows[:, 3])))
     calls = rows[:, 1:]

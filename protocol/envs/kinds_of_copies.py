@@ -58,12 +58,12 @@ def copies_kind(name: str) -> CopiesKind:
 
 
 def has_masks(name: str) -> bool:
-    """Whether copies of this kind report masks of the allowed actions. `loop` isn't imported for this: it always does."""
+    """Whether copies of this kind report masks of the allowed actions. Doesn't import `loop`, whose copies always do."""
     return name == DEFAULT or copies_kind(name).has_masks
 
 
 def has_attributes(name: str) -> bool:
-    """Whether attributes of copies of this kind can be set. `loop` isn't imported for this: its copies' always can."""
+    """Whether attributes of copies of this kind can be set. Doesn't import `loop`, for whose copies this is always so."""
     return name == DEFAULT or copies_kind(name).has_attributes
 
 

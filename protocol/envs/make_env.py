@@ -158,7 +158,7 @@ def _why_not_made(env_id: str, error: Exception, failed: Sequence[str], why_not:
                 f"environment {env_id} has no vectorized form of its own (gymnasium's vector_entry_point); use --vector loop"
             )
         case gymnasium.error.UnregisteredEnv() if env_id.rpartition(":")[2] in gymnasium.registry:
-            return f"environment {env_id} cannot be made: {says}"  # it is registered, but makes an environment that isn't
+            return f"environment {env_id} cannot be made: {says}"  # its own code asks for an id that isn't registered
         case gymnasium.error.UnregisteredEnv() if ours := preprocessed(env_id):
             return f"environment {env_id} is not registered: write {ours}"
         case gymnasium.error.UnregisteredEnv() if not colon:

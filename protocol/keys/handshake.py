@@ -36,8 +36,8 @@ log = logging.getLogger("millrace.authenticator")
 
 DOMAIN = b"millrace"
 ZAP = "inproc://zeromq.zap.01"
-LIST_CHECK_INTERVAL_S = 1.0  # at most this long after its file has changed, the list of clients is read again
-MAX_BATCH = 100  # requests, or events, that are handled before the other sockets get their turn
+LIST_CHECK_INTERVAL_S = 1.0  # how often to check whether the file with the list of clients has changed
+MAX_BATCH = 100  # at most this many requests, or events, are handled before the other sockets get their turn
 
 Socket = zmq.Socket[bytes]
 

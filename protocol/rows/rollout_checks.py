@@ -43,7 +43,7 @@ def validate(rollout: Rollout, run: RunSpec, most_steps: int = LARGEST) -> None:
         Expected("terminated", rollout.terminated, (T, N), "bool"),
         Expected("truncated", rollout.truncated, (T, N), "bool"),
         Expected("valid", rollout.valid, (T, N), "bool"),
-        Expected("state", rollout.state[None], (1, N, run.policy.state_size), "float32"),  # an error says "at step 0"
+        Expected("state", rollout.state[None], (1, N, run.policy.state_size), "float32"),  # so that errors say "at step 0"
     ]
     if (rollout.mask is not None) != run.masked:
         raise BadRollout(f"mask: expected {'one' if run.masked else 'none'}")

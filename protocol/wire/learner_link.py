@@ -63,7 +63,7 @@ class LearnerLink:
         self._authenticator: AuthenticatorThread | None = None
         try:
             if address.startswith("tcp://"):
-                self._authenticator = AuthenticatorThread(self._socket, keyring)  # before the port is bound
+                self._authenticator = AuthenticatorThread(self._socket, keyring)  # must exist before the port is bound
             self._socket.bind(address)
         except UsageError:
             self.close(linger_s=0.0)

@@ -196,7 +196,7 @@ class EnvLoop:
                 begin(WAITING)
                 raise CopyFailed(n, "reset" if resets else f"step {self.steps}") from error
             if info:
-                infos.append((n, _kept(info)))  # now, because the next copy may change the same dict
+                infos.append((n, _kept(info)))  # copied now, because the next copy may change the same dict
             if (now_s := perf_counter()) > pulse_due_s:
                 numbers[ENV_CALLS] += (done := chosen.index(n) + 1) - counted
                 counted = done

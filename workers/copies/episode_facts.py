@@ -29,7 +29,7 @@ def facts_of_info(names: Sequence[str], info: Mapping[str, Any], copy: int | Non
 def facts_of_copies(names: Sequence[str], infos: Mapping[str, Any], count: int) -> Array:
     """The facts [count, names] float64 of all copies of a vector environment, read from its infos in gymnasium's form.
 
-    Raises `CopyFailed` for values that aren't numbers, or if there isn't one for each copy.
+    Raises `CopyFailed` for values that aren't numbers, or if there isn't one value for each copy.
     """
     table = np.full((count, len(names)), np.nan)
     for k, name in enumerate(names):

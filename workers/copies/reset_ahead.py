@@ -119,5 +119,5 @@ class ResetAhead(gymnasium.Wrapper[Any, Any, Any, Any]):
         try:
             super().close()
         finally:
-            give_back(self.env)  # both, because they have taken turns
+            give_back(self.env)  # for both instances, because they have taken turns
             give_back(self._second)

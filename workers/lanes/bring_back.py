@@ -51,7 +51,7 @@ def bring_back(
     if isinstance(copies, LoopedCopies) and lane.remembers and _fits(past, memory, lane, run, written):
         continued = [n for n, last in enumerate(past.copies) if last.goes_on]
         states = _states(past.memory[-1], lane) if saved else []
-    if not isinstance(copies, LoopedCopies) or not continued:  # the learner knows the reason
+    if not isinstance(copies, LoopedCopies) or not continued:  # nothing is reported, because the learner knows why
         lane.set_attributes(attributes, pulse)
         starts = [last.start + 1 for last in past.copies]
         lane.start(starts if len(starts) == lane.count else [max(starts, default=1)] * lane.count, pulse)
@@ -257,7 +257,7 @@ def _fits(past: LanePast, memory: Sequence[Array], lane: Lane, run: RunSpec, wri
         ),
     ]
     shapes = all(array.shape == shape and array.dtype == dtype for array, shape, dtype in expected)
-    before = [1 if last.random and last.is_repeated else 0 for last in past.copies]  # the row of the reset
+    before = [1 if last.random and last.is_repeated else 0 for last in past.copies]  # 1 if the row of the reset comes first
     firsts = all(least <= last.first <= rows for least, last in zip(before, past.copies, strict=True))
     counts = len(past.copies) == lane.count and len(past.obs) == len(stored_leaves(run))
     return shapes and firsts and counts and lane.can_recall(memory, written)

@@ -59,7 +59,7 @@ from millrace.protocol.wire.codec import encode
 from millrace.protocol.wire.plain_values import pack
 from millrace.protocol.wire.weight_dtypes import to_wire_dtype
 
-STEPS = 32  # T, the steps of a rollout in most checks
+STEPS = 32  # T, the number of steps of a rollout in most checks
 TIMED_STEPS = 200  # T of the rollouts that measure how fast the client is
 TIMED_ROLLOUTS = 3
 LONG_S = 1.0  # duration of a long rollout
@@ -194,13 +194,13 @@ def collecting_at_length(learner: Learner, lasts_s: float = LONG_S) -> Script[Co
     """Begin a session with long rollouts, so that something can happen while the client is collecting one."""
     if not learner.step_s:
         session = yield from collecting(learner, TIMED_STEPS, net=LONG_NET)
-        yield from session.collect()  # opens the lane, so isn't measured
+        yield from session.collect()  # not measured, because it opens the lane
         took_s = []
         for _ in range(TIMED_ROLLOUTS):
             began_s = learner.now
             yield from session.collect()
             took_s.append(learner.now - began_s)
-        learner.step_s = max(min(took_s), 1e-3) / TIMED_STEPS  # the fastest: other programs may have slowed the others
+        learner.step_s = max(min(took_s), 1e-3) / TIMED_STEPS  # of the fastest rollout, because other programs may slow some
     return (yield from collecting(learner, min(max(int(lasts_s / learner.step_s), STEPS), LONGEST_STEPS), net=LONG_NET))
 
 
@@ -268,7 +268,7 @@ def keeps_rows(learner: Learner) -> Script[None]:
     session = yield from collecting(learner, steps=7)
     ends = 0
     between = False  # whether an episode ended in the last row of a rollout
-    around: list[tuple[bytes, bytes]] = []  # the last observation of an episode, the first one of the next episode
+    around: list[tuple[bytes, bytes]] = []  # pairs: last observation of an episode, first observation of the next
     for _ in range(40):
         rollout = yield from session.collect()
         if ends >= 8 and len(around) >= 3 and between:
@@ -427,7 +427,7 @@ def keeps_its_weights(learner: Learner) -> Script[None]:
     session = yield from collecting_at_length(learner)
     permit = session.permit()
     session.deal(permit)
-    for version in range(2, 20):  # without their orders, as if these had been lost
+    for version in range(2, 20):  # sent without their orders, as if the orders had been lost
         session.give(session.weights(version))
         yield Wait(session.rollout_s / 10)
     yield from session.rollout(permit)
@@ -537,7 +537,7 @@ def starts_a_lane_again(learner: Learner) -> Script[None]:
         got = f"the same observations and actions as in incarnation 0, for {STEPS} steps"
         raise Broken(Rule.INDEPENDENT, "other episodes in incarnation 2", got)
     session.permit(incarnation=1)
-    old = session.permit(incarnation=1)  # has the sequence number that is next
+    old = session.permit(incarnation=1)  # has the next sequence number
     session.deal(old)
     yield from learner.quiet(Rollout, Rule.INCARNATION, "no rollout of incarnation 1 after one of 2")
     yield from session.collect(session.permit(incarnation=2))
@@ -618,7 +618,7 @@ def closes_unlisted_lanes(learner: Learner) -> Script[None]:
     lost = session.permit(0)
     kept = session.permit(1)
     session.order(lost, kept, version=2)
-    learner.watch.sent(Release(learner.session, (LaneIncarnation(0, 0),)))  # tells only the watch, so the message is lost
+    learner.watch.sent(Release(learner.session, (LaneIncarnation(0, 0),)))  # only recorded, not sent, as if it had been lost
     yield from heartbeats(learner, 3)
     session.give(session.weights(2))
     yield from session.rollout(kept)

@@ -21,7 +21,7 @@ from millrace.protocol.specs import RunSpec
 from millrace.protocol.wire.weight_dtypes import to_float32
 
 RETURN_TOLERANCE = 1e-4  # relative, because rewards in rows are float32 but returns are summed in float64
-LOG_PROB_TOLERANCE = 1e-3  # absolute, because another order of additions gives other last bits
+LOG_PROB_TOLERANCE = 1e-3  # absolute; adding in another order changes the last bits
 
 
 class LaneRows:
@@ -78,7 +78,7 @@ class LaneRows:
         if run.seats:  # take the returns from facts, because rewards outside of valid rows also count
             returns = (sum(episode.facts[-len(run.seats) :]) for episode in rollout.episodes)
             expected = [(total, length) for total, (_, length) in zip(returns, expected, strict=True)]
-        got = [(episode.reward, episode.length) for episode in rollout.episodes]  # `validate` has counted the episodes
+        got = [(episode.reward, episode.length) for episode in rollout.episodes]  # `validate` has checked their number
         if not _same(expected, got) and _same(sorted(expected), sorted(got)):
             lengths = [length for _, length in expected]
             raise Broken(

@@ -169,7 +169,7 @@ def ends_episodes(learner: Learner) -> Script[None]:
     before = yield from steps.do(steps.reset())
     length = np.zeros(steps.spec.lanes[0], int)
     ends = 0
-    around: list[tuple[bytes, bytes]] = []  # the last observation of an episode, the first one of the next episode
+    around: list[tuple[bytes, bytes]] = []  # pairs: last observation of an episode, first observation of the next
     for _ in range(WALK_STEPS):
         row = yield from steps.do(steps.step())
         ended = before.terminated | before.truncated
@@ -520,7 +520,7 @@ def releases_a_lane(learner: Learner) -> Script[None]:
 def forgets_unlisted_lanes(learner: Learner) -> Script[None]:
     """Send no Release, as if it had been lost, and don't list the lane in the next HeartbeatReply."""
     steps = yield from stepping(learner, 0, 1)
-    learner.watch.sent(Release(learner.session, (LaneIncarnation(0, 0),)))  # tells only the watch, so the message is lost
+    learner.watch.sent(Release(learner.session, (LaneIncarnation(0, 0),)))  # only recorded, not sent, as if it had been lost
     yield from heartbeats(learner, 3)
     yield from _has_no_copies(steps, Rule.UNLISTED)
     yield from steps.do(steps.step(1))

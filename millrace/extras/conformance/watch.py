@@ -222,7 +222,7 @@ class WatchedSession:
                 if not isinstance(order, Evaluate):
                     raise Broken(Rule.EVALUATE, "the ticket of an Evaluate of this session", brief(message))
                 self._see_played(message, order)
-            case Goodbye() | Failure() if self._refused and not self._drains:  # after Drain, it may have been on its way
+            case Goodbye() | Failure() if self._refused and not self._drains:  # or it may answer the Drain
                 raise Broken(Rule.AFTER_REFUSE, "no last words after Refuse", brief(message))
             case Goodbye():
                 self._see_tickets(message.tickets)

@@ -50,7 +50,7 @@ def record_episodes(
             returns.append(episode.episode_return)
             taken += episode.length
             cut += was_cut
-        dataset.close()  # before the rows: if they can't be written, leaving the context removes the dataset
+        dataset.close()  # before the rows are written, so that the dataset is removed if that fails
     return RecordedDataset(
         dataset_id=dataset_id,
         episodes=len(returns),

@@ -283,7 +283,7 @@ def evaluations(rows: Sequence[Mapping[str, Any]], kept: Best | None = None) -> 
     returns, lengths = (points(rows, key) for key in (EVALUATION_KEY, EVALUATION_LENGTH_KEY))
     if not len(returns):
         return ""
-    best = len(returns) - 1 - int(returns[::-1, 1].argmax())  # the newest of equally good ones, as in the run
+    best = len(returns) - 1 - int(returns[::-1, 1].argmax())  # the newest of equally good evaluations, as in the run itself
     at, highest = returns[best] if kept is None else (kept.env_steps, kept.chosen_by)
     length_at = dict(lengths.tolist())
     which = f"The best of {len(returns)}" if kept is None else "The best of all, that at the end included,"

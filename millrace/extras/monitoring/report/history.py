@@ -10,7 +10,7 @@ from millrace.learner.run_folder.json_log import LoggedLine
 from millrace.protocol.bounds import escaped
 
 MOST_HISTORY = 30  # largest number of lines on the page
-AT_ONCE = 8  # number of lines shown at first; the others are in a block that is closed at first
+AT_ONCE = 8  # number of lines shown at first; the others are in a block that the reader can open
 
 
 def history(report: ReportData) -> str:

@@ -169,7 +169,7 @@ def _shown(path: Path, address: str, before: str, after: str) -> str:
 
 
 def settings(report: ReportData) -> str:
-    """The settings that differ, with a column for each group, and the others in a block that is closed at first."""
+    """The settings that differ, with a column for each group; the others are in a block that the reader can open."""
     runs = [run for _, run in report.runs]
     differ = differing_settings([run.settings for run in runs])
     same = {name: value for name, value in runs[0].settings.items() if name not in differ}
