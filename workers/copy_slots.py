@@ -6,7 +6,7 @@ children have ended.
 
 Rule: a copy that was only described is reused as the next copy that its thread makes, if the new one would be the same.
 Otherwise, it is closed before the new one is made. A worker also closes it if the worker has made no copy in the first
-`UNUSED_S` seconds of a run, because the run may not need this worker. So no worker long keeps a copy that it doesn't need.
+`UNUSED_S` seconds of a run, because the run may not need this worker. So no worker keeps an unneeded copy for long.
 """
 
 from __future__ import annotations

@@ -208,7 +208,7 @@ class Worker:
             self._take_shared_weights(self._options.shared_weights)
 
     def _take_shared_weights(self, shared: SharedWeightsReader) -> None:
-        """Handle weights that the supervisor has received as if the learner had sent them to this worker."""
+        """Handle weights from the supervisor in the same way as weights that the learner sends to this worker."""
         for frames in shared.find(self._session.session, self._session.missing_versions()):
             with suppress(BadMessage):  # the learner will send them to this worker directly
                 self._do(self._session.handle(decode_to_worker(frames), self._clock()))

@@ -40,7 +40,7 @@ class Typed(NamedTuple):
 
 
 def parse_flags(record: type[FlagsT], argv: Sequence[str], command: str) -> FlagsT:
-    """The record with the values that these words give. Raises `UsageError`, or SystemExit(0) after `--help`."""
+    """Parse these words as a record of this type. Raises `UsageError`, or SystemExit(0) after `--help`."""
     fields = fields_of(record)
     if asks_for_help(argv):
         show_help(command, " ".join((record.__doc__ or "").split()), {"flags": (record, list(fields))})

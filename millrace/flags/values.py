@@ -25,7 +25,7 @@ RecordT = TypeVar("RecordT", bound=msgspec.Struct)
 
 
 def read_words(field: FlagField, words: Sequence[str]) -> Any:
-    """The value of this field that the words give. Raises `UsageError`."""
+    """Parse these words as the value of this field. Raises `UsageError`."""
     if field.optional and list(words) in (["none"], ["None"]):
         return None
     match get_origin(field.kind):

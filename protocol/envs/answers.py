@@ -1,4 +1,4 @@
-"""Reads what `reset` and `step` of an environment return. Raises `WrongAnswer` for any other form than gymnasium's.
+"""Reads what `reset` and `step` of an environment return. Raises `WrongAnswer` for any form other than gymnasium's.
 
 Rule: None as the info means an empty info. If the info is anything else but a dict, the environment returned something other
 than gymnasium's tuple, perhaps an observation with the same number of elements, and none of it is used.

@@ -1,7 +1,7 @@
 """Converts actions between the form that policies choose and rollouts store and the form that environments expect. Pure.
 
-Rule: the chosen action is stored. What the environment gets is that action shifted by `start`, or, for a Box, scaled if the
-policy asks for it and clipped. A mixed action is stored as a row; the environment gets a Dict or Tuple
+Rule: the chosen action is stored. For the environment, it is converted: shifted by `start`, or, for a Box, scaled if the
+policy asks for that, and then clipped. A mixed action is stored as a row; the environment gets a Dict or Tuple
 (`millrace.protocol.action_parts`).
 """
 

@@ -10,7 +10,7 @@ import ctypes
 
 KEEP = 256 << 20  # up to this many free bytes at the end of the heap are not returned to the system
 LARGEST = 32 << 20  # allocations of up to this many bytes are made in the heap; glibc accepts no larger value
-# The numbers of these parameters in malloc.h.
+# The numbers that malloc.h gives to these parameters of mallopt.
 _M_TRIM_THRESHOLD = -1
 _M_MMAP_THRESHOLD = -3
 

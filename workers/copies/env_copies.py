@@ -327,7 +327,7 @@ class LoopedCopies:
         self._attributes[name] = packed
         with self._activity.during(STEPPING):
             for n, env in enumerate(self.envs):
-                set_attribute(n, env, name, unpack(packed))  # a separate value for each, because they may change it
+                set_attribute(n, env, name, unpack(packed))  # each copy gets its own value, because it may change the value
 
     def render(self, copy: int) -> Any:
         """The frame that this copy renders. Raises `CopyFailed`."""
@@ -368,7 +368,7 @@ def set_attribute(copy: int | None, env: Any, name: str, value: Any) -> None:
     while not hasattr(owner, name) and isinstance(owner, gymnasium.Wrapper | VectorWrapper):
         if isinstance(owner, ResetAhead):
             for instance in owner.instances():
-                set_attribute(copy, instance, name, deepcopy(value))  # a separate value for each, because they may change it
+                set_attribute(copy, instance, name, deepcopy(value))  # its own value, because it may change the value
             return
         owner = owner.env
     if name.startswith("_") or not hasattr(owner, name) or callable(getattr(owner, name)):

@@ -1,7 +1,8 @@
 """Checks, before rows are sent, that their values are finite and within their spaces. `row_writers` has checked the shapes.
 
-If not, each function raises `EnvironmentFailed`, which names the lane (or an evaluation if `lane` is None), and the step and
-the copy of the first wrong value. Arrays are [rows, N, …] with the axes `RunSpec.row_axes`; row 0 is step `first_step`.
+If a value is wrong, each function raises `EnvironmentFailed`. The error names the lane (or an evaluation if `lane` is None),
+and the step and copy of the first wrong value. Arrays are [rows, N, …] with the axes `RunSpec.row_axes`; row 0 is step
+`first_step`.
 """
 
 from __future__ import annotations

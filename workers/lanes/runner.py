@@ -77,7 +77,7 @@ class LaneRunner:
         self._stored = stored_leaves(run)
 
     def run(self, parts: Sequence[Part], pulse: Pulse) -> None:
-        """Fill the rows of these parts; in an evaluation, until all its episodes are over.
+        """Fill the rows of these parts. In an evaluation, stop when all its episodes are over.
 
         With two parts, the policy acts for one while the copies of the other step. `pulse` is called at every step and may
         raise. Raises `EnvironmentFailed` and `PolicyFailed`, and `EpisodesLost` in an evaluation. The values of the rows are

@@ -1,8 +1,8 @@
 """The env copies of one lane in envpool, with time limits that are applied here.
 
-Rule: autoreset is NextStep, as in envpool, and flags are exact, which they aren't in envpool: it reports an episode that
-terminates in the last step before its time limit only as truncated. So envpool gets a limit that is one step longer, and
-never reaches it: this file truncates an episode at its time limit, and resets the copy explicitly in the next step.
+Rule: autoreset is NextStep, as in envpool. Flags are exact, unlike envpool's: envpool reports an episode that terminates in
+the last step before its time limit only as truncated. So envpool gets a limit that is one step longer, and never reaches it:
+this file truncates an episode at its time limit, and resets the copy explicitly in the next step.
 """
 
 from __future__ import annotations

@@ -65,7 +65,7 @@ class MetricsCollector(Collector):
         """`clock`: seconds since 1970. `observed`: the snapshot to show before the first call of `observe`."""
         self._clock = clock
         self._observed = observed
-        self._updates_before: int | None = None  # updates of earlier learners, if the run was resumed
+        self._updates_before: int | None = None  # number of updates before this learner resumed the run
         self._about = {"env": config.env, "algo": config.algo, "seed": str(config.seed)}
         self._wanted = config.lanes
 

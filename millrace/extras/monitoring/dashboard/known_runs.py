@@ -75,7 +75,7 @@ class KnownRuns:
         return line
 
     def content(self, run: Path) -> RunContent:
-        """The content of this run's folder that its page shows.
+        """The parts of this run's folder that the run's page shows.
 
         Raises `UsageError`, with a one-line message, if the folder can't be read.
         """
