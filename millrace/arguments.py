@@ -32,7 +32,7 @@ WORDS: dict[Any, str] = {
     dict: "a dict",
 }
 UNSET = type("Unset", (), {"__repr__": lambda unset: "..."})()
-"""Shown by `help` as the default of a setting, because that may depend on other settings"""
+"""Shown by `help` as the default of a setting, because the real default may depend on other settings"""
 _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
 
@@ -97,7 +97,7 @@ def _names_keys(annotation: object) -> bool:
 
 
 def plain(value: Any) -> Any:
-    """The value with Python's own scalars in place of numpy's and of subclasses, even inside lists, tuples and dicts."""
+    """The value with scalars of numpy and of subclasses replaced by Python's own, even inside lists, tuples and dicts."""
     match value:
         case np.generic():
             return value.item()

@@ -210,7 +210,7 @@ class Sb3VecEnv(VecEnv):
 
 
 class _Wrapping:
-    """Makes a factory that wraps the environment with `wrapper_class`, for each environment of a list."""
+    """For each environment of a list, makes a factory that wraps the environment with `wrapper_class`."""
 
     def __init__(
         self, wrapper_class: Callable[..., gymnasium.Env[Any, Any]], keywords: dict[str, Any], monitor: bool

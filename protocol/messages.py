@@ -450,7 +450,7 @@ class WorkerStatus(msgspec.Struct, frozen=True):
     steps: int
     """env steps since the worker started"""
     steps_per_s: float
-    """env steps per second between the last two heartbeats with more steps than before, until the next one is overdue"""
+    """env steps per second between the last two heartbeats that reported new steps; falls once the next one is overdue"""
     version: int
     """version of the newest weights that the worker is known to hold; -1 before the first"""
     silent_s: float

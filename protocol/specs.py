@@ -315,7 +315,7 @@ class RunSpec(msgspec.Struct, frozen=True, tag=True):
 
     @property
     def info_keys(self) -> tuple[str, ...]:
-        """The facts that the environment itself reports. Those after them are computed: the score, or the seats' returns."""
+        """The facts that the environment itself reports. Further facts are computed: the score, or the seats' returns."""
         counted = 1 if self.teams else len(self.seats) if self.has_seat_returns else 0
         return self.facts[: len(self.facts) - counted]
 

@@ -144,7 +144,7 @@ def env_copy() -> EnvCopy:
     """The env copy that is being made now. Call this in the constructor of an environment or a wrapper, and keep the result.
 
     In a program that makes an environment itself, it is copy 0, with a slot that the process holds until it ends. In a
-    worker, raises `UsageError` if the calling thread isn't making a copy, for example because the constructor started it.
+    worker, raises `UsageError` if the calling thread isn't making a copy, but was started by the constructor, for example.
 
     >>> import millrace
     >>> millrace.env_copy().number

@@ -56,7 +56,7 @@ def read_words(field: FlagField, words: Sequence[str]) -> Any:
 
 
 def with_whole_numbers(field: FlagField, value: Any) -> Any:
-    """The value. If the field takes whole numbers, numbers written as text or as a float such as 1e6 become int."""
+    """Return the value. If the field takes whole numbers, text and floats such as 1e6 are converted to int."""
     if not field.whole:
         return value
     if not field.many:

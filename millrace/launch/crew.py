@@ -76,7 +76,7 @@ class Crew:
 
 
 def crew_of_run(config: Config, run: Path) -> Crew:
-    """The workers on this machine of a run. Their logs go to the run folder.
+    """The workers of a run that are started on this machine. Their logs go to the run folder.
 
     Raises `UsageError` if the logs can't be written there.
     """

@@ -93,7 +93,7 @@ def settings_of_run(config: Config, env: EnvSpec, where: BindSettings, workers: 
 
 
 def _longest_order_s(config: Config) -> float:
-    """How long an order may take: making and resetting every copy. A worker whose environment hangs is ended before that."""
+    """How long an order that makes and resets every copy may take. A worker whose environment hangs is ended before that."""
     timeouts = config.call_timeouts()
     each_s = 2 * timeouts.start_s + timeouts.step_s
     return each_s * config.envs if timeouts.start_s and timeouts.step_s else NEVER_S
@@ -118,7 +118,7 @@ class SteppingPool:
 
     @contextmanager
     def start(self, crew: Crew, before: LobbySettings) -> Iterator[Lobby]:
-        """The lobby of the stepping workers: as many of the crew as there are copies for."""
+        """A context manager: starts as many of the crew's workers as there are copies for, and yields their lobby."""
         self._before = before
         with self._stepping.start(crew, before) as lobby:
             try:

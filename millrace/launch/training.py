@@ -128,7 +128,7 @@ def _train(
 
 
 def _tell_finished(config: Config, place: Place) -> None:
-    """Tell the other learner processes that the run was already finished. They can't see this, without the run folder."""
+    """Tell the other learner processes, which have no run folder to read, that the run was already finished."""
     with _learners(config, place, lambda: None) as learners:
         if learners is not None:
             learners.end("the run was finished before")
@@ -145,7 +145,7 @@ def _learners(config: Config, place: Place, poll: Callable[[], None]) -> Abstrac
 
 
 def _pool(config: Config, env: EnvSpec, workers: int, *, elsewhere: bool) -> AbstractContextManager[WorkerPool]:
-    """The pool of the run's workers. The first rollouts wait until this number of `workers` has joined."""
+    """The pool of the run's workers. The first rollouts wait until `workers` of them have joined."""
     where = BindSettings(config.bind if elsewhere else "", config.keys, config.insecure, config.advertise)
     if config.inference == "workers":
         # Workers elsewhere decide for themselves whether to accept code.

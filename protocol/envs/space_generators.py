@@ -23,7 +23,7 @@ def generator_states(*given: gymnasium.Space[Any]) -> tuple[str, ...]:
 
 
 def restore_generators(states: Sequence[str], *given: gymnasium.Space[Any]) -> None:
-    """Give new spaces generators with these states. Raises `BadMessage` if some spaces have a state and others don't."""
+    """Give new spaces generators with these states. Raises `BadMessage` unless there is one state per space, or no state."""
     every = [space for outer in given for space in _with_inner(outer)] if states else []
     if len(states) != len(every):
         raise BadMessage(f"generators: expected one for each of {len(every)} spaces, got {len(states)}")

@@ -138,8 +138,8 @@ def _value(node: ast.expr, names: Mapping[str, int]) -> int:
 
 
 def takes_copy(factory: Callable[..., object], kwargs: Mapping[str, Any]) -> str:
-    """The name of the factory's parameter that gets the copy: the first one, if it is required and `kwargs` has all others
-    that are. Empty if there is no such parameter.
+    """The name of the factory's parameter that gets the copy: the first one, if it is required and `kwargs` has all other
+    required ones. Empty if there is no such parameter.
     """
     try:
         parameters = list(inspect.signature(factory).parameters.values())

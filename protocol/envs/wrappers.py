@@ -111,8 +111,8 @@ def not_named(wrapper: WrapperLike) -> Wrapper | None:
 def wrap(env: Any, wrapper: WrapperLike) -> Any:
     """Put this wrapper around the environment: a gymnasium wrapper, or, for a PettingZoo environment, a PettingZoo wrapper.
 
-    Raises `UsageError` if it can't be found, fails or returns something else than an environment. If the wrapper itself
-    raised, the error's `detail` is the traceback.
+    Raises `UsageError` if the wrapper can't be found, fails or returns something other than an environment. If the wrapper
+    itself raised, the error's `detail` is the traceback.
     """
     name = wrapper_name(wrapper)
     if has_seats(env) and name.startswith("gymnasium."):

@@ -129,7 +129,7 @@ class PendingHandshakes:
 
 
 def peer_host(descriptor: int) -> str:
-    """The peer's address in a connection; empty if the connection has ended. Leaves the descriptor open: it is libzmq's."""
+    """The address of a connection's peer; empty if the connection has ended. Leaves the descriptor open: it is libzmq's."""
     try:
         borrowed = socket.socket(fileno=descriptor)
     except OSError:

@@ -108,7 +108,7 @@ class KeyFolder:
         return self.token_path(name), client.public
 
     def allow(self, name: str, public: bytes, now: datetime) -> None:
-        """Allow a client to connect that created its own key. `public` is the public half of this key."""
+        """Allow a client that created its own key to connect. `public` is the public half of that key."""
         self._ensure_folder()
         with self._locked():
             _replace(self.list_path, self.allowed().with_client(name, public, now).to_toml())

@@ -17,6 +17,6 @@ def trainable(values: Tensor, gradient: Tensor | None) -> Tensor:
 
 
 def named_leaves(values: Tensor, gradient: Tensor, fields: Sequence[Field]) -> dict[str, Tensor]:
-    """A leaf of autograd's graph for each field, by name. Leaves are views of `values`, their gradients of `gradient`."""
+    """A leaf of autograd's graph for each field, by name: a view of `values`. Its gradient is a view of `gradient`."""
     gradients = named_views(gradient, fields)
     return {name: trainable(view, gradients[name]) for name, view in named_views(values, fields).items()}

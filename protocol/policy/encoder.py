@@ -68,8 +68,8 @@ class Encoder:
     """The layers before the MLPs: the convolutions of each image or the user-defined module, then the recurrent core."""
 
     def __init__(self, spec: PolicySpec, parameters: dict[str, Tensor], device: str | torch.device, *, seed: int) -> None:
-        """`parameters` has leaves of autograd's graph, by name. For a user-defined module, the module's own parameters
-        replace them, in the same memory.
+        """`parameters` has leaves of autograd's graph, by name. Leaves of a user-defined module are replaced by the module's
+        own parameters, which then use the same memory.
         """
         self._spec = spec
         self._parameters = parameters

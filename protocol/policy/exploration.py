@@ -133,7 +133,7 @@ class _Bounded:
         return BoundedNoise(noise[..., : self._size], noise[..., self._size :])
 
     def _uniform_in_warm_up(self, warm_up: Floats, uniform: Floats, action: Floats) -> Array:
-        """The action [..., D], or where `warm_up` [..., 1] is above 0 the uniform one, in the shape of the action space."""
+        """The action [..., D] in the shape of the action space; where `warm_up` [..., 1] is above 0, the uniform action."""
         chosen = np.where(warm_up > 0, uniform, action)
         return chosen.reshape(*action.shape[:-1], *self._shape)
 

@@ -28,8 +28,8 @@ class Policy(Protocol):
 
 
 def make_policy(spec: PolicySpec, images: ActingDtype = "float32") -> Policy:
-    """The policy of this spec: in numpy if it is an MLP; in torch, which is imported only then, if it has images or an
-    encoder.
+    """The policy of this spec: in numpy if it is an MLP, in torch if it has images or an encoder. Only the latter imports
+    torch.
 
     `images` is the precision in which images are processed.
     """

@@ -67,7 +67,7 @@ def raw_bytes(array: Array) -> memoryview:
 def unpack_array(frame: Frame, packings: Sequence[object], dtype: np.dtype[Any], shape: Sequence[int]) -> Array:
     """Unpack a frame into a read-only array of this dtype and shape. The caller must have checked the size of the array.
 
-    Raises `BadMessage` if that isn't possible.
+    Raises `BadMessage` if the frame can't be unpacked.
     """
     size = dtype.itemsize * math.prod(shape)
     match packings:

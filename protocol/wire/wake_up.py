@@ -86,7 +86,7 @@ class SpinWait:
         self._skipped = self._to_skip = 0
 
     def wait(self, seen: Callable[[], bool], seconds: float) -> bool:
-        """Spin until `seen` returns True, for at most this many seconds. Returns whether it did."""
+        """Spin until `seen` returns True, for at most this many seconds. Returns whether `seen` returned True."""
         if seen():
             return True
         if not CAN_SPIN or seconds <= 0:

@@ -154,7 +154,7 @@ class WorkerLink:
                 yield error
 
     def send(self, frames: Sequence[Buffer]) -> None:
-        """Send a message, or queue it while the learner can't be reached. If it is lost, heartbeats repair that."""
+        """Send a message, or queue it while the learner can't be reached. If a message is lost, heartbeats repair that."""
         with suppress(zmq.Again):
             send_frames(self._socket, frames)
 

@@ -250,7 +250,7 @@ class LoopedCopies:
         return env
 
     def _never_anew(self) -> str:
-        """Why copies are never recreated although the run asks for it; empty if they are, or the run doesn't ask for it."""
+        """Why copies are never recreated although the run asks for that; empty if they are, or if the run doesn't ask."""
         if not self._restart_episodes or self._loop.random_state(0) is not None:
             return ""
         return CANNOT_RESTART

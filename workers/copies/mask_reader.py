@@ -74,8 +74,8 @@ class MaskReader:
         truncated: Sequence[Any],
         stepped: Sequence[int] | None = None,
     ) -> list[Bools]:
-        """The mask of every copy of a loop. If `stepped` is given, only these copies need one; the others'
-        allow everything.
+        """The mask of every copy of a loop. If `stepped` is given, only these copies need one; the masks of the
+        others allow everything.
         """
         by_copy = dict(infos)
         of = range(len(observations)) if stepped is None else stepped
@@ -118,7 +118,7 @@ def _as_array(value: Any) -> Array | None:
 
 
 def _rows(given: Any, count: int) -> Sequence[Any]:
-    """Split a vector environment's masks into one value per copy. From a Tuple space, they are a tuple of arrays [N, …]."""
+    """Split a vector environment's masks into one value per copy. For a Tuple space, `given` is a tuple of arrays [N, …]."""
     if isinstance(given, tuple) and all(len(part) == count for part in given):
         return list(zip(*given, strict=True))
     if isinstance(given, np.ndarray | list) and len(given) == count:

@@ -45,7 +45,7 @@ class CannotSave(Exception):
 
 
 def saver(env: gymnasium.Env[Any, Any]) -> Any | None:
-    """The environment, or its wrapper, that can save its state; None if there is none."""
+    """The object that can save the environment's state: the environment or one of its wrappers; None if there is none."""
     inner: Any = env
     while True:
         if callable(getattr(type(inner), "save_state", None)) and callable(getattr(type(inner), "load_state", None)):
@@ -57,7 +57,7 @@ def saver(env: gymnasium.Env[Any, Any]) -> Any | None:
 
 def save(env: gymnasium.Env[Any, Any]) -> SavedCopy:
     """Save the state of an environment that can do so. Raises whatever its code raises, and `CannotSave` if the state isn't
-    bytes, or has too many.
+    bytes, or is too long.
     """
     outermost = _saver(env)
     state = outermost.save_state()

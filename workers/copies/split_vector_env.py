@@ -43,7 +43,7 @@ class StepsSomeLanes(Protocol):
         """Wait until these lanes have stepped. Returns what gymnasium's `step` returns; only these lanes' rows are valid."""
 
     def abandon(self) -> None:
-        """Wait for nothing any more."""
+        """Stop waiting for steps in progress."""
 
 
 class SplitVectorEnv:
@@ -180,7 +180,7 @@ class SplitVectorEnv:
         return StepResult(leaves, reward, terminated, truncated, infos.get("worker_lost"), facts)
 
     def abandon(self) -> None:
-        """Wait for nothing any more: a rollout was dropped."""
+        """Stop waiting for steps in progress, because a rollout was dropped."""
         if self._some is not None:
             self._some.abandon()
 
@@ -273,7 +273,7 @@ class SplitVectorEnv:
 class SplitLane:
     """The env copies of one lane, or those for evaluation.
 
-    If a copy is lost during an evaluation, all its running episodes are lost.
+    If a copy is lost during an evaluation, all running episodes of the evaluation are lost.
     """
 
     def __init__(self, split: SplitVectorEnv, first: int, count: int) -> None:

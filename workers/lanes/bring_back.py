@@ -145,7 +145,7 @@ class _Repeated:
         self._seed(anew)
 
     def hand_over(self) -> None:
-        """Give the lane the state that it had after its last row, except for copies that aren't continued."""
+        """Give the lane the state that the lost lane had after its last row, except for copies that aren't continued."""
         lane = self._lane
         past = self._past
         over = [n for n in self.continued if past.copies[n].over]

@@ -122,7 +122,7 @@ class Lane:
             self.add_outside(first.outside[: self.columns], 0)
 
     def add_outside(self, rewards: Doubles, step: int) -> None:
-        """Add this step's rewards [N · A] that belong to no row to the returns.
+        """Add to the returns this step's rewards [N · A] that belong to no row.
 
         They are checked here, because they aren't in the rows that are checked later.
         """

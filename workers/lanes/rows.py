@@ -181,7 +181,7 @@ class RowsOfLane:
             self._show_playing(t)
 
     def _step_playing(self, actions: Array, pulse: Pulse) -> StepResult:
-        """Step the copies whose episodes continue. Returns the result for the lane's copies: there may be more copies."""
+        """Step the copies whose episodes continue. Returns the result of the lane's copies only: there may be others."""
         lane = self.lane
         copies: EvaluationCopies = lane.copies  # type: ignore[assignment]
         playing = lane.playing.nonzero()[0].tolist()

@@ -299,7 +299,7 @@ def _end_of(output: str) -> str:
 
 
 def _signal_name(number: int) -> str:
-    """The name of a signal; its number if it has no name, as most real-time signals."""
+    """The name of a signal; its number if it has no name, which is true of most real-time signals."""
     return signal.Signals(number).name if number in set(signal.Signals) else f"signal {number}"
 
 

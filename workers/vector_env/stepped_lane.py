@@ -95,7 +95,7 @@ class SteppedLane:
         return map(self._nest, zip(*actions, strict=True)) if self._nested_actions else actions[0]
 
     def _write(self, infos: CopyInfos) -> CopyInfos:
-        """Write the rows of all copies. `infos` are the infos that the loop returned; returns them by row."""
+        """Write the rows of all copies. Converts the infos that the loop returned to infos by row."""
         leaves = read_leaves(self._read, self._observations) if self._nested_observations else (self._observations,)
         self._writer.write(self._joined, 0, leaves)
         self._write_numbers()

@@ -208,7 +208,7 @@ def collecting_at_length(learner: Learner, lasts_s: float = LONG_S) -> Script[Co
 
 
 def acts_as_its_policy_says(learner: Learner) -> Script[None]:
-    """Collect with the activation relu; then with normalized observations, many of them so large that they are clipped."""
+    """Collect with ReLU layers. Then collect with normalized observations, many of which are large and thus clipped."""
     relu = yield from collecting(learner, activation="relu")
     permit = relu.permit()
     relu.deal(permit)
@@ -232,7 +232,7 @@ def _rollout_or_declined(learner: Learner, permit: Permit) -> Script[None]:
 
 
 def sets_attributes(learner: Learner) -> Script[None]:
-    """Set attributes so that the cart isn't pushed under version 1; set none with version 2; push again under version 3."""
+    """With version 1, set attributes so that the cart isn't pushed; set none with version 2; with version 3, push it again."""
     env = yield from described(learner)
     if not is_gymnasium_pole(env):
         raise Skipped("the environment is not gymnasium's CartPole")
@@ -359,7 +359,7 @@ def waits_for_weights(learner: Learner) -> Script[None]:
 
 
 def acts_under_the_named_version(learner: Learner) -> Script[None]:
-    """Send the weights that a permit names only after newer ones, as if they had been lost. The watch compares versions."""
+    """Send newer weights before those that a permit names, as if the latter had been lost. The watch compares versions."""
     session = yield from collecting(learner)
     older = session.permit()
     newer = session.permit()
@@ -700,7 +700,7 @@ def beats_while_it_collects(learner: Learner) -> Script[None]:
 
 
 def evaluates(learner: Learner) -> Script[None]:
-    """Evaluate two greedy episodes, then again with a short limit. Then repeat that order, as if its answer had been lost.
+    """Evaluate two greedy episodes, then again with a low step limit. Repeat the second order, as if its answer were lost.
 
     The watch compares the two answers.
     """
@@ -729,8 +729,8 @@ def evaluates_one_version(learner: Learner) -> Script[None]:
 def evaluates_with_rows(learner: Learner) -> Script[None]:
     """Evaluate episodes and ask for their rows. A client may decline.
 
-    Actions are sampled and greedy; the same seeds are given in another order; episodes are cut and not cut. The watch
-    recomputes what it can of each answer.
+    The orders vary: sampled and greedy actions, the same seeds in another order, episodes that are cut and that aren't. The
+    watch recomputes what it can of each answer.
     """
     session = yield from collecting(learner)
     order = _evaluation(learner, greedy=False, send_rows=True, seeds=(1, 2, 3, 4))
@@ -756,7 +756,7 @@ def evaluates_with_rows(learner: Learner) -> Script[None]:
 
 
 def evaluates_under_no_other_version(learner: Learner) -> Script[None]:
-    """Send newer weights before those of an evaluation. The watch checks by the rows that the evaluation uses its own."""
+    """Send newer weights before those of an evaluation. The rows show the watch which weights the evaluation used."""
     session = yield from collecting(learner)
     session.give(session.weights(2, -session.random_parameters(1)))
     order = _evaluation(learner, send_rows=True)
@@ -881,7 +881,7 @@ def leaves_when_unknown_while_it_drains(learner: Learner) -> Script[None]:
 
 
 def _ends(learner: Learner, codes: tuple[int, ...], after: str) -> Script[None]:
-    """Wait until the client ends with one of these exit codes. It may say Goodbye before. Raises `Broken` otherwise."""
+    """Wait until the client ends, perhaps after a Goodbye. Raises `Broken` unless it ends with one of these exit codes."""
     within_s = 2 * learner.settings.patience_s
     learner.may_leave = True  # so that this check, and not the learner, judges a Hello
     before = learner.hello

@@ -85,7 +85,7 @@ class Learner:
         """whether the client was started and has never said Hello"""
         self.peer = b""
         self.hello: Hello | None = None
-        """the newest Hello of the running process; messages before the first one are from the process before"""
+        """the newest Hello of the running process; until its first Hello, messages come from the previous process"""
         self.answers_heartbeats = True
         self.may_leave = False
         """whether the client may leave its session, or a new process may take its name; then no Heartbeat is due"""
@@ -260,7 +260,7 @@ class Learner:
         return message
 
     def quiet(self, kind: type, rule: Rule, expected: str, *, for_s: float = QUIET_S) -> Script[None]:
-        """Raise `Broken` if anything of this kind arrives for this many seconds."""
+        """Raise `Broken` if anything of this kind arrives within this many seconds."""
         heard = yield Wait(for_s, lambda event: isinstance(event, Heard) and isinstance(event.message, kind))
         if isinstance(heard, Heard):
             raise Broken(rule, expected, brief(heard.message))

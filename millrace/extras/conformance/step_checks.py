@@ -201,7 +201,7 @@ def ends_episodes(learner: Learner) -> Script[None]:
 def resets_otherwise(learner: Learner, mode: Mode) -> Script[None]:
     """Use the same seeds and actions with autoreset mode NextStep and then with `mode`, until an episode has ended.
 
-    NextStep gives the last observation of the episode and the first one of the next, to compare with.
+    NextStep shows the last observation of the episode and the first one of the next, for the comparison.
     """
     steps = yield from stepping(learner)
     row = yield from steps.do(steps.reset())
@@ -407,7 +407,7 @@ def ignores_an_old_order(learner: Learner) -> Script[None]:
 
 
 def ignores_another_session(learner: Learner) -> Script[None]:
-    """Send orders of the session before. Heartbeats must still count its steps."""
+    """Send orders of the previous session. Heartbeats must still count that session's steps."""
     old = yield from stepping(learner, 0)
     before = learner.session
     yield from old.do(old.step())

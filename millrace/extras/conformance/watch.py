@@ -287,7 +287,7 @@ class WatchedSession:
     def rule_of_missing(self, ticket: int, otherwise: Rule) -> Rule:
         """The rule that is probably broken if the client does nothing about a ticket.
 
-        In a later session, a client that didn't forget the session before may take a lane's first permit for an old one.
+        In a later session, a client that didn't forget the previous one may mistake a lane's first permit for an old permit.
         """
         is_old = not self._is_first_session and ticket in self.permits and not self.permits[ticket].permit.sequence
         return Rule.FORGETS if is_old else otherwise
@@ -451,7 +451,7 @@ def _bits(value: object) -> object:
 
 
 def check_stepped(message: Stepped, spec: StepSpec) -> None:
-    """Raise `Broken` if the arrays don't have the dtypes and shapes of the lane, or values outside their spaces."""
+    """Raise `Broken` if the arrays don't have the dtypes and shapes of the lane, or have values outside their spaces."""
     if why := wrong_rows(message, spec, axes=None):
         raise Broken(Rule.STEPPED_ARRAYS, "arrays of the lane", why)
     if why := wrong_rows(message, spec, axes=("copy",)):

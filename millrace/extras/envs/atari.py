@@ -90,7 +90,7 @@ def make_game(**kwargs: Any) -> gymnasium.Env[Any, Any]:
 
 
 def make_games(num_envs: int, **kwargs: Any) -> VectorEnv[Any, Any, Any]:
-    """Make `num_envs` copies that the emulator steps together. It uses one thread, as each core already has a worker."""
+    """Make `num_envs` copies that the emulator steps together, in one thread, because each core already has a worker."""
     _silence_emulator()
     settings, options = GameSettings.split(kwargs)
     made = gymnasium.make_vec(

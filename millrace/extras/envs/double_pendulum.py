@@ -121,7 +121,7 @@ def energy(physics: Physics, state: Sequence[float]) -> float:
 
 
 def linear_model(physics: Physics) -> tuple[Doubles, Doubles]:
-    """A [6, 6] and B [6] of d state/dt = A state + B F, linearised at the upright position.
+    """A [6, 6] and B [6] of d state/dt = A state + B F, linearized at the upright position.
 
     There, sin α = α, cos α = 1, and squared speeds are 0.
     """

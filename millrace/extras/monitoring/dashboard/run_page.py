@@ -253,7 +253,7 @@ def who_waits(seen: Seen) -> str:
 
 
 def _segments(samples: Sequence[LaneSample], kinds: Sequence[str]) -> list[Segment]:
-    """The segments of a row. Neighbours of the same kind are joined. A sample lasts until the next one, at most 2 s."""
+    """The segments of a row. Neighbors of the same kind are joined. A sample lasts until the next one, at most 2 s."""
     end_s = samples[-1].at_s + 1.0
     segments = list[Segment]()
     span_s = max(LEAST_SHOWN_S, end_s - samples[0].at_s)

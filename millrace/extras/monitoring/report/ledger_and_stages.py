@@ -54,7 +54,7 @@ def stages(report: ReportData) -> str:
 
 
 def _bars(report: ReportData, process: str, name: str) -> str:
-    """A bar for each run. A stage has the same color in all runs; waiting is grey."""
+    """A bar for each run. A stage has the same color in all runs; waiting is gray."""
     spent = [
         {key.removeprefix(f"{process}_"): s for key, s in run.progress.stages.items() if key.startswith(f"{process}_")}
         for _, run in report.runs
