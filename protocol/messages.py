@@ -192,7 +192,7 @@ class Heartbeat(Message, frozen=True):
     """number of the last HeartbeatReply received; what the learner sent before that has arrived or is lost
     (rule HEARTBEAT_REPLIES)"""
     versions: Versions
-    """versions of the weights held, ascending (rule HEARTBEAT_VERSIONS)"""
+    """of the weights held, ascending (rule HEARTBEAT_VERSIONS)"""
     tickets: Tickets
     """tickets that the worker holds and has not finished: those that wait, and those of the work in progress
     (rule HEARTBEAT_TICKETS)"""

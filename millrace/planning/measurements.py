@@ -142,7 +142,7 @@ class Overheads(msgspec.Struct, frozen=True, kw_only=True):
     """additional memory that a worker needs to act with this policy"""
 
     def worker_s(self, lanes: int, copies: int, steps: int) -> float:
-        """The time that a worker with these lanes and copies needs for a round of `steps` steps, without its copies' time."""
+        """The time that a worker with these lanes and copies needs for a round of `steps` steps, besides the copies' own."""
         return steps * (self.row_s + lanes * self.lane_row_s + copies * self.copy_row_s) + lanes * self.sent_s
 
     def gathering_s(self, lanes: int, steps: float) -> float:

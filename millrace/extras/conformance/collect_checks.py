@@ -232,7 +232,7 @@ def _rollout_or_declined(learner: Learner, permit: Permit) -> Script[None]:
 
 
 def sets_attributes(learner: Learner) -> Script[None]:
-    """With version 1, set attributes so that the cart isn't pushed; set none with version 2; with version 3, push it again."""
+    """With version 1, set attributes so that the cart isn't pushed; with 2, set none; with 3, so that it is pushed again."""
     env = yield from described(learner)
     if not is_gymnasium_pole(env):
         raise Skipped("the environment is not gymnasium's CartPole")
