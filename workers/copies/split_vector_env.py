@@ -84,7 +84,7 @@ class SplitVectorEnv:
         self._result: StepResult | None = None
         self._no_workers: NoWorkers | None = None
         self._assigned: dict[tuple[int, str], tuple[slice, bytes]] = {}  # attributes that were set, by first copy and name
-        self._missing: set[tuple[int, str]] = set()  # those of them that replacements of lost copies may lack
+        self._missing: set[tuple[int, str]] = set()  # attributes that replacements of lost copies may lack
 
     def open_lane(self, run: RunSpec, lane: int, pulse: Pulse) -> EnvCopies:
         """The copies of this lane. A `Collector` takes this method as its `open_copies`."""
@@ -240,7 +240,7 @@ class SplitVectorEnv:
             return False
 
     def _assign_again(self, stepped: set[int], pulse: Pulse) -> None:
-        """Set the attributes that these copies may lack, before they are stepped. Others may be stepping, and come later.
+        """Set the attributes that these copies may lack, before they are stepped. Copies that may be stepping come later.
 
         If a worker is lost meanwhile, the next step tries again.
         """
