@@ -88,7 +88,7 @@ class Stepping:
         seed: int | None = 7,
         options: object = None,
     ) -> Reset:
-        """A Reset of these copies (by default, of all copies), each seeded with `seed` plus its number."""
+        """A Reset of these copies (by default, of all copies), each with the seed `seed` plus the copy's number."""
         copies = range(self.spec.lanes[lane]) if copies is None else copies
         seeds = tuple(None if seed is None else seed + copy for copy in copies)
         packed = np.frombuffer(pack(options), np.uint8)
