@@ -1,8 +1,9 @@
 """The base of PPO, A2C, IMPALA, REINFORCE and your own actor-critics: everything about an update except the loss.
 
-An update raises before it takes a gradient step whose loss, logged numbers or gradient are not finite. The training loop
-checks the weights after the update, and undoes the whole update if they are not finite. With one torch thread on a CPU, the
-same batches give the same bits, even after `load_state_dict`. This file uses no sockets, no files and no clock.
+Before each gradient step, an update checks the loss, the logged numbers and the gradient, and raises if one of them is not
+finite. The training loop checks the weights after the update, and undoes the whole update if they are not finite. With one
+torch thread on a CPU, the same batches give the same bits, even after `load_state_dict`. This file uses no sockets, no files
+and no clock.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
 
 Pulse = Callable[[], None]
 
-MAX_LOG_STD = 80.0  # e⁸⁰ times the largest normal sample that numpy can draw, which is below 14, is finite in float32
+MAX_LOG_STD = 80.0  # numpy's normal samples stay below 14, and 14 · e⁸⁰ is still finite in float32
 
 
 class Estimates(NamedTuple):
@@ -89,7 +90,7 @@ class ActorCritic(GradientDescent):
             self.net.parameters["actor.log_std"].detach().fill_(config.log_std_init)
         self.generator = torch.Generator().manual_seed(torch_seed(seed, Purpose.SHUFFLES))
         self.tensors = {"parameters": self.net.flat}
-        optimizer = make_optimizer(config.optimizer, self.net.flat, eps=1e-5)  # ε of Stable-Baselines3
+        optimizer = make_optimizer(config.optimizer, self.net.flat, eps=1e-5)  # the ε that Stable-Baselines3 uses
         self.optimizers = {"optimizer": optimizer}
 
     # ---------------------------------------------------------------- what an algorithm defines
@@ -132,10 +133,11 @@ class ActorCritic(GradientDescent):
         return math.ceil(rows / batch_size)
 
     def standardizes_advantages(self) -> bool:
-        """Whether to scale the advantages of each minibatch to mean 0 and standard deviation 1; never after cloning.
+        """Whether to scale the advantages of each minibatch to mean 0 and standard deviation 1. Never True after cloning.
 
-        If a policy acts well from the start, its advantages are little more than the critic's small errors. Scaled to a
-        standard deviation of 1, they would change the policy as much as advantages that tell good actions from bad ones.
+        A cloned policy acts well from the start, so its advantages are little more than the critic's small errors. Scaled to
+        a standard deviation of 1, these errors would change the policy as much as advantages that tell good actions from bad
+        ones.
         """
         normalize: bool = self.config.normalize_advantage
         return normalize and not self.pretraining_steps
@@ -147,12 +149,12 @@ class ActorCritic(GradientDescent):
     # ---------------------------------------------------------------- an update
 
     def update(self, batch: Batch, pulse: Pulse) -> UpdateMetrics:
-        """Learn from a batch, calling `pulse` between minibatches. Returns metrics with the names of Stable-Baselines3.
+        """Learn from a batch, calling `pulse` between minibatches. Returns metrics, named as in Stable-Baselines3.
 
         Raises `RunError` before a step whose loss, logged numbers or gradient norm are not finite, and after the last step
         if the new weights could give actions that are not finite.
         """
-        if not batch.valid.any():  # with several agents, all seats may wait: then there is nothing to learn
+        if not batch.valid.any():  # with several agents, all seats may be waiting; then there is nothing to learn
             self.env_steps += batch.env_steps
             return {}
         self.set_schedules()
@@ -179,7 +181,7 @@ class ActorCritic(GradientDescent):
         return self.metrics(epochs, estimates)
 
     def step(self, *minibatch: Minibatch) -> tuple[UpdateMetrics, bool]:
-        """Take one gradient step on a minibatch. Returns the metrics, and whether they end the update without this step.
+        """Take one gradient step on a minibatch. Returns the metrics, and whether they end the update before the step.
 
         `minibatch` holds the parts that this process learns from: all rows in one part, unless the run has shards.
 
@@ -204,10 +206,10 @@ class ActorCritic(GradientDescent):
         return _checked(self.loss(self.evaluate(rows)), type(self).__name__)
 
     def evaluate(self, minibatch: Minibatch) -> LossInput:
-        """The rows of a minibatch with the network's outputs for them, by a forward pass and the action distribution.
+        """Run the network on a minibatch. Returns the minibatch's rows together with the network's outputs for them.
 
         The logits of actions that are not allowed become -1e30. Actions of a Box have a normal distribution that is not
-        clipped. A small network on the CPU computes the same in numpy (`kernels/trained_networks.py`).
+        clipped. For a small network on the CPU, numpy computes the same (`kernels/trained_networks.py`).
         """
         action = minibatch.action
         outputs = self.net.evaluate(minibatch.features, minibatch.images, minibatch.recurrent, action, minibatch.mask)
@@ -217,7 +219,7 @@ class ActorCritic(GradientDescent):
         return LossInput(action, minibatch.log_prob, advantage, raw, minibatch.target, *outputs)
 
     def count_update(self, batch: Batch, epochs: int) -> None:
-        """Count an update of `epochs` epochs: its env steps, and a new version. Observation statistics take effect now."""
+        """Count an update of `epochs` epochs and its env steps. The new observation statistics take effect now."""
         self.env_steps += batch.env_steps
         self.version += 1
         # Workers acted under the statistics that were published before this batch. The losses must normalize observations
@@ -271,9 +273,9 @@ class ActorCritic(GradientDescent):
 
 
 def _recurrent_input(batch: Batch, tensor: Callable[[Array], Tensor]) -> RecurrentInput:
-    """The recurrent states with which the rollouts began, and the steps before which they are reset or left unchanged.
+    """The recurrent states with which the rollouts began, and the steps at which these are reset or left unchanged.
 
-    An episode begins after a step that resets. A row in which a seat waits leaves the state of that seat unchanged.
+    The state is reset after a step that resets the env copy. A row in which a seat waits leaves that seat's state unchanged.
     """
     begins = ~batch.valid
     first = np.zeros_like(batch.valid[:1])
@@ -297,7 +299,11 @@ def _checked(returned: Any, algorithm: str) -> tuple[Tensor, Mapping[str, Tensor
 
 
 def _check_spread_of_actions(net: ActorCriticNetwork, version: int) -> None:
-    """Raise `RunError` before Box actions overflow. Otherwise, the learner would refuse one worker after another."""
+    """Raise `RunError` if Box actions could overflow.
+
+    Without this check, workers would send actions that are not finite, and the learner would refuse one worker after
+    another.
+    """
     log_std = net.parameters.get("actor.log_std")
     if log_std is not None and (largest := log_std.detach().max().item()) > MAX_LOG_STD:
         raise RunError(

@@ -23,7 +23,7 @@ from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
 
 
 class Start(NamedTuple):
-    """The parts of an earlier run that a new run takes over. The policies of both have the same `PolicySpec`."""
+    """The parts of an earlier run that a new run takes over. Both runs' policies have the same `PolicySpec`."""
 
     state: dict[str, Any]
     """The `state_dict` of the earlier run's algorithm. If only the policy of that run is known, it holds just `parameters`,
@@ -37,11 +37,11 @@ class Start(NamedTuple):
     """Whether to take over the moments of the optimizers, too."""
 
     def into(self, fresh: dict[str, Any], weights: Iterable[str], optimizers: Iterable[str]) -> dict[str, Any]:
-        """The state `fresh` of a new algorithm, with the parts that are taken over from the earlier run put in their place.
+        """The state `fresh` of a new algorithm, in which the parts taken over from the earlier run replace the new ones.
 
         `weights` and `optimizers` are the names of the tensors and the optimizers in the state. The first P of `parameters`
-        and `target` compute actions; if the new algorithm has only these, the saved one must have only these, too. Raises
-        `ValueError` if a tensor's shape or dtype differs from that in the new algorithm.
+        and `target` compute actions; if the new algorithm has no other parameters, the earlier one must have none either.
+        Raises `ValueError` if a tensor's shape or dtype differs from that in the new algorithm.
         """
         state = self.state
         taken = dict[str, Any]()
@@ -64,7 +64,7 @@ class Start(NamedTuple):
 
 
 class Algorithm(ABC):
-    """The base of every algorithm, which learns from batches and provides the weights of the policy that collects the next.
+    """The base of every algorithm. An algorithm learns from batches, and provides the weights with which workers act.
 
     A subclass defines `__init__`, `update`, `weights`, `state_dict` and `load_state_dict`, and has its settings in `Config`.
     """
@@ -73,7 +73,7 @@ class Algorithm(ABC):
     """The record of the settings. Its fields become flags, TOML keys and keyword arguments of a run."""
 
     whole_episodes: ClassVar[bool] = False
-    """True if the algorithm learns only from whole episodes. Then a run whose rollouts are shorter is refused."""
+    """True if the algorithm learns only from whole episodes. Runs whose rollouts are shorter than an episode are refused."""
 
     @staticmethod
     def policy_spec(config: Any, observation: tuple[Leaf, ...], action: ActionSpec) -> PolicySpec:
@@ -93,9 +93,9 @@ class Algorithm(ABC):
     def __init__(self, config: Any, policy: PolicySpec, *, total_steps: int, seed: int, device: str = "cpu") -> None:
         """Make the weights of version 0.
 
-        `config` is an instance of `Config`. `total_steps` is the number of env steps of the run, for schedules. All random
-        numbers must derive from `seed`. `device` is "cpu" or "cuda". Raises `UsageError` if this machine cannot do what the
-        settings ask for.
+        `config` is an instance of `Config`. `total_steps`, the number of env steps of the run, is needed for schedules. All
+        random numbers must derive from `seed`. `device` is "cpu" or "cuda". Raises `UsageError` if this machine cannot do
+        what the settings ask for.
         """
 
     @abstractmethod
@@ -103,8 +103,8 @@ class Algorithm(ABC):
         """Learn from a batch and return metrics by name, such as "train/loss".
 
         Calls `pulse` between gradient steps, so that the learner can answer its workers meanwhile; let any exception that
-        `pulse` raises pass. Uses only rows where `batch.valid` is True, and changes no array of the batch. If a loss or a
-        gradient is not finite, raises `RunError` before it reaches the weights (see `check_finite`).
+        `pulse` raises propagate. Uses only rows where `batch.valid` is True, and changes no array of the batch. If a loss or
+        a gradient is not finite, raises `RunError` before it changes the weights (see `check_finite`).
         """
 
     @abstractmethod

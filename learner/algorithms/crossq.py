@@ -16,7 +16,7 @@ from millrace.protocol.specs import PolicySpec
 
 
 class CrossQ(NormalizedSAC):
-    """An actor, two critics without targets, and the temperature."""
+    """An actor, two critics without target networks, and the temperature."""
 
     Config = CrossQConfig
     ADAM = {"betas": (0.5, 0.999)}

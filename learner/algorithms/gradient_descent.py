@@ -92,7 +92,7 @@ class GradientDescent(Algorithm):
         return torch.from_numpy(array).to(self.net.flat.device)
 
     def count(self, batch: Batch) -> None:
-        """Count a batch in the running statistics. Those of observations take effect only when `statistics` is set."""
+        """Count a batch in the running statistics. Observation statistics take effect only when `statistics` is set."""
         if self.config.normalize_rewards:
             self.rewards.count(batch)
         if self.policy.normalize_observations:
@@ -141,7 +141,7 @@ class GradientDescent(Algorithm):
 
     @staticmethod
     def means(measured: Iterable[Mapping[str, float]]) -> UpdateMetrics:
-        """The mean of each metric over the measurements that have it, with the prefix "train/"."""
+        """The mean of each metric over the measurements that include it. Names get the prefix "train/"."""
         by_name: dict[str, list[float]] = {}
         for each in measured:
             for name, number in each.items():
@@ -155,7 +155,7 @@ class GradientDescent(Algorithm):
         return bool(all(tensor.isfinite().all() for tensor in self.tensors.values()) and np.isfinite(self.statistics).all())
 
     def other_state(self) -> dict[str, Any]:
-        """A copy, as plain data, of all else that the next update depends on, besides tensors, optimizers and statistics."""
+        """A copy, as plain data, of what the next update depends on besides tensors, optimizers and statistics."""
         return {"env_steps": self.env_steps, "version": self.version, "pretraining_steps": self.pretraining_steps}
 
     def load_other_state(self, state: dict[str, Any]) -> None:
@@ -165,7 +165,7 @@ class GradientDescent(Algorithm):
         self.pretraining_steps = int(state["pretraining_steps"])
 
     def state_dict(self) -> dict[str, Any]:
-        """A copy of everything that the next update depends on: tensors and plain data (`torch.load(weights_only=True)`)."""
+        """A copy of all that the next update depends on. `torch.load(weights_only=True)` can load it from a file."""
         return (
             {name: tensor.clone() for name, tensor in self.tensors.items()}
             | {name: state_of(optimizer) for name, optimizer in self.optimizers.items()}
@@ -202,7 +202,7 @@ class GradientDescent(Algorithm):
 
 
 def check_finite(metrics: Mapping[str, float], update: int, advice: str) -> None:
-    """Raise `RunError`, naming the first metric that is not finite, if there is one. Call this before the step."""
+    """Raise `RunError` if a metric is not finite, and name the first such metric. Call this before each gradient step."""
     for name, number in metrics.items():
         if not math.isfinite(number):
             raise RunError(

@@ -1,8 +1,8 @@
 """IMPALA's learner (Espeholt et al. 2018). Its settings are in `learner/config/hyperparameters.py`.
 
 A batch may have been collected under older weights (`max_lag` above 0). V-trace weights each row by the ratio of its
-action's probability under the newest policy to that under the policy that acted. It is computed in time order, before rows
-are shuffled. This file uses no sockets, no files and no clock.
+action's probability under the newest policy to that under the policy that acted. V-trace is computed in time order, before
+rows are shuffled. This file uses no sockets, no files and no clock.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Rows of a batch in the form of the network's input, and the selection of minibatches from them.
 
 Rule: rows that are not valid never enter a loss, and each valid row enters exactly one loss per epoch. A recurrent core
-still runs over the rows that are not valid, because they are part of its columns.
+still runs over the rows that are not valid, because it processes whole columns.
 
 A batch has T rows for each of ΣN env copies (columns). Row numbers count all T · ΣN rows as one flat sequence in time order.
 B is the number of rows of a minibatch, and C the number of its columns if the policy has a recurrent core.
@@ -143,7 +143,7 @@ class Minibatch(NamedTuple):
         return self.select(rows[selected], rows, recurrent)
 
     def shuffled(self, used: Bools, count: int, generator: torch.Generator | None) -> Iterator[Minibatch]:
-        """Yield `count` minibatches of nearly equal size, which together hold each row where `used` [T, ΣN] is True once.
+        """Yield `count` minibatches of nearly equal size. Each row where `used` [T, ΣN] is True is in exactly one of them.
 
         Rows are shuffled; without a generator, they stay in order. With a core, whole columns stay together, because the
         core learns from consecutive rows; then there are at most as many minibatches as columns.
@@ -173,7 +173,7 @@ class UpdateRows(Protocol):
     def epochs(
         self, advantage: Floats, target: Floats, used: Bools, count: int, generator: torch.Generator
     ) -> Iterator[Iterable[Sequence[Minibatch]]]:
-        """Yield epochs without end: the minibatches of each epoch, each as the parts that this process learns from.
+        """Yield epochs without end. A minibatch of an epoch is a sequence of the parts that this process learns from.
 
         If an epoch is a single minibatch, it is made once, with its rows in order, and yielded every time. The arrays are
         [T, ΣN].
@@ -198,7 +198,7 @@ class WholeBatch(NamedTuple):
 def endless_epochs(
     minibatches: Callable[[torch.Generator | None], Iterable[Sequence[Minibatch]]], count: int, generator: torch.Generator
 ) -> Iterator[Iterable[Sequence[Minibatch]]]:
-    """Yield epochs without end. `minibatches` makes the minibatches of one epoch, in order if its argument is None.
+    """Yield epochs without end. `minibatches` makes those of one epoch, in order if its argument is None.
 
     If an epoch is a single minibatch, it is made once, with its rows in order, and yielded every time.
     """
@@ -239,8 +239,8 @@ def flat_tensor(array: Array, device: torch.device | str) -> Tensor:
 def units_in_order(used: Bools, generator: torch.Generator | None, *, whole_columns: bool) -> Tensor:
     """The numbers of the rows where `used` [T, N] is True, shuffled, or in order if there is no generator.
 
-    With `whole_columns`, the numbers of the columns that have such a row. Columns without one are left out, because they
-    would make an empty minibatch.
+    If `whole_columns`, returns the numbers of the columns that have such a row. Other columns are left out, because they
+    could make a minibatch empty.
     """
     units = torch.from_numpy(np.flatnonzero(used.any(0) if whole_columns else used))
     return units if generator is None else units[torch.randperm(len(units), generator=generator)]

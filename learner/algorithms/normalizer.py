@@ -107,7 +107,7 @@ class Normalizer:
         return kept
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Continue from the result of `state`. Raises an exception of any type if it is malformed or not finite."""
+        """Continue from the result of `state`. Raises an exception, of any type, if the state is malformed or not finite."""
         self._observations.load_state_dict(_tensors(state["observations"]))
         if "gamma" in state:
             scaler = RewardScaler(state["gamma"])

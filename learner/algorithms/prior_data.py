@@ -1,4 +1,4 @@
-"""The interface of prior data: a dataset (`--prior`) that an algorithm learns from besides the rollouts of its run."""
+"""The interface of prior data: a dataset (`--prior`) that an algorithm learns from in addition to its run's rollouts."""
 
 from __future__ import annotations
 

@@ -73,7 +73,7 @@ class Rainbow(DQN):
         return CriticLoss(loss, values - targets.mean(-1), {"q_mean": values.mean()})
 
     def start_from(self, start: Start) -> None:
-        """See `Algorithm.start_from`. Raises `UsageError` if only action values are known, without their quantiles."""
+        """See `Algorithm.start_from`. Raises `UsageError` if the earlier run's policy has no quantiles."""
         if "statistics" not in start.state:
             raise UsageError(
                 "start_from: expected a run of rainbow with a checkpoint, got action values without the quantiles whose "

@@ -1,8 +1,9 @@
 """REINFORCE (Williams 1992). Its settings are in `learner/config/hyperparameters.py`.
 
-An update is one gradient step on the rows whose episode ends within the rollout, because all the rewards that follow them
-are known. Other rows are dropped, and their number is logged. The return of a truncated episode includes the baseline's
-value of its final observation; without a baseline it ends there. This file uses no sockets, no files and no clock.
+An update is one gradient step on the rows whose episode ends within the rollout, because all the rewards that follow these
+rows are known. Other rows are dropped, and their number is logged. The return of a truncated episode includes the baseline's
+value of its final observation; without a baseline, the return ends with the last reward. This file uses no sockets, no files
+and no clock.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ class REINFORCE(ActorCritic):
 
     @property
     def vf_coef(self) -> float:
-        """The weight of the value loss: 0 without a baseline."""
+        """The weight of the value loss, which is 0 without a baseline."""
         return self.config.vf_coef if self.config.baseline else 0.0
 
     def standardizes_advantages(self) -> bool:

@@ -149,12 +149,12 @@ def complete(ends: EpisodeEnds) -> Bools:
 
 
 def discounted_return(reward: Floats, ends: EpisodeEnds, gamma: float, start: Doubles) -> tuple[Doubles, Doubles]:
-    """The discounted sum of the *past* rewards of each row's episode, by whose spread rewards are scaled.
+    """The discounted sum of the *past* rewards of each row's episode. The spread of these sums sets the scale of rewards.
 
         Gₜ = rₜ + γ Gₜ₋₁ [the same episode]
 
-    `start` [N] is the G of the row before the first, 0 where an episode begins. Returns G [T, N] float64 (0 where the row is
-    not valid), and the `start` [N] for the next rollout of these copies.
+    `start` [N] is G of the row before the first one, or 0 where an episode begins. Returns G [T, N] float64 (0 where the row
+    is not valid), and the `start` [N] for the next rollout of these copies.
     """
     returns = np.zeros(reward.shape)
     last, ended = start, ends.ended

@@ -188,7 +188,7 @@ class RewardScaler:
     def __init__(self, gamma: float) -> None:
         self._gamma = gamma
         self._moments = RunningMoments()
-        self._largest = 0.0  # the largest size of a discounted return so far
+        self._largest = 0.0  # the largest absolute value of a discounted return so far
         self._returns: dict[int, Doubles] = {}  # by lane, the running return [columns] of each env copy
 
     def count_and_scale(self, batch: Batch) -> Floats:
@@ -197,12 +197,12 @@ class RewardScaler:
         return self.scaled(batch.reward)
 
     def scaled(self, reward: Floats) -> Floats:
-        """These rewards, scaled and clipped to ±10 as by Stable-Baselines3's VecNormalize, float32."""
+        """These rewards, float32, scaled and clipped to ±10 as in Stable-Baselines3's VecNormalize."""
         clipped: Floats = np.clip(reward / self.std, -CLIP, CLIP).astype(np.float32)
         return clipped
 
     def bounded(self, reward: Floats, bound: float) -> Floats:
-        """These rewards, float32, divided by `std`, or by more if a discounted return so far would exceed the bound."""
+        """These rewards, float32, divided by `std`, or by more to keep all discounted returns so far within the bound."""
         divided: Floats = (reward / max(self.std, self._largest / bound)).astype(np.float32)
         return divided
 
@@ -218,7 +218,7 @@ class RewardScaler:
             columns = slice(at, at + batch.columns_per_rollout)
             lane = int(batch.lane[at])
             fresh = batch.fresh[columns]
-            known = 0.0 if fresh.all() else self._returns.get(lane, 0.0)  # the old array may not fit a fresh lane's size
+            known = 0.0 if fresh.all() else self._returns.get(lane, 0.0)  # a fresh lane may have a new size
             start = np.where(fresh, 0.0, known)
             returns, self._returns[lane] = discounted_return(
                 batch.reward[:, columns], ends.columns(columns), self._gamma, start

@@ -44,7 +44,7 @@ class SAC(Continuous):
 
     @property
     def batch_normalization(self) -> str:
-        """Where the actor has batch normalization. Actors that differ in this cannot use each other's parameters."""
+        """Where the actor has batch normalization. Actors that differ here cannot use each other's parameters."""
         return "none"
 
     @property
@@ -81,9 +81,9 @@ class SAC(Continuous):
         return -(log_temperature * (log_prob + self.target_entropy)).mean()
 
     def start_from(self, start: Start) -> None:
-        """See `Algorithm.start_from`. If the earlier run did not learn its temperature, this run starts from its own.
+        """See `Algorithm.start_from`. If the earlier run did not learn its temperature, the new run keeps its own.
 
-        Raises `UsageError` if the earlier run's actor has another kind of batch normalization.
+        Raises `UsageError` if the earlier run's actor has batch normalization in other places.
         """
         expected, got = self.batch_normalization, start.state.get("batch_normalization", "none")
         if expected != got:

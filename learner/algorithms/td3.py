@@ -54,7 +54,7 @@ class TD3(Continuous):
         return -value.mean()
 
     def step(self, rows: Transitions) -> tuple[UpdateMetrics, Tensor]:
-        """Take one gradient step of the critics; if it is their turn, also step the actor and move the targets."""
+        """Take one gradient step of the critics. Every `policy_delay`-th time, also step the actor and move the targets."""
         critic = self.critic_loss(rows)
         measured = self.descend("critic", critic.loss, critic.numbers)
         self.gradient_steps += 1

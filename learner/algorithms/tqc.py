@@ -31,7 +31,7 @@ class TQC(SAC):
 
     @staticmethod
     def policy_spec(config: Any, observation: tuple[Leaf, ...], action: ActionSpec) -> PolicySpec:
-        """A squashed Gaussian. Raises `UsageError` unless the action is a bounded Box and a quantile is left in targets."""
+        """A squashed Gaussian. Raises `UsageError` unless the action is a bounded Box and targets keep some quantiles."""
         if config.dropped_quantiles >= config.quantiles:
             raise UsageError(
                 f"dropped_quantiles: expected fewer than quantiles, {config.quantiles}, got {config.dropped_quantiles}"

@@ -28,7 +28,7 @@ INITIAL_TEMPERATURE = 0.01
 
 
 class XQC(NormalizedSAC):
-    """An actor, two critics of categories with their targets, and the temperature."""
+    """An actor, two categorical critics with their target networks, and the temperature."""
 
     Config = XQCConfig
     config: XQCConfig

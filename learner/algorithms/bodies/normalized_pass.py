@@ -83,7 +83,7 @@ class NormalizedPass(torch.autograd.Function):
             h = torch.bmm(layer.weight, h) if layer.bias is None else torch.baddbmm(layer.bias, layer.weight, h)
         ctx.kept = kept
         ctx.plan = plan
-        ctx.save_for_backward(flat)  # so that torch raises if a step changes them before the backward pass
+        ctx.save_for_backward(flat)  # so that torch raises if an optimizer step changes them before the backward pass
         return h.mT
 
     @staticmethod
@@ -114,7 +114,7 @@ class NormalizedPass(torch.autograd.Function):
 
 
 class _Normalization(NamedTuple):
-    """The results of a normalization that the backward pass needs."""
+    """The intermediate results of a normalization that its backward pass needs."""
 
     x_hat: Tensor
     """[K or 1, n, B]"""
@@ -138,10 +138,10 @@ class _Normalization(NamedTuple):
 def _normalized(
     h: Tensor, layer: Layer, running: RunningStatistics | None, renormalizes: bool, in_place: bool
 ) -> tuple[Tensor, _Normalization]:
-    """γ x̂ + β [K, n, B] for h [K or 1, n, B], and the results that the backward pass needs.
+    """γ x̂ + β [K, n, B] for h [K or 1, n, B], and the intermediate results that the backward pass needs.
 
-    With batch renormalization (Ioffe 2017) it is γ (r x̂ + d) + β, which normalizes by the running statistics as long as r
-    and d are within their bounds. The backward pass treats r and d as constants.
+    With batch renormalization (Ioffe 2017), the result is γ (r x̂ + d) + β, which normalizes by the running statistics as
+    long as r and d are within their bounds. The backward pass treats r and d as constants.
     """
     mean = h.mean(-1, keepdim=True)
     x_hat = h.sub_(mean) if in_place else h - mean

@@ -59,7 +59,7 @@ class NormalizedSAC(SAC):
         return self.net.actor_body.shape.normalized.value
 
     def joint(self, rows: Transitions) -> Joint:
-        """The observations and actions of these rows, and the next observations with actions ã′ ~ π(s′), no gradient."""
+        """The observations and actions of these rows, and the next observations with ã′ ~ π(s′) (without gradient)."""
         with torch.no_grad():
             action, log_prob = self.sample(rows.next_x)
         return Joint(torch.cat((rows.x, rows.next_x)), torch.cat((rows.action, action)), log_prob)
@@ -99,7 +99,7 @@ class NormalizedSAC(SAC):
         return super().other_state() | {"batch_normalization": self.batch_normalization}
 
     def start_from(self, start: Start) -> None:
-        """See `Algorithm.start_from`. Raises `UsageError` if only a policy is known, without normalization statistics."""
+        """See `Algorithm.start_from`. Raises `UsageError` if the earlier run has no normalization statistics."""
         if "statistics" not in start.state:
             raise UsageError(
                 "start_from: expected a run of the same algorithm with a checkpoint, got a policy without the statistics of "

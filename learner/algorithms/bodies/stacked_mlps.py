@@ -5,8 +5,9 @@ them. A pass that doesn't train these MLPs, such as one that acts, uses the runn
 `of_minibatch`). Batch normalization is then linear, so it is folded into the linear layers: workers act with a plain MLP,
 and need neither statistics nor PyTorch.
 
-With `Normalized.BEFORE` an MLP is a BN; then linear, BN and activation for each hidden layer; then linear (XQC, Palenicek et
-al. 2025). With `Normalized.AFTER` there is a BN in front of every linear layer (CrossQ, Bhatt et al. 2024).
+With `Normalized.BEFORE`, an MLP begins with batch normalization (BN), continues with a linear layer, BN and an activation
+for each hidden layer, and ends with a linear layer (XQC, Palenicek et al. 2025). With `Normalized.AFTER`, there is a BN in
+front of every linear layer (CrossQ, Bhatt et al. 2024).
 """
 
 from __future__ import annotations

@@ -23,7 +23,7 @@ LOG_2 = math.log(2)
 
 
 class EvaluatedActions:
-    """A top that computes log π(action), the entropy of π, and V, [B] each, from the outputs of an actor and a critic."""
+    """A `Top` that computes log π(action), the entropy of π, and V, [B] each, from the outputs of an actor and a critic."""
 
     def __init__(self, distribution_kernel: DistributionKernel) -> None:
         self._distribution = distribution_kernel
@@ -45,7 +45,7 @@ class EvaluatedActions:
 
 
 class SquashedSample:
-    """A top that samples actions a = tanh u [B, D], u = mean + std · noise, and computes their log-densities [B].
+    """A `Top` that samples actions a = tanh u [B, D], u = mean + std · noise, and computes their log-densities [B].
 
     log π(a) = Σ −½ noise² − log std − log √2π − log(1 − a²), where log(1 − a²) = 2 (log 2 − |u| − log(1 + exp(−2|u|)))
     ∂a/∂u = 1 − a²;  ∂log π(a)/∂u = 2 a;  ∂u/∂log std = std · noise

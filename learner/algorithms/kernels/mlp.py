@@ -30,8 +30,8 @@ from millrace.protocol.policy.layout import Field, named_views
 MLPPass = Callable[[], object]
 
 CHUNK_ROWS = 512  # the largest number of rows in a chunk
-THREADED_PRODUCT_SIZE = 64 * 64 * 128  # the number of multiplications from which torch's threads speed a matrix product up
-MAX_PLANS = 256  # minibatch sizes whose plans are kept; the size varies with the number of valid rows
+THREADED_PRODUCT_SIZE = 64 * 64 * 128  # from this many multiplications on, torch's threads speed a product up
+MAX_PLANS = 256  # how many minibatch sizes have plans; the size varies with the number of valid rows
 
 
 class Linear(NamedTuple):
@@ -80,7 +80,7 @@ class Top(Protocol):
 
 
 class Outputs:
-    """A top that returns the outputs themselves, [B, out] each."""
+    """A `Top` that returns the outputs themselves, [B, out] each."""
 
     def forward(self, outputs: Sequence[Array]) -> tuple[Array, ...]:
         """See `Top`."""
@@ -92,7 +92,7 @@ class Outputs:
 
 
 class Values:
-    """A top for networks with one output each, which returns their outputs as one array [networks, B]."""
+    """A `Top` for networks with one output each. Returns their outputs as one array [networks, B]."""
 
     def forward(self, outputs: Sequence[Array]) -> tuple[Array, ...]:
         """See `Top`."""
@@ -161,7 +161,7 @@ class _Pass(torch.autograd.Function):
     def forward(ctx: Any, mlp: SmallMLP, x: Tensor, parameters: Tensor, *given: Tensor | None) -> tuple[Tensor, ...]:
         ctx.mlp = mlp
         ctx.kept = mlp.take()
-        ctx.save_for_backward(parameters)  # so that torch raises if a step changes them before the backward pass
+        ctx.save_for_backward(parameters)  # so that torch raises if an optimizer step changes them before the backward pass
         outputs: tuple[Tensor, ...] = ctx.kept.forward(x, given)
         return outputs
 
@@ -196,7 +196,7 @@ def taken_once(ctx: Any) -> Any:
 
 
 class _Workspace:
-    """The arrays that one call uses at a time, and the plans for the minibatch sizes so far.
+    """The arrays of one call at a time, and the plans for all minibatch sizes so far.
 
     All plans share these arrays: each plan takes the same arrays in the same order.
     """
@@ -382,7 +382,7 @@ def _linear(layer: Linear, x: Array, y: Array) -> list[MLPPass]:
 
 def _activation(y: Array, relu: bool) -> MLPPass:
     """The call that applies the activation in place."""
-    if relu:  # numpy's maximum takes several times as long
+    if relu:  # numpy's own maximum takes several times as long
         output = torch.from_numpy(y)
         return partial(torch.clamp_min, output, 0, out=output)
     return partial(np.tanh, y, out=y)

@@ -93,7 +93,7 @@ class Continuous(OffPolicy):
         if action.kind != "box":
             others = "ppo or dqn" if action.kind == "discrete" else "ppo"
             raise UsageError(f"{name}: expected an action space Box, got {action.in_words}; take --algo {others} for it")
-        largest = min(float(np.finfo(kind).max) for kind in (action.dtype, "float32"))  # such a bound means "no bound"
+        largest = min(float(np.finfo(kind).max) for kind in (action.dtype, "float32"))  # a bound this large means "no bound"
         for low, high in zip(action.low, action.high, strict=True):
             if max(-low, high) >= largest:
                 raise UsageError(
@@ -122,7 +122,7 @@ class Continuous(OffPolicy):
         return actor_and_critics(self.policy, device, self.seed)
 
     def after_step(self, name: str) -> None:
-        """Move weights back to where the algorithm keeps them. Called after each step of NAME_optimizer, even in cloning."""
+        """Move weights back to where the algorithm keeps them. Called after each step of NAME_optimizer, and in cloning."""
 
     def begin_with_actor(self) -> None:
         """Let an actor that was trained before the first rollouts act from the first env step, and copy it to its target."""
@@ -136,14 +136,14 @@ class Continuous(OffPolicy):
         return max(0, int(self._counted["made"]) + steps - (self.gradient_steps - self.prior_gradient_steps))
 
     def noise(self, rows: int) -> Tensor:
-        """Standard normal noise [B, D′], B being `rows`."""
+        """Standard normal noise [B, D′], where B is `rows`."""
         return torch.randn(rows, math.prod(self.policy.action.shape), generator=self._generator).to(self.net.flat)
 
     def transitions(self, sample: Sample | SequenceSample) -> Transitions:
         """See `OffPolicy`. Actions are flattened to [B, D′]; `x` and `next_x` are encoded, so losses need no images.
 
-        Images are shifted at random before they are encoded. The loss of the critics trains the encoder through `rows.x`;
-        `next_x` has no gradient (Yarats et al. 2022, DrQ-v2).
+        Images are shifted at random before they are encoded. The critic loss trains the encoder through `rows.x`; `next_x`
+        has no gradient (Yarats et al. 2022, DrQ-v2).
         """
         rows = super().transitions(sample)
         rows = rows._replace(action=rows.action.reshape(len(rows.action), -1).to(rows.x))
@@ -181,7 +181,10 @@ class Continuous(OffPolicy):
         return self.net.acting_parameters(), np.concatenate((self.statistics, exploration))
 
     def exploration(self) -> list[float]:
-        """The numbers in the policy's buffers between the statistics and the last one, which is 1 during the warm-up."""
+        """The exploration settings: the numbers in the policy's buffers after the statistics, except the last number.
+
+        The last number says whether to draw uniform actions: it is 1 during the warm-up.
+        """
         return []
 
     def other_state(self) -> dict[str, Any]:

@@ -2,10 +2,11 @@
 
 Law: a row shows what an action did, whatever the goal was. So when a row is drawn, its goal may be replaced with one that
 was achieved later in its episode, if its reward and its end are recomputed for this goal. The learner runs no code of the
-environment: reward and end must be functions of the achieved and the desired goal alone, which the user names. Each row that
-arrives is checked against them.
+environment: reward and end must be functions of the achieved and the desired goal alone, and the user names these functions.
+Each row that arrives is checked against them.
 
-As in gymnasium-robotics, reward and end of a row depend on the achieved and the desired goal of its next observation. Pure.
+As in gymnasium-robotics, reward and end of a row depend on the achieved and the desired goal of its next observation. This
+file is pure.
 """
 
 from __future__ import annotations
@@ -103,7 +104,7 @@ def goal_reward(name: str) -> GoalReward:
 
 
 def goals_of(observation: Sequence[Leaf]) -> tuple[int, int] | None:
-    """The indices of the leaves with the achieved and the desired goal; None unless both exist and have one form."""
+    """The indices of the leaves with the achieved and the desired goal; None unless both exist and have the same form."""
     paths = [leaf.path for leaf in observation]
     if ACHIEVED not in paths or DESIRED not in paths:
         return None
@@ -244,8 +245,8 @@ class Hindsight:
     def _check_ends(self, batch: Batch, terminated: Bools, achieved: Doubles, desired: Doubles, far: Doubles) -> None:
         """Raise `UsageError` unless episodes terminate at their goal if and only if `goal_ends` says so.
 
-        Episodes may terminate elsewhere too. So they count as terminating at their goal only if all rows terminate in which
-        the goal is reached according to the reward.
+        Episodes may terminate elsewhere, too. So they count as terminating at their goal only if every row terminates whose
+        reward says that the goal is reached.
         """
         ends_within = -1.0 if self.ends_within is None else self.ends_within
         given = "goal_ends none" if self.ends_within is None else f"goal_ends {ends_within:g}"

@@ -70,7 +70,7 @@ class MixedReplay(ReplayBuffer):
         self._prior_share = share
 
     def sample(self, count: int, beta: float = 1.0) -> Sample:
-        """Draw transitions with replacement; only prior ones until there are others. For `beta`, see `ReplayBuffer`."""
+        """Draw transitions with replacement, only prior ones until the run has its own. For `beta`, see `ReplayBuffer`."""
         if self.prior is None:
             return super().sample(count, beta)
         prior = round(self._prior_share * count) if len(self) else count
@@ -81,7 +81,7 @@ class MixedReplay(ReplayBuffer):
         return parts[0] if len(parts) == 1 else _joined(*parts)
 
     def samples(self, number: int, count: int, beta: float = 1.0) -> Iterator[Sample]:
-        """Yield `number` draws of `count` transitions each, as by `sample`."""
+        """Yield `number` draws of `count` transitions each. For one draw, see `sample`."""
         if self.prior is None:
             return super().samples(number, count, beta)
         return (self.sample(count, beta) for _ in range(number))
@@ -113,7 +113,7 @@ class MixedReplay(ReplayBuffer):
         )
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from a `state_dict`, bit for bit. Raises ValueError if the size, or that of the prior data, differs."""
+        """Continue from a `state_dict`, bit for bit. Raises ValueError if its size, or that of the prior data, differs."""
         had = state.get("prior", {}).get("rows", 0)
         has = 0 if self.prior is None else len(self.prior)
         if had != has:

@@ -1,7 +1,8 @@
 """The base of the algorithms with a replay buffer: an update, except for its gradient steps.
 
-DQN derives from it, and by way of continuous.py so do SAC, TD3 and the like. They define `steps_due`, the number of gradient
-steps of an update, and `step`, which takes one gradient step, adds 1 to `gradient_steps` and moves the target networks.
+DQN derives from it directly; SAC, TD3 and the like derive from it through `continuous.py`. They define `steps_due`, the
+number of gradient steps of an update, and `step`, which takes one gradient step, adds 1 to `gradient_steps` and moves the
+target networks.
 
 The buffer holds raw observations and rewards. They are normalized when they are drawn, with the current statistics. With one
 torch thread on a CPU, the same batches give the same bits, even after `load_state_dict`. This file uses no sockets, no files
@@ -95,7 +96,7 @@ class OffPolicy(GradientDescent):
     def step(self, rows: Transitions) -> tuple[UpdateMetrics, Tensor]:
         """Take one gradient step on a minibatch, and add 1 to `gradient_steps`. Returns its metrics, and the TD errors [B].
 
-        If a loss or a gradient is not finite, raises `RunError` before it reaches the weights.
+        If a loss or a gradient is not finite, raises `RunError` before it changes the weights.
         """
 
     def update(self, batch: Batch, pulse: Callable[[], None]) -> UpdateMetrics:
@@ -135,7 +136,7 @@ class OffPolicy(GradientDescent):
             pulse()
 
     def transitions(self, sample: Sample | SequenceSample) -> Transitions:
-        """A sample as tensors on the device of the weights, with observations and rewards normalized if so set."""
+        """A sample as tensors on the device of the weights, normalized if the settings say so."""
         if isinstance(sample, SequenceSample):
             return self._of_sequences(sample)
         next_x, next_images = self.inputs(sample.next_leaves)
@@ -202,7 +203,7 @@ class OffPolicy(GradientDescent):
 
     def learn_from_prior(self, pulse: Callable[[], None]) -> None:
         """Take `prior_steps` gradient steps on prior data alone, less those already taken."""
-        self.set_schedules()  # a loaded state may have brought another learning rate
+        self.set_schedules()  # a state that was loaded may have changed the learning rate
         for _ in self.steps(self.config.prior_steps - self.prior_gradient_steps, pulse):
             self.prior_gradient_steps += 1
 

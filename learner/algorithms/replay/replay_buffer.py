@@ -39,7 +39,7 @@ from millrace.protocol.random_streams import Purpose, generator
 from millrace.protocol.rollout import Batch
 from millrace.protocol.specs import ActionSpec, Leaf
 
-PRIORITY_OFFSET = 1e-6  # is added to errors, so that every transition can be drawn again
+PRIORITY_OFFSET = 1e-6  # added to each error, so that every transition can be drawn again
 DRAWN_AT_ONCE = 1 << 20  # the most bytes of transitions to draw together, so that they stay in the cache
 DISCRETE = ActionSpec("discrete", (), "int64")
 
@@ -156,7 +156,7 @@ class ReplayBuffer(Rewinding[Overwritten]):
         action: ActionSpec = DISCRETE,
         hindsight: Hindsight | None = None,
     ) -> None:
-        """`size` is the number of slots. Transitions are drawn in proportion to |error|^alpha, or uniformly if it is None.
+        """`size` is the number of slots. Draws are in proportion to |error|^alpha, or uniform if `alpha` is None.
 
         Raises `UsageError` if memory is too small.
         """
@@ -168,7 +168,7 @@ class ReplayBuffer(Rewinding[Overwritten]):
         self._gamma = gamma
         self._alpha = alpha
         self._seed = seed
-        self.generator = generator(seed, self._purpose)  # decides what is drawn
+        self.generator = generator(seed, self._purpose)  # the random numbers of all draws
         self._obs = tuple(self._room(leaf) for leaf in observation)
         self._mask: Bools | None = None  # [size, choices], the masks of `_obs`; allocated when the first masks arrive
         self._row = np.zeros(size, row_dtype(action))
@@ -225,7 +225,7 @@ class ReplayBuffer(Rewinding[Overwritten]):
         if most > self.size:
             raise UsageError(f"replay_size {self.size}: a rollout takes up to {most}; take --replay-size {most} or more")
         fresh = batch.fresh[columns]
-        known = NO_SLOT if fresh.all() else self._newest.get(lane, NO_SLOT)  # the old array may not fit a fresh lane
+        known = NO_SLOT if fresh.all() else self._newest.get(lane, NO_SLOT)  # a fresh lane may have a new size
         newest = np.where(fresh, NO_SLOT, known)
         continues = self._continues([leaf[0] for leaf in obs], newest, most)
         goes_on = _goes_on(EpisodeEnds.of(batch).columns(columns), continues)  # [T+1, N]
@@ -351,7 +351,7 @@ class ReplayBuffer(Rewinding[Overwritten]):
     def _uniform(self, count: int) -> tuple[Ints, Array, Floats]:
         used = min(self._written, self.size)
         slots = self.generator.integers(0, used, count)
-        while not (found := (row := self._row[slots])["is_row"]).all():  # few rounds: half of the slots have a row
+        while not (found := (row := self._row[slots])["is_row"]).all():  # few rounds, because half of the slots have a row
             slots[~found] = self.generator.integers(0, used, np.count_nonzero(~found))
         return slots, row, np.ones(count, np.float32)
 
@@ -372,7 +372,7 @@ class ReplayBuffer(Rewinding[Overwritten]):
         for _ in range(self._n_step - 1):
             row = self._row[at]
             self._set_outcome(row, goals)
-            going = row["is_row"] & ~ended  # others stay at their slot
+            going = row["is_row"] & ~ended  # the other rows stay at the last slot that they reached
             reward += np.where(going, discount * row["reward"], 0)
             discount = np.where(going, discount * self._gamma * ~row["terminated"], discount)
             ended |= going & row["terminated"]
@@ -404,7 +404,7 @@ class ReplayBuffer(Rewinding[Overwritten]):
         self._keep(slots, ())
         self._tree.set(slots, priority**self._alpha)
 
-    # ---------------------------------------------------------------- taking back
+    # ---------------------------------------------------------------- rolling back
 
     def roll_back(self) -> None:
         """Return to the state that was remembered last."""

@@ -5,9 +5,10 @@ core had on the worker before them. That state was computed with older weights. 
 the core first, from its own stored state and without a gradient, to compute a state with the current weights (stored state
 and burn-in, Kapturowski et al. 2019, R2D2).
 
-Rule: each row is in one sequence, and unless replay is prioritized each sequence is equally likely to be drawn. So each row
-is learned from equally often, whatever the length of its episode. Rows follow the row format (`millrace.protocol.rollout`):
-episodes may end inside a sequence, where the state is reset to zeros, and a row that is not valid passes the state on.
+Rule: each row is in one sequence, and unless replay is prioritized each sequence is equally likely to be drawn. So all rows
+are learned from equally often, whatever the length of their episodes. Rows follow the row format
+(`millrace.protocol.rollout`): episodes may end inside a sequence, where the state is reset to zeros, and a row that is not
+valid passes the state on.
 
 This file uses no files, and all randomness comes from the seed.
 """
@@ -106,7 +107,7 @@ class SequenceReplay(Rewinding[ReplacedSequences]):
         self.arrays = {name: np.zeros((self.size, *shape), dtype) for name, (shape, dtype) in shapes.items()}
         """Arrays with one entry for each slot, by name. `begins` is True where obs[t+1] begins an episode. `before` is the
         number of the previous sequence; sequences are numbered in the order in which they were written."""
-        self.generator = generator(seed, Purpose.REPLAY)  # decides what is drawn
+        self.generator = generator(seed, Purpose.REPLAY)  # the random numbers of all draws
         self._tree = None if alpha is None else SumTree(self.size)
         self._highest = 1.0  # the highest priority so far, which new sequences get
         self._written = 0  # number of sequences ever written; modulo the size, it is the next slot
@@ -268,7 +269,7 @@ class SequenceReplay(Rewinding[ReplacedSequences]):
         self._keep(sequences)
         self._tree.set(sequences, priority**self._alpha)
 
-    # ---------------------------------------------------------------- taking back
+    # ---------------------------------------------------------------- rolling back
 
     def _put_back(self, old: ReplacedSequences) -> None:
         for name, array in old.arrays.items():

@@ -2,7 +2,7 @@
 
 Law: reading returns exactly the bytes that were written. For a replay buffer it works like an array of images:
 `images[slots]` copies, and `images[slots] = values` overwrites. A channel is kept as long as a slot refers to it. It is
-identified by its digest, so it is shared wherever it occurs: in any slot, and in any place of the stack.
+identified by its digest, so it is shared wherever it occurs: in any slot, and at any position in the stack.
 """
 
 from __future__ import annotations

@@ -72,9 +72,10 @@ class SumTree:
         return self.find((np.arange(count) + generator.random(count)) * (self.total / count))
 
     def draw_weighted(self, generator: np.random.Generator, count: int, entries: int, beta: float) -> tuple[Ints, Floats]:
-        """`count` indices as by `draw`, and their importance-sampling weights [count]. The tree has `entries` entries.
+        """Draw `count` indices as `draw` does. Returns them and their importance-sampling weights [count].
 
-        P(i) = pᵢ^α / Σ p^α;  wᵢ = (entries · P(i))^−β, divided by the greatest of them (Schaul et al. 2016, section 3.4).
+        `entries` is the number of indices that have a weight. P(i) = pᵢ^α / Σ p^α;  wᵢ = (entries · P(i))^−β, divided by the
+        greatest of them (Schaul et al. 2016, section 3.4).
         """
         index = self.draw(generator, count)
         chance = self.weights[index] / self.total

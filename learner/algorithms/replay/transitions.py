@@ -64,9 +64,9 @@ class Transitions(NamedTuple):
     weight: Tensor
     """[B] the weight of each row in the loss; 1 unless replay is prioritized"""
     target_x: Tensor
-    """[B, D] next_x for the target network; once encoded, by the encoder of the target network"""
+    """[B, D] `next_x` for the target network, which encodes it with its own encoder"""
     sequences: Sequences | None = None
-    """how the rows lie in sequences; None without a recurrent core, and once the rows are encoded"""
+    """how the rows lie in sequences; None without a recurrent core, and after the rows were encoded"""
 
     def encoded(self, encode: Encoder) -> Transitions:
         """A copy with an encoder's outputs [B, H] in place of features and images. Those of `next_x` have no gradient."""
