@@ -23,7 +23,7 @@ from millrace.protocol.wire.learner_link import LearnerLink
 log = logging.getLogger("millrace.learner")
 
 LINGER_S = 0.5  # how long a closed socket still tries to send queued messages
-LINGER_ELSEWHERE_S = 2.0  # the same for workers that are started elsewhere, perhaps on other machines
+LINGER_ELSEWHERE_S = 2.0  # the same, if workers are started elsewhere, perhaps on other machines
 
 
 @dataclass(frozen=True)

@@ -3,14 +3,14 @@
 It is pure: messages and `now` in, messages out.
 
 Rule: a worker that is waiting when the run begins becomes a member of the run, in the same session. If it is describing an
-environment at that time, it gets work once it says that it has begun the run. The membership (`Membership.hear`) answers
-messages that don't belong to a member's session, and Failures; a subclass handles all other messages. A membership ends by
-Goodbye, by Failure, by the end of the process, by silence, by a refusal, or when the worker's key is revoked. Then the
-member's tickets and lanes are taken back, and `_deal` gives them to others. If a Heartbeat shows that a message was lost,
-the message is sent again before the reply.
+environment at that time, it gets work only once it says that it has begun the run. The membership (`Membership.hear`)
+answers messages that don't belong to a member's session, and Failures; a subclass handles all other messages. A membership
+ends by Goodbye, by Failure, by the end of the process, by silence, by a refusal, or when the worker's key is revoked. Then
+the member's tickets and lanes are taken back, and `_deal` gives them to others. If a Heartbeat shows that a message was
+lost, the message is sent again before the reply.
 
-A subclass defines the rest: how messages are answered, which work is dealt, what a loss means, and what happens after a
-wrong answer.
+A subclass defines the rest: how to answer messages, which work to deal, what to do when a worker is lost, and what to do
+after a wrong answer.
 """
 
 from __future__ import annotations
@@ -99,17 +99,17 @@ class Coordinator(ABC, Generic[M]):
         """Ask every worker to leave. From now on, no work is dealt."""
         return self.membership.drain(reason)
 
-    # ---------------------------------------------------------------- what differs
+    # ---------------------------------------------------------------- what a subclass defines
 
     @abstractmethod
     def _answer(self, member: M, message: ToLearner) -> list[Outgoing]:
         """The answer to a message that a member sent in its session."""
 
     def _not_of_member(self, message: ToLearner, answered: Answered) -> None:
-        """Called with each message that the membership has answered itself."""
+        """Called with each message that the membership, and not this object, has answered."""
 
     def _deal(self) -> list[Outgoing]:
-        """Give the work that no worker has to workers. Called after each event that may have made one available."""
+        """Give workers the work that no worker has. Called after each event that may have made a worker available."""
         return []
 
     def _again(self, member: M, heartbeat: Heartbeat, lost: Sequence[int]) -> list[Outgoing]:
@@ -124,7 +124,7 @@ class Coordinator(ABC, Generic[M]):
         return ()
 
     def _unusable(self, member: M, why: str) -> list[Outgoing]:
-        """Handle a message of a member that could not be used."""
+        """Handle a member's message that could not be used."""
         return self.membership.refuse(member, SentUnusable, why)
 
     # ---------------------------------------------------------------- inside

@@ -65,7 +65,7 @@ class DescribeCoordinator(Coordinator[Member]):
         self._decliners: set[str] = set()
 
     def ask(self, unknown: Unknown) -> list[Outgoing]:
-        """Have a worker describe this environment. Its answer is in `described` until the next call."""
+        """Have a worker describe this environment. The description is then in `described`, until the next call."""
         self.described = None
         self._unknown = unknown
         self._at_once = 1
@@ -155,7 +155,7 @@ class DescribeCoordinator(Coordinator[Member]):
 
 
 def _free_first(member: Member) -> tuple[bool, bool, int]:
-    """Sort key of the workers to ask. Those that aren't busy with an earlier order come first.
+    """Sort key of the workers that may be asked. Those that aren't busy with an earlier order come first.
 
     Among these, the worker that will get the first lane comes first, because it can go on using the copy that it describes.
     """

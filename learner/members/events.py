@@ -77,7 +77,7 @@ class Failed:
     worked_s: float | None = None
     """Seconds from the worker's first env step to the failure; None if its process is not known to have made one."""
     spare: bool = False
-    """Whether the run didn't need the worker, because every lane had another one. Such a failure doesn't count."""
+    """Whether the run didn't need the worker, because every lane had another worker. Such a failure doesn't count."""
 
     @property
     def line(self) -> str:
@@ -203,8 +203,8 @@ Event = LoggedEvent | RolloutRejected | RolloutArrived | EpisodesArrived
 def describe(event: LoggedEvent) -> str:
     """The text of an event for the log: one line, then the traceback or the last lines of output, if there are any.
 
-    The latter are indented so that none of them looks like a line of the log. Control characters in a peer's texts are
-    replaced.
+    The lines after the first are indented, so that none of them looks like a log line of its own. Control characters in a
+    peer's texts are replaced.
     """
     line = one_line(_line(event), 4 * MAX_LINE)
     match event:

@@ -23,7 +23,7 @@ DOING = {
     "closing": "in close",
 }
 """What a worker is doing, in words. Only workers with a supervisor report it."""
-MOST_TOLD = 4  # the most workers in one line about what they are doing
+MOST_TOLD = 4  # how many workers a line about what workers do may name
 LONG_S = 2.0  # shorter times aren't shown; by default, heartbeats are sent every second
 
 
@@ -36,13 +36,13 @@ def in_words(doing: str, seconds: float) -> str:
 def held_up(member: Member, now: float) -> tuple[float, float, str]:
     """How many seconds a member has been held up, its env steps per second negated, and a line about it.
 
-    The line says which worker it is, on which host, and what it is doing. The largest tuple is that of the member that has
-    been held up longest or, if none is held up, of the slowest.
+    The line says which worker it is, on which host, and what it is doing. Tuples can be compared: the largest belongs to the
+    member that has been held up longest or, if none is held up, to the slowest one.
     """
     row = member.status(now)
     seconds = 0.0
     silent_s = now - member.alive_s
-    # Its speed is measured between two heartbeats with more steps, so a worker without any has no speed.
+    # A speed is known only after two heartbeats that each reported more steps.
     unmeasured = "has begun to step" if row.steps else "no env step yet"
     what = f"{row.steps_per_s:,.1f} steps/s" if row.steps_per_s else unmeasured
     if silent_s >= LONG_S:
@@ -59,8 +59,8 @@ def what_they_do(
 ) -> tuple[str, list[str]]:
     """What the workers are doing, in one line, and a line for each worker that wrote something.
 
-    The members come first, the one that has been held up longest before the others, and then the worker processes that have
-    not joined. `said` are the last lines of the workers' logs, by name.
+    Members come first, in the order of how long they have been held up. The worker processes that have not joined follow.
+    `said` are the last lines of the workers' logs, by name.
     """
     members = list(members)
     lines = [line for *_, line in sorted((held_up(member, now) for member in members), reverse=True)]

@@ -17,7 +17,7 @@ class JoinLimiter:
     """Decides which `Hello` messages are answered."""
 
     def __init__(self) -> None:
-        self._buckets: dict[str, TokenBucket] = {}  # by the key's name, so there are only as many as there are keys
+        self._buckets: dict[str, TokenBucket] = {}  # by the key's name, so there are only as many buckets as keys
 
     def admits(self, source: str, now: float) -> bool:
         """Whether to answer a `Hello` from this source: the name of the sender's key, or an empty string without keys."""

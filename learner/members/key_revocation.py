@@ -20,5 +20,5 @@ class KeyRevocation:
         keyring = self._link.keyring
         if keyring is None or keyring.allowed is self._checked_against:
             return []
-        self._checked_against = keyring.allowed  # before the check, because the list may be replaced meanwhile
+        self._checked_against = keyring.allowed  # noted before the check, because the list may be replaced during it
         return [(peer, why) for peer in members if (why := self._link.rejection_reason(peer))]

@@ -98,7 +98,7 @@ class Lobby:
             check_interrupt()
             self._check()
             now = self._clock()
-            # Time in the environment's code doesn't count: the timeouts of its calls end a worker, with better errors.
+            # Time in the environment's code doesn't count, because its calls have timeouts of their own, with better errors.
             busy_s = max((member.in_env_code_s for member in members.values()), default=began_s)
             if now - max(began_s, busy_s) > stall_timeout_s and members:
                 told = server.what_workers_do()
@@ -140,7 +140,7 @@ class Lobby:
 
     def hand_over(self) -> Membership[Member]:
         """Close the lobby. Returns the workers that wait for the run, for its hub to take over."""
-        self._server.listen(0.0)  # so that the hub takes over nobody whose process has ended or whose key was revoked
+        self._server.listen(0.0)  # so that the hub takes over no worker whose process has ended or whose key was revoked
         self._server.close()
         return self._coordinator.membership
 

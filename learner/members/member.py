@@ -23,7 +23,7 @@ SUPERVISOR_WORD_S = 5.0  # how long a supervisor's statement is valid
 
 @dataclass(eq=False)
 class SharingSupervisor:
-    """A supervisor whose workers share the weights that it receives, as the learner sees it. Members refer to it."""
+    """A supervisor, as the learner sees it, that shares the weights it receives among its workers. Members refer to it."""
 
     peer: bytes
     heard_s: float = 0.0
@@ -39,7 +39,7 @@ class Speed:
     """How fast a worker steps.
 
     A step may take minutes, and a client may count the steps of a rollout only when that is complete. So the speed is
-    measured between the last two heartbeats with more steps. It falls once the next one is overdue.
+    measured between the last two heartbeats with more steps. The speed falls once the next measurement is overdue.
     """
 
     steps: int
@@ -75,7 +75,7 @@ class Member:
     joined_s: float = 0.0
     """Time when the worker joined."""
     takeovers: int = 0
-    """How many times in a row another process has taken over this name from a live one."""
+    """How many times in a row another process has taken this name from a live process."""
     state: MemberState = MemberState.ACTIVE
     lanes: set[int] = field(default_factory=set)
     tickets: dict[int, int] = field(default_factory=dict)
@@ -99,7 +99,7 @@ class Member:
     activity: WorkerActivity | None = None
     """What the worker is doing, according to its supervisor's last statement."""
     activity_s: float = 0.0
-    """Time of that statement."""
+    """Time of the supervisor's last statement."""
     failed_lane: int | None = None
     """The lane whose environment failed, if the worker left because of that."""
     hung: bool = False
@@ -126,7 +126,7 @@ class Member:
 
     @property
     def has_counted(self) -> bool:
-        """Whether the counts of its process, in the next heartbeat, include time before it took part in this run."""
+        """Whether the next heartbeat's counts may include work that the process did before it joined this run."""
         return not self.hello.is_first_attempt if self.heartbeat is None else self.heartbeat.waits
 
     @property
@@ -171,7 +171,7 @@ class Member:
         return [ticket for ticket, sent_at in self.tickets.items() if ticket not in held and heartbeat.replies > sent_at]
 
     def begins(self, heartbeat: Heartbeat) -> None:
-        """Record it if this heartbeat shows that a worker that was describing an environment has begun the run."""
+        """Check whether a worker that was describing an environment has begun the run, and record that it has."""
         if not heartbeat.waits:
             self.describes = False
 

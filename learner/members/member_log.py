@@ -19,7 +19,7 @@ log = logging.getLogger("millrace.learner")
 MOST_WORKERS = 1_000  # how many workers' budgets are remembered
 OF_A_WORKER = Allowance(lines=30, lines_per_s=0.2, bytes=MAX_TEXT, bytes_per_s=100)
 OF_A_KEY = Allowance(lines=5_000, lines_per_s=1, bytes=6 * MAX_TEXT, bytes_per_s=100)
-LINE_BYTES = 100  # size of a line besides its text: time, level, line break
+LINE_BYTES = 100  # size of the rest of a line: time, level, line break
 
 
 class MemberLog:

@@ -1,4 +1,4 @@
-"""The server of members, with which every learner serves its workers. A shell around link, clock and log.
+"""The server through which every learner exchanges messages with its workers. A shell around link, clock and log.
 
 Rule: the inbox is emptied before silent workers are removed, and a learner that was away listens for a while first. So a
 long update, or a stopped process, never costs a healthy worker its membership.
@@ -67,7 +67,7 @@ STATUS_SHARE = 20  # answers to Inquire take at most 1 / STATUS_SHARE of the tim
 
 
 class ServedHub(Protocol):
-    """The owner of a server. It waits in the server, which calls it with each event."""
+    """The owner of a server. The server calls it with each event, while the owner waits for the server."""
 
     def status(self, now: float) -> Status:
         """The answer to `millrace status`."""
@@ -92,7 +92,7 @@ class ServerSettings:
 
 
 class MemberServer:
-    """Exchanges messages with the members, and removes those that are silent, have ended, or whose key was revoked."""
+    """Exchanges messages with the members. Removes those that are silent or have ended, or whose key was revoked."""
 
     def __init__(
         self,
@@ -204,7 +204,7 @@ class MemberServer:
             raise self.no_workers(1, timeout_s)
 
     def check_left(self, workers: int, *, collecting: bool) -> None:
-        """Raise `NoWorkers` if fewer than `workers` are left, all started by this program, and no others can join."""
+        """Raise `NoWorkers` if this program started all workers, no others can join, and fewer than `workers` are left."""
         left = self._processes.left(collecting=collecting)
         if left >= workers:
             return
@@ -284,7 +284,7 @@ class MemberServer:
         return [(peer, Refuse(line))] if member is None else self._membership.refuse(member, SentUnusable, line)
 
     def _status_frames(self, now: float) -> Sequence[Buffer]:
-        """The frames of a status, which is recomputed only after `STATUS_SHARE` times as long as computing it took."""
+        """The frames of a status. It is kept for `STATUS_SHARE` times as long as it took to compute."""
         if now >= self._status[0]:
             frames = status_frames(self._hub.status(now))
             took_s = self._clock() - now

@@ -100,8 +100,8 @@ class Membership(Generic[M]):
         self.draining: str | None = None
         """why the workers were asked to leave; None if they were not"""
         self.progress = {False: 0, True: 0}
-        """how many times members have reported more env steps, or more finished calls of the environment, since the last
-        time: False counts members that may collect, True those that only evaluate
+        """how many times a member has reported more env steps, or more finished calls of the environment, than before. The
+        key False counts members that may collect, and True those that only evaluate
         """
         self.has_policy_code = isinstance(run, RunSpec) and bool(run.policy_code)
         """whether a user-defined policy acts in the workers; if not, a failure is never blamed on the policy"""
@@ -143,7 +143,7 @@ class Membership(Generic[M]):
         return events
 
     def hear(self, peer: bytes, message: ToLearner, now: float) -> M | Answered:
-        """The member that sent this message in its session, for the caller to answer; otherwise the answer."""
+        """The member, if one sent this message in its session, for the caller to answer. Otherwise, the answer to it."""
         match message:
             case Hello():
                 out, joined = self.join(peer, message, now)
@@ -324,7 +324,7 @@ class Membership(Generic[M]):
         return silent
 
     def remove(self, member: M, event: type, why: str, refusal: str | None = None) -> None:
-        """Remove a member. If it is refused, `refusal` is the reason that it is told."""
+        """Remove a member. If the member is refused, `refusal` is the reason that is sent to it."""
         member.state = TABLE[member.state][event]
         del self.members[member.peer]
         _add(self._stages_of_left, member.stages())

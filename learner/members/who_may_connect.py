@@ -2,7 +2,7 @@
 
 Rule: an address that other machines can reach needs keys, unless the user sets `insecure`. Keys are made automatically on
 first use. On loopback they are needed only if a key folder was named. Over ipc and inproc, the operating system decides who
-may connect. `membership.py` decides which of those who may connect may join a run.
+may connect. Of the workers that may connect, `membership.py` decides which may join a run.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class Listening(Protocol):
 
 @dataclass(frozen=True)
 class BindSettings:
-    """Where a vector environment listens; fields are named as in `Config`. Without an address it starts its own workers."""
+    """Where a vector environment listens. Fields are named as in `Config`. Without an address, it starts its own workers."""
 
     bind: str = ""
     keys: str = ""
@@ -53,7 +53,7 @@ class BindSettings:
 def keyring_for(config: Listening, now: datetime) -> Keyring | None:
     """The keys that may connect to `config.bind`; None if no key is needed.
 
-    Raises `UsageError` for both keys and `insecure`, or if the key folder can't be used.
+    Raises `UsageError` if both keys and `insecure` are given, or if the key folder can't be used.
     """
     if config.insecure and config.keys:
         raise UsageError(f"keys {config.keys} or insecure: expected one, got both")

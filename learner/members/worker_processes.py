@@ -20,7 +20,7 @@ class WorkerProcesses:
     expected: int = 0
     """The number of processes that the user asked for; 0 for any number."""
     most_copies: int = 0
-    """The largest number of env copies for which their machine has room; 0 for any number."""
+    """The largest number of env copies for which this machine has room; 0 for any number."""
 
     def ended(self) -> Sequence[WorkerExit | StartFailed]:
         """The workers whose processes have ended since the last call. An override may raise."""
@@ -52,7 +52,7 @@ class WorkerProcesses:
         """Give these processes, and those that replace them, the lowest CPU priority."""
 
     def stepping(self) -> Sequence[Member] | None:
-        """The workers that step the environment if they are not the learner's members; otherwise None."""
+        """The workers that step the environment, if these are not the learner's members; otherwise None."""
         return None
 
     def take_failures(self) -> Sequence[Failed]:

@@ -85,7 +85,7 @@ def part_of(batch: Batch, columns: Columns) -> Batch:
 
 
 def pairwise_sum(terms: Sequence[Term]) -> Term:
-    """The sum of one or more terms: adds neighbours, then neighbouring sums, until one is left."""
+    """The sum of one or more terms: adds neighbors, then neighboring sums, until one is left."""
     while len(terms) > 1:
         pairs = [one + other for one, other in zip(terms[::2], terms[1::2], strict=False)]
         terms = [*pairs, *terms[2 * len(pairs) :]]

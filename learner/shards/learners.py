@@ -41,7 +41,7 @@ log = logging.getLogger("millrace.learner")
 
 POLL_S = 0.1
 TELL_EVERY_S = 30.0
-TELL_BEFORE = 0.1  # a sign of life is sent after this share of the time that others wait for a message
+TELL_BEFORE = 0.1  # others wait for a message for some time; a sign of life is sent after this share of it
 PATIENCE_S = 3.0  # timeout of one attempt to connect
 JOINED = "millrace/rank/"
 
@@ -117,7 +117,7 @@ class Learners:
             self.others_wait = False
 
     def tell_all(self, message: FromRankZero) -> None:
-        """Send a message without arrays to all other processes. If that fails for one, no further message can be sent."""
+        """Send a message without arrays to all other processes. After a failure, no further message can be sent."""
         self.others_wait = False
         for rank in self.others:
             self.tell(rank, message)
@@ -153,14 +153,14 @@ class Learners:
 def connected(place: Place, shards: int, device: str, timeouts: Timeouts, poll: Callable[[], None]) -> Iterator[Learners]:
     """Connect the processes of a run, and disconnect them at the end.
 
-    `poll` is called now and then while this process waits for others; the log says for whom. Raises `UsageError` if
-    `shards` can't be divided among them, and `LearnerLost` if not all of them connect in time.
+    `poll` is called now and then while this process waits for others; the log names the processes that are missing. Raises
+    `UsageError` if `shards` can't be divided among them, and `LearnerLost` if not all of them connect in time.
     """
     division = place.division(shards)
     if place.processes == 1:
         yield Learners(division)
         return
-    if distributed.is_initialized():  # the program that started this process, such as Ray Train, has done it
+    if distributed.is_initialized():  # by the program that started this process, such as Ray Train
         with _told_of_the_end(Learners(division, reply_s=timeouts.reply_s)) as learners:
             yield learners
         return

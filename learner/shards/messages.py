@@ -65,7 +65,7 @@ FromRankZero = Begin | Learn | StillThere | End
 
 
 def arrays_of(batch: Batch, columns: Array) -> list[Array]:
-    """The arrays of a batch that are sent to a process. They have all columns; only observations have just `columns`."""
+    """The arrays of a batch that are sent to a process. Observations have only `columns`, the others all columns."""
     optional = [array for array in (batch.mask, batch.resets) if array is not None]
     return [
         *(getattr(batch, name) for name in SMALL),
@@ -76,7 +76,7 @@ def arrays_of(batch: Batch, columns: Array) -> list[Array]:
 
 
 def batch_of(learn: Learn, arrays: Sequence[Array], columns: Array) -> Batch:
-    """The batch from the arrays of `arrays_of`, without episodes. The observations of other columns are zeros.
+    """Make the batch from the arrays of `arrays_of`, without episodes. The observations of other columns are zeros.
 
     The operating system allocates no memory for these zeros.
     """

@@ -36,13 +36,13 @@ class ShardObservations(NamedTuple):
     """The observations of a process's own shards."""
 
     batch: Batch
-    """its small arrays have all columns; its observations have at least the columns of the own shards"""
+    """its small arrays have all columns; its observations have at least the columns of this process's shards"""
     columns: Sequence[Columns]
     """the columns of each of the S shards"""
     own: range
     """the shards of this process"""
     parts: Sequence[WholeBatch]
-    """the own shards, with their observations"""
+    """this process's shards, with their observations"""
     gather: Gather
 
     @property
@@ -52,7 +52,7 @@ class ShardObservations(NamedTuple):
         return T + 1, N
 
     def evaluate(self, steps: int, function: Callable[[NetworkInput, Index], Tensor], pulse: Callable[[], None]) -> Floats:
-        """See `Observations`. Each process computes the results of its own shards, and gets those of all."""
+        """See `Observations`. Each process computes the results of its own shards, and gets the results of all shards."""
         total = self.batch.valid.shape[1]
         widest = max(map(len, self.columns))
         values = torch.zeros(len(self.own), steps, widest)
@@ -79,7 +79,7 @@ class ShardRows(NamedTuple):
     def epochs(
         self, advantage: Floats, target: Floats, used: Bools, count: int, generator: torch.Generator
     ) -> Iterator[Iterable[Sequence[Minibatch]]]:
-        """See `UpdateRows`. The parts of a minibatch are those of the own shards."""
+        """See `UpdateRows`. A minibatch has one part for each of this process's shards."""
         _, columns, own, parts, _ = self.observations
         rows_of_shards = [
             Minibatch.of(*part, advantage[:, columns[shard]], target[:, columns[shard]])
@@ -109,7 +109,7 @@ class ShardRows(NamedTuple):
         return endless_epochs(minibatches, count, generator)
 
     def _standardized(self, advantages: Sequence[Tensor]) -> Sequence[Tensor]:
-        """The advantages of all parts, scaled to mean 0 and standard deviation 1 over the whole minibatch if so set."""
+        """The advantages of all parts, scaled, if so set, to mean 0 and standard deviation 1 over the whole minibatch."""
         if not self.standardizes:
             return advantages
         return torch.split(standardized(torch.cat(list(advantages))), [len(each) for each in advantages])

@@ -53,10 +53,10 @@ class Sharded(ActorCritic):
     _failed: Exception | None = None
     """the exception that this process raised in the current minibatch"""
 
-    # ---------------------------------------------------------------- what rank 0 tells, and the others do
+    # ---------------------------------------------------------------- how the processes make the same update
 
     def update(self, batch: Batch, pulse: Callable[[], None]) -> UpdateMetrics:
-        """See `ActorCritic`. If `pulse` raises, all processes end the update, at the next gradient step or at its end."""
+        """See `ActorCritic`. If `pulse` raises, all processes end the update at its next gradient step, or at its end."""
         self._stopped = None
         self.learners.others_wait = False
         if self.learners.leads:
@@ -151,7 +151,7 @@ class Sharded(ActorCritic):
             metrics = self.differentiate(loss * count, self.optimizers["optimizer"], {**numbers, "loss": loss})
             assert self.net.flat.grad is not None
             gradient.copy_(self.net.flat.grad)
-            del metrics["grad_norm"]  # the norm of a part's gradient means nothing for the minibatch
+            del metrics["grad_norm"]  # the gradient norm of one part says nothing about the whole minibatch
             return Report(count, metrics)
         except Exception as error:
             self._failed = error

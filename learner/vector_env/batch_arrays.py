@@ -1,7 +1,7 @@
 """The arrays that hold the newest observations, rewards and episode ends of all env copies, or of their seats.
 
-They are in shared memory if there is any. Then local workers write the results of a step there themselves. Results that
-arrive as messages are written to the same arrays.
+If there is shared memory, the arrays are in it, and local workers write the results of their steps there themselves. Results
+that arrive as messages are written to the same arrays.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ class BatchArrays:
         return np.logical_not(self._seats[0].reshape(self._layout.count, -1).any(1))
 
     def of_seats(self, rows: slice | Sequence[int]) -> Infos:
-        """Gymnasium infos of these rows: which act next, which are complete, and rewards that belong to no transition."""
+        """Infos of these rows: which rows act next, which are complete, and the rewards that belong to no transition."""
         found = {leaf.path: array[rows].copy() for leaf, array in zip(SEAT_LEAVES, self._seats, strict=True)}
         return found | {f"_{name}": np.ones(len(array), bool) for name, array in found.items()}
 

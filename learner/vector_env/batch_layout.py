@@ -51,7 +51,7 @@ class BatchLayout:
         return bisect_right(self._firsts, copy) - 1
 
     def by_lane(self, copies: Iterable[int]) -> dict[int, list[int]]:
-        """Group env copies by lane. In the result they are numbered within their lane, from 0, in the given order."""
+        """Group env copies by lane, in the given order. In the result, copies are numbered within their lane, from 0."""
         grouped: dict[int, list[int]] = {}
         for copy in copies:
             lane = self.lane_of(copy)

@@ -1,4 +1,4 @@
-"""Calls and descriptions of env copies: makes the orders to each lane, and reads the answers."""
+"""Calls env copies and has them described: makes the orders to each lane, and reads the answers."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ USE_INSTEAD = ("reset", "step", "close")
 
 
 class CopyCalls:
-    """Calls, reads and assigns attributes of the env copies of one vector environment, and describes them."""
+    """Calls, reads and sets attributes of a vector environment's env copies, and gets descriptions of the copies."""
 
     def __init__(self, send_recv: SendRecv, parts: VectorEnvParts, known: Mapping[str, Any]) -> None:
-        """`known` are attributes that every copy has and that can't be sent, because they aren't plain data."""
+        """`known` has the attributes that are equal in all copies and can't be sent, because they aren't plain data."""
         self.known = known
         self._send_recv = send_recv
         self._parts = parts
 
     def call(self, copies: Sequence[int], name: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[Any, ...]:
-        """Call, or get, an attribute of these copies. The results are in ascending order of the copies.
+        """Call a method of these copies, or get an attribute. The results are in ascending order of the copies.
 
         Raises the errors that `ZmqVectorEnv.call` raises.
         """
@@ -68,7 +68,7 @@ class CopyCalls:
 
     def _answers(self, orders: Mapping[int, MakeOrder]) -> dict[int, Returned]:
         self._send_recv.call(orders)
-        results = self._send_recv.recv_some(list(orders)).results  # other lanes may be stepping
+        results = self._send_recv.recv_some(list(orders)).results  # only these lanes, because others may be stepping
         return {lane: result for lane, result in results.items() if isinstance(result, Returned)}
 
 
@@ -78,7 +78,7 @@ def call_orders(
     """Orders, by lane, that call or get an attribute of these copies.
 
     Raises `ValueError` for `reset`, `step` and `close`, `UsageError` for a name that no message can carry, and `TypeError`
-    for such arguments.
+    for arguments that no message can carry.
     """
     _check_name(name)
     if name in USE_INSTEAD:
@@ -92,7 +92,7 @@ def call_orders(
 def assign_orders(layout: BatchLayout, copies: Sequence[int], name: str, values: Sequence[Any]) -> dict[int, MakeOrder]:
     """Orders, by lane, that assign one value to each of these copies, which are in ascending order.
 
-    Raises `UsageError` for a name that no message can carry, and `TypeError` for such a value.
+    Raises `UsageError` for a name that no message can carry, and `TypeError` for a value that no message can carry.
     """
     _check_name(name)
     by_copy = dict(zip(copies, values, strict=True))

@@ -104,7 +104,7 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
 
         A single seed s gives the copies the seeds s, s + 1, …. A list of options has one entry for each copy. Raises
         `WorkerLost` if every attempt loses a worker. With SameStep, copies that were lost with their worker must be reset
-        together; raises `UsageError` for only some of them.
+        together; raises `UsageError` if only some of them are.
         """
         self._check_idle("reset")
         self.reset_async(seed, options)
@@ -117,11 +117,11 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         *,
         env_ids: Sequence[int] | Array | None = None,
     ) -> None:
-        """Begin episodes as `reset` does, or only in the copies `env_ids`; a list of seeds then has one for each of these.
+        """Begin episodes as `reset` does, but only in the copies `env_ids` if these are given.
 
-        Get the results with `reset_wait`, which returns what `reset` returns, or with `recv`, which returns the copies that
-        are ready, with reward 0. Raises `AlreadyPendingCallError` if one of the copies, or another copy of its lane, has not
-        come back.
+        With `env_ids`, a list of seeds has one seed for each of these copies. Get the results with `reset_wait`, which
+        returns what `reset` returns, or with `recv`, which returns the copies that are ready, with reward 0. Raises
+        `AlreadyPendingCallError` if one of the copies, or another copy of its lane, has not come back from an earlier call.
         """
         self._check_idle("reset_async", of_sent=True)
         copies, seeds, options = reset_arguments(env_ids, seed, options, self._layout.count)
@@ -178,15 +178,15 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         self._step(lanes, actions, together=False)
 
     def end_step(self, lanes: Sequence[int]) -> GymnasiumStep:
-        """Wait for the step of these lanes. Returns and raises what `step` does; only the rows of these lanes count.
+        """Wait for the step of these lanes. Returns what `step` returns, but only the rows of these lanes are meaningful.
 
-        After an error, nothing is waited for any more.
+        Raises what `step` raises. After an error, no lane is awaited any more.
         """
         self._check_idle("end_step", of_sent=True)
         return self._rows(self._send_recv.recv_some(lanes))
 
     def abandon(self) -> None:
-        """Wait for nothing any more: the results of what was sent don't come back."""
+        """Stop waiting for all lanes. The results of the orders that were sent are dropped."""
         if self.outstanding:
             self._send_recv.abandon()
         self._state = AsyncState.DEFAULT
@@ -216,7 +216,7 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         self._state = AsyncState.DEFAULT
 
     def recv(self, min_envs: int = 1, timeout: float | None = None) -> GymnasiumStep:
-        """Wait until at least `min_envs` copies are ready, and return the results of all that are. 0 does not wait.
+        """Wait until at least `min_envs` copies are ready (0 does not wait). Returns the results of all ready copies.
 
         Observations, rewards, terminated, truncated and infos have a row for each of these copies, or for each of their
         seats, in ascending order of the copies. `infos["env_id"]` has the numbers of the copies, int64. The arrays are
@@ -288,7 +288,7 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
     # ---------------------------------------------------------------- inside
 
     def _step(self, lanes: Sequence[int], actions: Any, *, together: bool) -> None:
-        """Order the copies of these lanes to step. `together`: no other lane is stepped before these have come back."""
+        """Order the copies of these lanes to step. If `together`, no other lane steps before these come back."""
         arrays = action_arrays(actions, self._read_actions, self._action_leaves, self.num_envs)
         self._send_recv.step(lanes, arrays, self._layout.rows, together=together)
 
@@ -303,7 +303,7 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
             raise AlreadyPendingCallError(f"{doing} while copies {copies} have not come back: expected recv() first", "send")
 
     def _wait(self, awaited: AsyncState, timeout_s: float | None) -> GymnasiumStep:
-        """Wait for the pending step or reset. Raises `NoAsyncCallError` unless `awaited` is what is pending."""
+        """Wait for the pending step or reset. Raises `NoAsyncCallError` unless the call `awaited` is pending."""
         if self.closed:
             raise ClosedEnvironmentError(f"{awaited.value}_wait after close()")
         if self._state is not awaited:

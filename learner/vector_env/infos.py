@@ -20,7 +20,7 @@ log = logging.getLogger("millrace.learner")
 class OfSomeRows(VectorEnv[Any, Any, Array]):
     """Merges the infos of some rows, as gymnasium's vector environments merge those of all rows."""
 
-    closed = True  # so that nobody tries to close it
+    closed = True  # so that no code tries to close it
 
     def __init__(self, count: int) -> None:
         self.num_envs = count
@@ -33,7 +33,7 @@ class InfoReader:
         """`refuse` is called with a lane whose infos cannot be read, and the reason."""
         self._layout = layout
         self._refuse = refuse
-        self._warned: set[str] = set()  # keys of infos that were logged because they arrived as their repr
+        self._warned: set[str] = set()  # keys of infos about which the log has warned, because their values arrived as texts
 
     def by_row(self, ready: Ready) -> dict[int, Infos]:
         """The infos that are not empty, by row, in the order of the rows."""
@@ -67,7 +67,7 @@ def merged(by_row: Mapping[int, Infos], env: VectorEnv[Any, Any, Array], rows: S
 
 
 def unpack_infos(packed: bytes, rows: Sequence[int]) -> dict[int, Infos]:
-    """The infos of a lane with these rows, by row. Raises `BadMessage` for bytes that aren't infos."""
+    """Unpack the infos of a lane that has these rows. Returns them by row. Raises `BadMessage` if that is impossible."""
     try:
         pairs = [(n, info) for n, info in unpack(packed)]
     except (TypeError, ValueError) as error:

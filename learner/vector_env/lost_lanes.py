@@ -19,7 +19,7 @@ UNKNOWN_REASON = "its worker is gone"
 
 
 class LostLanes:
-    """The lanes whose loss has not been reported yet, and the lanes that have been reported and not been reset yet."""
+    """The lanes whose loss has not been reported yet, and those whose loss was reported but that were not reset yet."""
 
     def __init__(self) -> None:
         self._unreported: dict[int, str] = {}  # by lane, why it was lost
@@ -40,7 +40,7 @@ class LostLanes:
         self._unreported |= lost
 
     def expect_reset(self, lanes: Iterable[int]) -> None:
-        """Record that the caller knows of the loss of these lanes, so they wait for a reset."""
+        """Record that the caller knows that these lanes were lost. They now wait for a reset."""
         self._awaiting_reset.update(lanes)
 
     def answered(self, lanes: AbstractSet[int]) -> None:
@@ -53,9 +53,10 @@ class LostLanes:
             self._unreported.pop(lane, None)
 
     def report(self, unanswered: Sequence[int]) -> dict[int, str]:
-        """Report lanes that were lost instead of answering this step. Returns why. From now on they wait for a reset.
+        """Report the lanes that were lost instead of answering this step. Returns the reasons, by lane.
 
-        A lane that was lost after it answered this step is reported in the next step.
+        From now on, these lanes wait for a reset. A lane that was lost after it answered this step is reported in the next
+        step.
         """
         reported = {lane: self._unreported.pop(lane, UNKNOWN_REASON) for lane in unanswered}
         self.expect_reset(reported)
@@ -63,7 +64,7 @@ class LostLanes:
 
 
 def replacement_seeds(seeds: Iterable[int | None], incarnation: int) -> tuple[int | None, ...]:
-    """Seeds for copies that replace lost ones. They differ from the old seeds, and are the same if this loss is repeated."""
+    """Seeds for copies that replace lost ones. They differ from the old seeds and depend on nothing else."""
     return tuple(None if seed is None else env_seed(seed, Purpose.REPLACEMENT, incarnation) for seed in seeds)
 
 

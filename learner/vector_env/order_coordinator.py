@@ -3,7 +3,7 @@
 Rule: an order goes to one lane, and a lane has one order at a time; lanes do not wait for each other. Either the order is
 answered, or its lane is lost with its worker. A lost lane starts again on new env copies, in its next incarnation. If a
 Heartbeat shows that an order was lost on the way, the order is sent again. Steps through shared memory don't count as orders
-here; only if their infos are too long for the shared memory, these arrive as messages.
+here. If the infos of such a step are too long for the shared memory, they arrive as a message.
 """
 
 from __future__ import annotations
@@ -62,13 +62,13 @@ class OrderCoordinator(Coordinator[Member]):
         self.spec = spec
         self.lanes = [OrderedLane(lane) for lane in range(len(spec.lanes))]
         self.orders: dict[int, Order] = {}
-        """Orders that have been sent and not been answered, by ticket."""
+        """The orders that were sent and have not been answered, by ticket."""
         self.answers: dict[int, Answer] = {}
-        """Answers by lane, until the next orders."""
+        """The newest answer of each lane, by lane, until `forget` removes it."""
         self.shared_orders: dict[int, int] = {}
-        """Number of the step through shared memory that is under way, by lane."""
+        """By lane, the number of its step through shared memory that is under way."""
         self.infos: dict[int, bytes] = {}
-        """Packed infos of such a step, by lane, if they arrived as a message."""
+        """By lane, the packed infos of that step, if they arrived as a message."""
         self.lost: dict[int, str] = {}
         """Lanes whose env copies are gone, with the reason, until the vector environment has handled them."""
         self._placement = LanePlacement(self.lanes, _by_name)
@@ -91,13 +91,13 @@ class OrderCoordinator(Coordinator[Member]):
         return lost
 
     def forget(self, lane: int) -> None:
-        """Forget the answer to the last order of a lane, which the caller has taken."""
+        """Forget the answer to a lane's last order, because the caller has taken it."""
         self.answers.pop(lane, None)
         self.shared_orders.pop(lane, None)
         self.infos.pop(lane, None)
 
     def place(self, lane: int, patient: bool) -> bool:
-        """Assign the lane to a worker. Returns False if there is none or, if `patient`, if each already has a lane."""
+        """Assign the lane to a worker. Returns False if there is no worker, or if `patient` and each has a lane."""
         if self.lanes[lane].owner is not None:
             return True
         candidates = [member for member in self.membership.active() if not (patient and member.lanes)]

@@ -82,10 +82,10 @@ class SendRecv:
     # ---------------------------------------------------------------- out
 
     def reset(self, copies: Sequence[int], seeds: Sequence[int | None], options: Options) -> None:
-        """Begin episodes in these copies. `seeds`, and `options` if it is a list, have an entry for every copy there is.
+        """Begin episodes in these copies. `seeds`, and `options` if it is a list, have an entry for every copy.
 
-        Raises `TypeError` for options that aren't plain data. With SameStep, raises `UsageError` for only some copies of a
-        lane that was lost, because no step would reset the others.
+        Raises `TypeError` for options that aren't plain data. With SameStep, raises `UsageError` if `copies` has only some
+        copies of a lane that was lost, because no step would reset the others.
         """
         parts = self._parts
         layout = self._parts.layout
@@ -117,8 +117,8 @@ class SendRecv:
     ) -> None:
         """Step these lanes.
 
-        `actions` are the arrays of actions, in which `at[lane]` are the rows of a lane, and whether they fit into shared
-        memory without rounding. `together` says that `recv_all` will take the results.
+        `actions` is a pair: the arrays of actions, and whether shared memory can hold them without rounding. `at[lane]`
+        selects a lane's rows in these arrays. `together` says that `recv_all` will take the results.
 
         Raises `UsageError` for copies that must be reset first, and, with `on_worker_loss="raise"`, `WorkerLost` for copies
         that were lost. If it raises, nothing is sent.
@@ -138,7 +138,7 @@ class SendRecv:
         for lane in lanes:
             if lane in unreported:
                 continue  # this step reports the loss in place of a result
-            if lane in awaiting_reset:  # just as in NextStep mode, the step after a truncation resets
+            if lane in awaiting_reset:  # in NextStep mode, the step after a truncation resets, too
                 hub.send_order(lane, parts.reset_of_new_copies(lane).order())
             elif fit and hub.can_share(lane):
                 shared.append(lane)
@@ -165,7 +165,7 @@ class SendRecv:
     # ---------------------------------------------------------------- in
 
     def recv(self, min_envs: int, timeout_s: float | None = None) -> tuple[Ready, list[int]]:
-        """Wait until at least `min_envs` copies are ready. Returns the lanes that are, and the numbers of their copies.
+        """Wait until at least `min_envs` copies are ready. Returns the ready lanes, and the numbers of their copies.
 
         Raises `EnvironmentFailed`, `WorkerLost` and `NoWorkers`. If it raises, the next call can still take lanes that are
         ready.
@@ -203,7 +203,7 @@ class SendRecv:
         return sent.take()
 
     def recv_some(self, lanes: Sequence[int]) -> Ready:
-        """Wait until these lanes are ready, and take them; others stay. Raises as `recv_all`, and abandons as it does."""
+        """Like `recv_all`, but waits for these lanes only, and takes no others. After an error, it gives up on all lanes."""
         try:
             self.look(self.timeout_s)
             while not self._sent.are_ready(lanes):
@@ -327,12 +327,12 @@ class SendRecv:
                 case AfterLoss.RAISE:
                     self._to_raise[lane] = parts.lost_lanes.unreported[lane]
                     if asked is not Asked.CALL or parts.on_worker_loss == "raise":
-                        parts.lost_lanes.report([lane])  # otherwise the caller may continue, and the next step reports it
+                        parts.lost_lanes.report([lane])  # after other calls, the next step reports the loss
                     sent.drop(lane)
                 case AfterLoss.RESET_AGAIN:
                     assert isinstance(asked, AskedReset)
                     if len(asked.copies) == len(copies):
-                        parts.lost_lanes.forget([lane])  # otherwise the next step reports the copies that were not reset
+                        parts.lost_lanes.forget([lane])  # all copies are reset; otherwise the next step reports the others
                     self._reset_instead(lane, asked, {})
                 case AfterLoss.RESET_NEW_COPIES:
                     self._warn(lane, parts.lost_lanes.report([lane])[lane])

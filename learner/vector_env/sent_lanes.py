@@ -38,7 +38,7 @@ class AskedReset:
 
 
 class Asked(Enum):
-    """The other orders that a lane can be sent, which are not repeated."""
+    """The orders other than resets that a lane can be sent. They are not repeated after a loss."""
 
     STEP = 0
     CALL = 1
@@ -123,11 +123,11 @@ class SentLanes:
         return self._copies(sorted(self._results))
 
     def among(self, lanes: Iterable[int]) -> list[int]:
-        """The lanes among these that have not come back."""
+        """Those of these lanes that have not come back."""
         return [lane for lane in lanes if lane in self.sent] if self.sent else []
 
     def send(self, lanes: Iterable[int], sent: Sent) -> None:
-        """Record that these lanes were sent an order. Raises `ValueError` if one has not come back from an earlier order."""
+        """Record that these lanes were sent an order. Raises `ValueError` if one still has an earlier order."""
         if early := self.among(lanes):
             raise ValueError(f"lanes {early}: expected some that have come back, got some that have not")
         self.sent |= dict.fromkeys(lanes, sent)
@@ -180,7 +180,7 @@ class SentLanes:
         return ready
 
     def take_some(self, lanes: Iterable[int]) -> Ready:
-        """Those of these lanes that are ready. They have come back now; other lanes stay ready."""
+        """Take those of these lanes that are ready. They now count as having come back; other ready lanes stay."""
         taken = [lane for lane in sorted(lanes) if lane in self._results]
         rows = self._layout.rows_of(self._layout.copies_of(taken)) if self._losses else ()
         for lane in taken:
@@ -212,7 +212,7 @@ class WatchedTime:
         self._total_s = 0.0
 
     def look(self, now: float) -> float:
-        """Seconds watched until now."""
+        """Record that somebody looks now. Returns the number of seconds that were watched until now."""
         self._total_s += min(now - self._looked_s, LONGEST_GAP_S)
         self._looked_s = now
         return self._total_s

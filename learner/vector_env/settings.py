@@ -41,7 +41,7 @@ class VectorEnvSettings:
     on_worker_loss: Literal["truncate", "raise"] = "truncate"
     timeout_s: float = 60.0
     worker_timeout_s: float = 5.0
-    """A worker elsewhere is lost if it is silent for this many seconds while the learner listens."""
+    """A worker that was started elsewhere is lost if it is silent for this many seconds while the learner listens."""
     call_timeouts: CallTimeouts = field(default_factory=CallTimeouts)
     """How long a call of the environment may take before its worker is ended."""
     max_env_failures: int = 3
@@ -60,7 +60,7 @@ class VectorEnvSettings:
     """Whether all copies are for evaluations."""
 
     def __post_init__(self) -> None:
-        if not self.timeout_s > 0:  # also true for NaN
+        if not self.timeout_s > 0:  # this way, NaN is refused, too
             raise UsageError(f"timeout: expected a number of seconds above 0, got {safe_repr(self.timeout_s)}")
         if self.workers is not None and self.workers < 0:
             raise UsageError(f"workers: expected at least 0, got {self.workers}")

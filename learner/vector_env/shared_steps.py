@@ -27,12 +27,12 @@ class SharedSteps:
         """
         self.memory = memory
         self.under_way: dict[int, int] = {}
-        """the number of the order of each lane whose step is under way, by lane"""
+        """by lane, the number of the order whose step is under way"""
         self._to_workers = to_workers
         self._to_learner = to_learner
         self._spin_s = spin_s
         self.pipes: dict[int, WakePipe | None] = {}
-        """the pipe that wakes each lane's worker, by lane; None if that worker doesn't have the memory"""
+        """by lane, the pipe that wakes its worker; None if that worker doesn't have the memory"""
         self._spin = SpinWait()
 
     def opened(self, lane: int, worker: str) -> None:
@@ -52,7 +52,7 @@ class SharedSteps:
         return {lane: memory.infos(lane) for lane, number in self.under_way.items() if memory.answered(lane) == number}
 
     def is_done(self, lane: int) -> bool:
-        """Whether the lane's step, which is under way, is done."""
+        """Whether the lane's step is done. Call this only while a step of the lane is under way."""
         return self.memory.answered(lane) == self.under_way[lane]
 
     def worker_left(self, lane: int) -> None:
@@ -68,7 +68,7 @@ class SharedSteps:
     def spin(self, *, together: bool) -> bool:
         """Spin for a short time until all lanes that are under way are done or, unless `together`, until one of them is.
 
-        Returns whether they are.
+        Returns whether this has happened.
         """
         if not self._spin_s:
             return False
@@ -84,7 +84,7 @@ class SharedSteps:
     def sleep(self, link: LearnerLink, timeout_s: float, *, together: bool) -> bool:
         """Sleep until a worker wakes this process, at most for `timeout_s`. Returns whether a message may have arrived.
 
-        Unless `together`, the arrival of a message wakes it, too.
+        Unless `together`, the arrival of a message also wakes this process.
         """
         if together:
             return not self._to_learner.wait(timeout_s)

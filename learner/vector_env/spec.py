@@ -55,7 +55,7 @@ class RequestedCopies:
     call_timeouts: CallTimeouts
     learner_timeout_s: float
     evaluation_copies: int
-    """how many of the copies, the last ones, play evaluations"""
+    """the number of copies that play evaluations; they are the last ones"""
 
     @property
     def to_describe(self) -> Unknown:
@@ -64,7 +64,7 @@ class RequestedCopies:
 
     @property
     def wait(self) -> WaitSpec:
-        """The spec that welcomes the workers before the spaces of their copies are known."""
+        """The spec that is sent to workers that join before the spaces of the copies are known."""
         return WaitSpec(self.call_timeouts, learner_timeout_s=self.learner_timeout_s)
 
     def description(self, env: DescribedEnv) -> VectorEnvDescription:
@@ -89,7 +89,7 @@ class RequestedCopies:
 
 
 def _identity(spec: EnvSpec) -> tuple[str, PickledCallable | None, str]:
-    """A key that is equal for specs that make the same environment. Wrappers are left out, because all have the same."""
+    """A key that is equal for specs that make the same environment. Wrappers are left out: all copies have the same."""
     return spec.id, spec.factory, repr(spec.kwargs)
 
 

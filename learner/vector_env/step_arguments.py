@@ -43,8 +43,8 @@ Options = dict[str, Any] | list[dict[str, Any] | None] | None
 def take_reset_mask(options: Options, num_envs: int) -> tuple[Bools, Options]:
     """The env copies to reset, and the options without the mask. Without a mask all copies are reset.
 
-    Raises `TypeError` for a mask that isn't a bool array, and `ValueError` for a mask of a wrong shape or without True and
-    for a list of options of a wrong length.
+    Raises `TypeError` for a mask that isn't a bool array. Raises `ValueError` for a mask that has a wrong shape or no True,
+    and for a list of options that has a wrong length.
     """
     if isinstance(options, list) and len(options) != num_envs:
         raise ValueError(f"options: expected one for each of {num_envs} copies, got {len(options)}")
@@ -61,7 +61,7 @@ def take_reset_mask(options: Options, num_envs: int) -> tuple[Bools, Options]:
 def reset_arguments(
     env_ids: Any, seed: int | Sequence[int | None] | None, options: Options, num_envs: int
 ) -> tuple[list[int], list[int | None], Options]:
-    """The copies to reset, a seed for every copy there is, and the options without the mask.
+    """The copies to reset, a seed for every copy of the environment, and the options without the mask.
 
     Raises what `seed_list`, `take_reset_mask` and `numbered` raise, and `ValueError` if there are both `env_ids` and a mask.
     """

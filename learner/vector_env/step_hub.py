@@ -31,7 +31,7 @@ POLL_S = 0.05  # interval at which to check whether a child process has ended
 LISTEN_EVERY_S = 0.5  # interval at which heartbeats are answered while steps go through shared memory
 # How long a lost lane waits for a restarted worker, at most half the timeout, before it goes to a worker that has lanes.
 PATIENCE_S = 10.0
-BUSY_S = 1.0  # how long closing waits for a step under way: no longer, because the step may hang, and nobody uses its result
+BUSY_S = 1.0  # how long closing waits for a step under way, which may hang and whose result nobody uses
 
 
 class StepHub:
@@ -68,19 +68,19 @@ class StepHub:
             self._under_way = self.coordinator.shared_orders = shared.under_way
         self._processes = processes
         self._waiting_orders: dict[int, MakeOrder] = {}  # by lane, an order to send as soon as the lane has a worker
-        self._waiting_since_s: dict[int, float] = {}  # by lane, since when such an order has waited
+        self._waiting_since_s: dict[int, float] = {}  # by lane, the time at which that order began to wait
         self._newest_tickets: dict[int, int] = {}  # by lane, the ticket of its newest order, if the answer is still wanted
         self._infos_to_come: set[int] = set()  # lanes whose step is done, and whose infos arrive later as a message
         self._patience_s = PATIENCE_S
         self._listen_due_s = 0.0
         self._failure: Failed | None = None  # the first failure since the last `raise_failure`
-        # Losing a worker costs the user episodes. So after this process was away, a worker has its whole timeout to be heard
-        # again, not only the server's short grace: after a long suspension, it must even reconnect.
+        # Losing a worker costs the user episodes. So after this process was away, each worker gets its whole timeout to be
+        # heard again, instead of the server's short grace. After a long suspension, it must even reconnect.
         settings = ServerSettings(grace_s=worker_timeout_s, log_tracebacks=False)
         self._server = MemberServer(link, self.coordinator, self, processes, settings, clock)
 
     def take_over(self, waiting: Membership[Member]) -> None:
-        """Take over the workers that wait for the vector environment, which begins for them."""
+        """Begin the vector environment for the workers that wait for it."""
         self._server.send(self.coordinator.take_over(waiting, self.now()))
 
     @property
@@ -104,7 +104,8 @@ class StepHub:
     def can_share(self, lane: int) -> bool:
         """Whether a step of this lane may go through shared memory: its worker has the memory, and the lane has no order.
 
-        The lane still has an order if the wait for its answer was interrupted. The worker might execute it after the step.
+        The lane still has an order if the wait for the answer was interrupted. The worker might execute that order after the
+        step.
         """
         shared = self.shared
         coordinator = self.coordinator
@@ -157,7 +158,7 @@ class StepHub:
     # ---------------------------------------------------------------- waiting
 
     def listen_if_due(self) -> None:
-        """Send the orders that can be sent, and read the messages that have arrived if some may matter."""
+        """Send the orders that can be sent. Read the messages that have arrived, if any of them may matter now."""
         self._send_waiting_orders()
         if self._waiting_orders or self.coordinator.orders or self.now() > self._listen_due_s:
             self._turn(0.0)
@@ -202,7 +203,7 @@ class StepHub:
             self._server.send(self.coordinator.reject_message(member.peer, why, self.now()))
 
     def rebalance(self) -> None:
-        """Even out the lanes of the workers. Call it when all lanes are about to be reset."""
+        """Even out the lanes of the workers. Call this only when all lanes are about to be reset."""
         self._turn(0.0)
         if self.shared is not None:
             self.shared.lanes_move()
@@ -234,7 +235,7 @@ class StepHub:
         self._processes.stop(max(0.0, deadline_s - self.now()))
         self._server.close()
 
-    # ---------------------------------------------------------------- what the server asks and tells
+    # ---------------------------------------------------------------- called by the server
 
     def status(self, now: float) -> Status:
         """The answer to `millrace status`."""

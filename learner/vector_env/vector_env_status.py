@@ -24,7 +24,7 @@ def status(coordinator: OrderCoordinator, now: float, of_run: Callable[[float], 
         return replace(of_run(now), workers=workers)
     steps = sum(member.heartbeat.steps for member in members if member.heartbeat is not None)
     progress = RunProgress(
-        env_steps=min(steps, LARGEST),  # workers may report anything
+        env_steps=min(steps, LARGEST),  # bounded, because workers may report any number
         steps_per_s=max(-LARGEST, min(sum(row.steps_per_s for row in workers), LARGEST)),
     )
     envs = ", ".join(dict.fromkeys(env.id for env in coordinator.spec.envs))
