@@ -17,7 +17,7 @@ THREAD = "imports"
 
 
 class ImportsAhead:
-    """The imports of one run, which begin at once."""
+    """The imports of one run, which begin when this object is made."""
 
     def __init__(self, algo: str) -> None:
         # The module of a user-defined algorithm has already been imported, for its settings.

@@ -22,7 +22,7 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 FOR_SAVING = 0.5  # the share of the grace time that an update must leave for saving
 SAVE_TAKES = 1.5  # the time allowed for saving, as a multiple of the longest save so far
 
-_stopped = False  # whether `Stopped` was raised, because other code, such as an import or a finalizer, may have swallowed it
+_stopped = False  # whether `Stopped` was raised; other code, such as an import or a finalizer, may have swallowed it
 Handler = Callable[[int, FrameType | None], None] | signal.Handlers
 
 

@@ -1,7 +1,7 @@
 """Assembles a run: the algorithm, the hub, and everything that happens between two updates.
 
-This file imports PyTorch. `learner/run_setup.py` has the parts that must exist before. For a resumed run, nothing is written
-before all checks have passed.
+This file imports PyTorch. `learner/run_setup.py` has the parts that must exist earlier. For a resumed run, nothing is
+written before all checks have passed.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def open_run(setup: RunSetup, lobby: Lobby, watch: Watch, observer: HubObserver)
     """
     callbacks = Callbacks.of(watch).with_named(setup.config.callbacks)
     if setup.config.tensorboard:
-        callbacks.add(started_by("tensorboard")(setup.folder))  # last, so that it gets the numbers that the others log
+        callbacks.add(started_by("tensorboard")(setup.folder))  # last, so that it gets the numbers that other callbacks log
     if line := unused_setting(setup.config):
         log.warning("%s", line)
     with naming_run(setup.folder.shown if setup.resumed else None):

@@ -37,7 +37,7 @@ POLICY = 1
 
 
 class SavedPolicy(NamedTuple):
-    """A policy of a run folder, and the environment for which it was trained."""
+    """A policy from a run folder, and the environment for which it was trained."""
 
     spec: PolicySpec
     env: EnvSpec

@@ -1,8 +1,9 @@
 """Checks the calls in a checkpoint's pickle before torch's loader makes them. Pure.
 
 Rule: a pickle may contain only what torch.save writes for tensors and plain data. torch's loader for untrusted files
-(`weights_only`) doesn't run their code, but it calls `bytearray` with any length, and copies a container or a text as many
-times as the file says, so a few bytes could fill the memory. This file interprets the pickle without making its objects.
+(`weights_only`) doesn't run code from them, but it calls `bytearray` with any length, and copies a container or a text as
+many times as the file says, so a few bytes could fill the memory. This file interprets the pickle without making its
+objects.
 """
 
 from __future__ import annotations
@@ -20,9 +21,9 @@ protocol 2."""
 REBUILD = {f"torch._utils {name}" for name in ("_rebuild_tensor_v2", "_rebuild_tensor_v3", "_rebuild_parameter")}
 """Functions that make a view of a storage. torch checks the size of the view when it makes it."""
 HOOKS = "collections OrderedDict"  # the empty dict of a tensor's hooks
-BYTES = "_codecs encode"  # makes a bytes object, which is written as text
+BYTES = "_codecs encode"  # makes a bytes object, whose content the pickle holds as text
 CALLED = REBUILD | {HOOKS, BYTES}
-TYPES = ("torch ", "torch.storage ")  # how the names of storage types and dtypes begin, which aren't called
+TYPES = ("torch ", "torch.storage ")  # prefixes of the names of storage types and dtypes, which aren't called
 
 
 class Unfit(Exception):

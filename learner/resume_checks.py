@@ -108,7 +108,7 @@ def _with_present_names(before: Config, now: Config) -> Config:
 
 
 def _is_finished(config: Config, folder: RunFolder) -> bool:
-    """Whether the run has nothing left to do, because the reason for which it ended holds with this configuration, too."""
+    """Whether the run has nothing left to do, because the reason why it ended also holds with this configuration."""
     summary = folder.summary()
     if summary is None or summary.evaluation is None:
         return False

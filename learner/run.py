@@ -26,7 +26,7 @@ class OpenRun:
     evaluations: Evaluations
     """evaluates the policy"""
     prior: PriorData | None = None
-    """the dataset that the run learns from besides its own rollouts, if there is one"""
+    """the dataset, if there is one, that the run learns from in addition to its own rollouts"""
 
     def check_time(self) -> None:
         """Raise `Interrupted` if the grace time of an interrupted run is up."""

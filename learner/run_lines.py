@@ -1,7 +1,7 @@
 """The line that sums up a run: its state, its progress and its return. For this, only a few files of a run folder are read.
 
-Rule: a folder that can't be read gets a line, too, which says why. Nothing records that a run died, so this is inferred if
-no process trains the run and it has no results.
+Rule: a folder that can't be read gets a line, too, which says why. Nothing records that a run died. So a run counts as dead
+if no process trains it and it has no results.
 """
 
 from __future__ import annotations

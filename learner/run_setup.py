@@ -46,7 +46,7 @@ log = logging.getLogger("millrace.learner")
 
 
 def stopped(resumed: Path | None) -> KeyboardInterrupt:
-    """The exception to raise if the user stops the program before it trains. `resumed` is the run to resume, if any."""
+    """The exception to raise if the user stops the program before training. `resumed` is the run to resume, if any."""
     return KeyboardInterrupt() if resumed is None else Interrupted(resumed)
 
 
@@ -78,7 +78,7 @@ class RunSetup:
     """The learner processes of a run with shards, which share the updates."""
 
     def announce(self, bound: Bound) -> None:
-        """Write the learner's address, which `millrace status` asks, to the lock of the run, or why it can't be asked."""
+        """Write to the run's lock the address at which `millrace status` asks the learner, or why it can't be asked."""
         address = bound.link.address
         keyring = bound.keyring
         lock = self.folder.lock

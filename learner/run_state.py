@@ -53,9 +53,9 @@ class RunState(msgspec.Struct, kw_only=True):
     """The next incarnation of each lane."""
     rounds: RoundsState = RoundsState()
     lanes: Any = ()
-    """The past of each lane, a sequence of `LanePast`."""
+    """The past of each lane, as a sequence of `LanePast`."""
     acting: Any = ()
-    """The weights that act in open rounds, without the newest, a sequence of `Weights`."""
+    """The weights that act in open rounds, except the newest, as a sequence of `Weights`."""
     episodes: list[Episode] = []
     """The episodes of the `EpisodeWindow`."""
     facts: list[str] = []
@@ -171,7 +171,7 @@ def start_from(config: Config, policy: PolicySpec, algorithm: Algorithm) -> str:
 
 
 def _of_policy_alone(config: Config, policy: PolicySpec, parameters: Floats, buffers: Floats) -> dict[str, Any]:
-    """The `Start.state` if only a policy is known. Its statistics weigh as much as all observations of the new run will."""
+    """The `Start.state` if only a policy is known. Its statistics count as much as all observations of the new run."""
     import torch
 
     state: dict[str, Any] = {"parameters": torch.from_numpy(parameters)}

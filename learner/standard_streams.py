@@ -17,7 +17,7 @@ from typing import Literal, TextIO
 
 
 def prepare_streams() -> None:
-    """Open the null device in place of each of standard input, output and error that is closed.
+    """Open the null device in place of each standard stream (input, output or error) that is closed.
 
     From now on, characters that the encoding of standard output or error lacks are escaped.
     """
@@ -30,7 +30,7 @@ def prepare_streams() -> None:
         stream = getattr(sys, name)
         if stream is None:
             setattr(sys, name, _writer(number, "utf-8"))
-        elif isinstance(stream, io.TextIOWrapper):  # unlike the stream of a notebook
+        elif isinstance(stream, io.TextIOWrapper):  # not so in a notebook
             stream.reconfigure(errors="backslashreplace")
 
 
@@ -58,7 +58,7 @@ def never_fails(stream: TextIO) -> TextIO:
 
 
 def _writer(number: int, encoding: str) -> TextIO:
-    binary = io.BufferedWriter(DroppingFile(number))  # type: ignore[type-var]  # the type asks for methods nobody calls
+    binary = io.BufferedWriter(DroppingFile(number))  # type: ignore[type-var]  # the type requires methods that nobody calls
     return io.TextIOWrapper(binary, encoding, "backslashreplace", line_buffering=True)
 
 

@@ -70,7 +70,7 @@ def train(run: OpenRun, workers: int, cores: CrowdedCores) -> str:
         audience.start()
         tell(evaluations.begin_again(audience.env_attributes(), audience.show_now))
         publish(acting_weights(algorithm, policy))
-        if tally.evaluation_is_due():  # if the run was interrupted before this evaluation
+        if tally.evaluation_is_due():  # true if the run was interrupted before this evaluation
             tell(evaluations.evaluate_when_due(audience.show_now))
         while (reason := tally.stop_reason()) is None:
             arrived = hub.gather(audience.show_now)
@@ -91,7 +91,7 @@ def train(run: OpenRun, workers: int, cores: CrowdedCores) -> str:
             tally.updated(time.monotonic() - began_s)
             audience.updated(metrics | tally.ratings())
             if tally.evaluation_is_due():
-                files.save()  # an evaluation may take long
+                files.save()  # before the evaluation, which may take long
                 tell(evaluations.evaluate_when_due(audience.show_now))
             else:
                 files.save_if_due()

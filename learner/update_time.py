@@ -26,7 +26,7 @@ from millrace.protocol.specs import PolicySpec
 
 SMALL_REPLAY = 20_000  # the largest capacity of the replay buffer, in transitions
 LEAST_UPDATES = 2
-AT_MOST = 4.0  # no update is begun after this many times the given seconds
+AT_MOST = 4.0  # no update begins later than this multiple of the given seconds
 
 
 class UpdateTime(NamedTuple):
@@ -35,7 +35,7 @@ class UpdateTime(NamedTuple):
     per_step_s: float
     """the median time of an update, without delays by other processes, divided by the env steps of its batch"""
     cores: float
-    """the median CPU time of an update, divided by its time"""
+    """the median, over the updates, of an update's CPU time divided by its duration"""
 
 
 def update_time(

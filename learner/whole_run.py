@@ -1,6 +1,7 @@
 """Trains a run to its end, and tells the workers, the callbacks and the user how it ended.
 
-Rule: of several errors, the one that ended the run is raised. Errors that occur while others are told are only logged.
+Rule: of several errors, the one that ended the run is raised. Errors that occur while workers and callbacks are told are
+only logged.
 """
 
 from __future__ import annotations

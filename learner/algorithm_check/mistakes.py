@@ -46,7 +46,7 @@ from millrace.protocol.specs import PolicySpec
 
 MOST_STEPS = 64  # the most steps of a rollout in this check
 MOST_WARM_UP = 24  # the most updates before the first gradient step, because an algorithm may fill a replay buffer first
-MORE_UPDATES = 3  # number of updates after the first gradient step
+MORE_UPDATES = 3  # number of updates that follow the first gradient step
 TOTAL_STEPS = 20_000  # env steps of the toy run, for schedules
 LEARNING_STEPS = 40_000  # env steps within which the identity environment must be learned
 LEARNED = 0.5  # the mean reward to reach, as a fraction of the way from random actions to perfect ones
@@ -235,7 +235,7 @@ def rows_that_are_not_valid_change_nothing(subject: Subject) -> Iterator[str]:
 def what_is_carried_passes_through_rows_that_are_not_valid(subject: Subject) -> Iterator[str]:
     """Check that rows in which a seat waits, between two of its own rows, change no metric of an actor-critic.
 
-    Algorithms with a replay buffer are not compared, because they may draw other rows then.
+    Algorithms with a replay buffer are not checked, because they may then draw other rows.
     """
     if not issubclass(subject.algorithm, ActorCritic):
         return
@@ -300,7 +300,7 @@ def a_saved_state_goes_on_as_if_nothing_had_happened(subject: Subject) -> Iterat
 
 
 def an_update_can_be_taken_back(subject: Subject) -> Iterator[str]:
-    """Check `roll_back` after a whole update and after one that stopped in the middle, and the update that follows."""
+    """Check `roll_back`, after a whole update and after one that stopped in the middle. Also check the update after it."""
     *first, second, third = subject.copies()
     disturbed = subject.new()
     undisturbed = subject.new()

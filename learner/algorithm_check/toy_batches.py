@@ -57,8 +57,8 @@ def noise_batch(acting: ToyActor, steps: int, generator: np.random.Generator, fr
 def identity_batch(acting: ToyActor, steps: int, generator: np.random.Generator) -> tuple[Batch, float]:
     """A batch of the identity environment, in which the right action is the one that is observed, and its mean reward.
 
-    Each episode has one step. A discrete action gets 1 if it is the right one. Numbers get minus their squared distance from
-    the observation. Both rewards are added up for a Dict or Tuple.
+    Each episode has one step. A discrete action gets 1 if it is the right one. A Box action gets minus its squared distance
+    from the observation. For a Dict or Tuple, the two rewards are added.
     """
     columns = LANES * COPIES
     choice = generator.integers(0, CHOICES, (steps + 1, columns))
@@ -83,8 +83,8 @@ def identity_batch(acting: ToyActor, steps: int, generator: np.random.Generator)
 def with_other_invalid_rows(batch: Batch, generator: np.random.Generator) -> Batch:
     """The same batch with other finite values on rows that are not valid.
 
-    Their observations stay, because they also belong to the previous row, which bootstraps from them. Only after a
-    termination, where nothing bootstraps, are they changed, too.
+    Their observations stay, because they also belong to the previous row, which bootstraps from them. After a termination,
+    where nothing bootstraps, the observations are changed, too.
     """
     other = generator.permutation(batch.action.reshape(-1, *batch.action.shape[2:])).reshape(batch.action.shape)
     if batch.action.dtype == np.int64:

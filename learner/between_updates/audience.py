@@ -101,7 +101,7 @@ class Audience:
             self._write_logged()
 
     def evaluated(self, metrics: Row | None = None) -> None:
-        """Report an evaluation. Without `metrics`, only the numbers that callbacks log are added to its update's row."""
+        """Report an evaluation. Without `metrics`, only the numbers that callbacks log are added to the update's row."""
         progress = self.progress()
         if metrics is not None:
             self._write_row(progress, metrics)

@@ -5,8 +5,8 @@ upwards, and so is an evaluation that ended the run, because it reached the targ
 best policy, and for the final policy of such a run, the summary reports a second evaluation, on other episodes.
 
 Rule: without `eval_workers`, training waits for each evaluation. With them, evaluations run alongside training: the result
-of one counts when the next one is due, or at the end, and the run waits for it there. So the course of a run doesn't depend
-on speed. The evaluated policy is kept until then.
+of an evaluation counts when the next one is due, or at the end of the run, and the run then waits for it. So the course of a
+run doesn't depend on speed. The evaluated policy is kept until its result counts.
 """
 
 from __future__ import annotations
@@ -44,13 +44,13 @@ class Evaluations:
         self._time_limit = time_limit
         self._tally = run.tally
         self._state = run.tally.state
-        self.write_best()  # the folder may have that of a later update, which a resumed run has lost
+        self.write_best()  # the folder may have the best policy of a later update, which a resumed run has lost
 
     def begin_again(self, env_attributes: Array | None, watch: Callable[[], None]) -> Row | None:
         """Restart the evaluation that was running alongside training when the run was interrupted. Publishes its weights.
 
         If the run was resumed without `eval_workers`, this also waits for the evaluation and returns its metrics.
-        `env_attributes` are those of the newest weights; if these are the ones to evaluate, they are sent only once.
+        `env_attributes` are those of the newest weights; if these weights are the ones to evaluate, they are sent only once.
         """
         if (pending := self._state.pending) is None:
             return None

@@ -1,4 +1,4 @@
-"""Writes the files of a run: rows of metrics, checkpoints, policies and the summary. Deleted files are written again.
+"""Writes the files of a run: rows of metrics, checkpoints, policies and the summary. Rewrites deleted files.
 
 Rule: a checkpoint is written between two updates, never during one, and holds everything that the next update depends on.
 If the disk is full, the run logs a warning and continues; at its end, it fails if its last state can't be written.
@@ -76,7 +76,7 @@ class RunFiles:
         self._schedule.saved(began_s)
         took_s = time.monotonic() - began_s
         grace_s = self._config.grace_s
-        if grace_s and self.longest_save_s <= grace_s < took_s:  # warn once
+        if grace_s and self.longest_save_s <= grace_s < took_s:  # warns only once
             log.warning("a checkpoint takes %.0f s, but --grace-s %g: a SIGTERM may lose work; allow more", took_s, grace_s)
         self.longest_save_s = max(self.longest_save_s, took_s)
         if self._saved == self._position():

@@ -5,7 +5,7 @@ from __future__ import annotations
 from millrace.learner.config.config import Config
 from millrace.learner.run_folder.results import ALL_STEPS_DONE
 
-BY_THE_POLICY_OF = " by the policy of "  # is appended to the reason if training continued during the evaluation
+BY_THE_POLICY_OF = " by the policy of "  # appended to the reason if training continued during the evaluation
 
 
 def reason_to_stop(

@@ -1,8 +1,8 @@
 """Counts the env steps, updates and episodes of one run. The counts decide when it ends, and when an evaluation is due.
 
-Rule: decisions depend on counts alone, so every run with these settings makes the same ones. The seconds of evaluations are
-a stage of their own and do not count as training. `run_folder/checkpoint.py` says when a checkpoint is due. This file uses
-no files and no sockets.
+Rule: decisions depend on counts alone, so every run with these settings makes the same decisions. The seconds of evaluations
+are a stage of their own and do not count as training. `run_folder/checkpoint.py` says when a checkpoint is due. This file
+uses no files and no sockets.
 """
 
 from __future__ import annotations
@@ -114,5 +114,5 @@ class Tally:
         return stages | {f"worker_{name}": s for name, s in snapshot.worker_stages.items()}
 
     def wall_s(self, snapshot: HubSnapshot) -> float:
-        """Seconds of training so far, including those before a resume, without evaluations."""
+        """Seconds of training so far, without evaluations, and including the time before a resume."""
         return self.wall_before_s + snapshot.taken_s - self._started_s - snapshot.evaluate_s

@@ -1,8 +1,8 @@
 """All callbacks of a run as one object. It calls them in order, and remembers whether one of them ended the run.
 
-Rule: exceptions of callbacks pass through, with a note that names the callback. `on_end` is called for every callback that
-was started, even if an earlier one raised. A function among the callbacks is called to show the progress of the run: after
-each update and evaluation, several times a second during an evaluation or a long wait, and at the end.
+Rule: exceptions of callbacks propagate, with a note that names the callback. `on_end` is called for every callback that was
+started, even if an earlier one raised. A function among the callbacks is called to show the progress of the run: after each
+update and evaluation, several times a second during an evaluation or a long wait, and at the end.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ class Callbacks:
             self._call("on_checkpoint", progress)
 
     def on_end(self, progress: Progress) -> None:
-        """Call `on_end` of all started callbacks. Raises the first exception of these; further ones are logged."""
+        """Call `on_end` of all started callbacks. Raises the first exception of these calls; further ones are logged."""
         raised: BaseException | None = None
         calls = [self._show]
         calls += [lambda progress, each=each: _call(each, "on_end", progress) for each in self._started]  # type: ignore[misc]
@@ -133,7 +133,7 @@ def _call(callback: object, moment: str, progress: Progress) -> object:
 
 
 def _method(callback: object, moment: str) -> Callable[[Progress], object] | None:
-    """The method of a callback, unless it is the empty one of `Callback`. For `__call__`, a callback that is a function."""
+    """The method of a callback, unless it is the empty one of `Callback`. For `__call__`, a function itself."""
     if moment == "__call__":
         return None if not callable(callback) or any(hasattr(callback, each) for each in MOMENTS) else callback
     found: Any = getattr(callback, moment, None)

@@ -44,13 +44,13 @@ NEEDED = (
 """The methods that every algorithm needs; `millrace.learner.algorithms.Algorithm` describes them."""
 
 FOR_PRIOR = ("add_prior", "learn_from_prior")
-"""The methods that an algorithm needs in addition in a run with prior data."""
+"""The additional methods that an algorithm needs in a run with prior data."""
 
 NOT_SETTINGS = {"config", "preset", "resume", "log_json", "debug", "progress"}
 """Flags and arguments of `millrace train` and `millrace.train` that are not settings."""
 
 _given: dict[str, type] = {}
-"""The classes that were passed in Python and can't be imported, by name. If several had the same name, the newest."""
+"""The classes that were passed in Python and can't be imported, by name. Of several with the same name, the newest."""
 
 
 def is_own(algo: str) -> bool:
@@ -75,7 +75,7 @@ def own_class(name: str) -> Any:
 
 
 def name_of(algorithm: type) -> str:
-    """The name of a class, for `Config.algo`. By it, this process finds the class, and so do others that can import it.
+    """The name of a class, for `Config.algo`. It leads to the class in this process, and in others that can import it.
 
     Raises `UsageError` if the class lacks something.
     """
@@ -98,7 +98,7 @@ def name_of(algorithm: type) -> str:
 
 
 def moved(before: str, now: str) -> bool:
-    """Whether a run of the algorithm `before` may continue with `now`: the same class, moved to where it can be imported."""
+    """Whether a run of the algorithm `before` may continue with `now`: the same class, but in a module now."""
     module, _, qualname = before.partition(":")
     return (module == "__main__" or "<locals>" in qualname) and is_own(now) and last_part(before) == last_part(now)
 

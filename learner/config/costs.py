@@ -15,8 +15,8 @@ from millrace.protocol.envs.description import DescribedEnv, class_name
 from millrace.protocol.policy.arithmetic import multiply_adds
 from millrace.protocol.specs import PolicySpec
 
-MANY_MULTIPLY_ADDS = 1 << 24  # per observation; Atari's four frames of 84 x 84 take half as many
-PASSES = 3  # cost of a forward and a backward pass, in forward passes: a backward pass costs two
+MANY_MULTIPLY_ADDS = 1 << 24  # per observation; Atari's four frames of 84 x 84 pixels need half as many
+PASSES = 3  # the cost of a forward and a backward pass, in forward passes; a backward pass costs as much as two
 
 
 def minibatch_rows(config: Config) -> int:

@@ -38,7 +38,7 @@ class SettingsLayer(NamedTuple):
     """The settings from one source, with those of the run and those of its algorithm in one mapping."""
 
     where: str
-    """how an error begins: a file, `preset NAME` or `train`; empty for flags, which are recognized by their names"""
+    """how an error begins: with a file, `preset NAME` or `train`; empty for flags, whose names say enough"""
     settings: Mapping[str, Any]
 
     def origin(self, field: FlagField) -> str:
@@ -129,7 +129,7 @@ def config_of_run(run: Path, algo: str | None = None) -> Config:
 
 
 def read_lower_layers(algo: str | None, *, file: Path | None, resume: Path | None, preset: str) -> LowerLayers:
-    """Read the named preset and the file. `algo` is the algorithm that flags or keyword arguments name, if they do.
+    """Read the named preset and the file. `algo` is the algorithm that flags or keyword arguments name, or None.
 
     Raises `UsageError` if the arguments exclude each other, or if a file cannot be read.
     """
@@ -194,7 +194,7 @@ def merged(algo: str, layers: Sequence[SettingsLayer]) -> Config:
                 check_table(plain, origins[name])
                 plain = {**values.get(name, {}), **plain}
             values[name] = plain
-    values["algo"] = algo  # a layer may name another algorithm than the one that counts
+    values["algo"] = algo  # a weaker layer may have named another algorithm
     of_algorithm = {name: values.pop(name) for name in record.__struct_fields__ if name in values}
     algorithm = convert(of_algorithm, record, origins)
     config = convert(values, Config, origins)

@@ -13,8 +13,8 @@ from millrace.protocol.machine.cpu_cores import usable_cores
 def local_workers(config: RolloutConfig, cores: int | None = None) -> int:
     """The number of worker processes. Unless the settings give it, one for each core, but at most one for each lane.
 
-    It is lower if fewer workers are as fast: with 4 lanes, 2 workers are as fast as 3, one of which would step two lanes.
-    `cores` is the number of cores; None means all that this process may use.
+    The number is lower if fewer workers are as fast: with 4 lanes, 2 workers are as fast as 3, one of which would step two
+    lanes. `cores` is the number of cores; None means all that this process may use.
     """
     if config.workers is not None:
         return config.workers

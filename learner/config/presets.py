@@ -59,9 +59,9 @@ def added(table: Mapping[str, object], default: Mapping[str, object]) -> list[st
 def origin(config: Config) -> str:
     """Where the settings of a new run come from, as one line for the user.
 
-    The preset counts as used if some setting has the preset's value and this differs from the default. Without a preset, the
-    line names the settings of the algorithm that differ from the defaults; these were given by the user, or come from a file
-    or from the preset of another environment.
+    The preset counts as used if some setting has the preset's value and that value differs from the default. Without a
+    preset, the line names the settings of the algorithm that differ from the defaults; these were given by the user, or come
+    from a file or from the preset of another environment.
     """
     preset = environment_presets(config.algo).get(config.env)
     mine = _settings(config)

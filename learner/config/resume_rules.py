@@ -17,7 +17,7 @@ import msgspec
 
 
 class OnResume(Enum):
-    """What a resumed run does if a setting gets another value. The value of each member is its text in the documentation."""
+    """What a resumed run does if a setting gets another value. A member's value is its text in the documentation."""
 
     FREE = "Another value takes effect at once."
     ADAPTABLE = "Another value takes effect at once. Lanes whose number of env copies changes begin new episodes."
@@ -42,7 +42,7 @@ class Change(NamedTuple):
 
 @cache
 def declared(record: type[msgspec.Struct], *, by_type: bool = False) -> dict[str, OnResume]:
-    """What a resumed run does if each setting of a record changes, in the order of its fields.
+    """For each setting of a record, in the order of the fields, what a resumed run does if the setting changes.
 
     With `by_type`, for user-defined records, a field need not be declared. An undeclared float is free, because it is
     usually a coefficient; any other field is fixed, because the shape of the weights or of the saved state may depend on

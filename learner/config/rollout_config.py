@@ -188,9 +188,9 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
         return self.replay_limit if self.lost_lanes == "continue" else -1
 
     def stall_timeout_s(self) -> float:
-        """The run ends after this many seconds without a finished env step, reset or construction, which take less each."""
+        """The run ends after this many seconds without a finished env step, reset or construction. Each takes less time."""
         return max(STALL_TIMEOUT_S, self.call_timeouts().longest_s())
 
     def heartbeat_s(self) -> float:
-        """Seconds between two heartbeats of a worker: so few that it doesn't count as silent if some arrive late."""
+        """Seconds between two heartbeats of a worker: so few that it doesn't count as silent even if some arrive late."""
         return min(HEARTBEAT_S, self.worker_timeout_s / 5)

@@ -62,7 +62,7 @@ def check_text(name: str, value: object, origin: str) -> None:
 
     A command line may contain any bytes. `origin` is how an error refers to the setting.
     """
-    if name == "run_dir":  # left to the check of the folder, whose error says what to do
+    if name == "run_dir":  # the check of the folder has a better error, which says what to do
         return
     for text in value if isinstance(value, tuple | list) else (value,):
         if isinstance(text, str) and any("\ud800" <= character <= "\udfff" for character in text):
@@ -84,12 +84,12 @@ def check_numbers(record: msgspec.Struct, origins: Mapping[str, str]) -> None:
 
 
 def check_copies(config: Config, limit: str, most: int) -> None:
-    """Raise `UsageError` if `most` env copies (0 for any number) are too few for the run.
+    """Raise `UsageError` if the run needs more than `most` env copies (0 for any number).
 
     `limit` names the setting or the variable that gives the number.
     """
-    # Each worker that evaluates keeps its env copies. There is one such worker, or there are the eval_workers and one more
-    # worker, which evaluates if those are lost.
+    # Each worker that evaluates keeps its env copies. Without eval_workers, one worker evaluates. With them, one more worker
+    # must be able to, in case they are lost.
     evaluate = min(config.eval_copies, evaluation_size(config).episodes) * (config.eval_workers + 1)
     if 0 < most < config.envs + evaluate:
         raise UsageError(

@@ -1,4 +1,4 @@
-"""The conversation before a run: workers wait for it, and describe environments. Pure: messages and `now` in, messages out.
+"""The conversation before a run: workers wait, and describe environments. Pure: messages and `now` in, messages out.
 
 Rule: the worker that joined first describes the environment; the others wait. A worker that has not answered an order is the
 last to be asked about the next environment, because it may hang. Each time a worker is lost after it was asked, or no answer

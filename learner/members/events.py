@@ -108,7 +108,7 @@ class PolicyRaised(Failed):
 
 @dataclass(frozen=True)
 class WorkerProcessFailed(Failed):
-    """A worker's process ended unannounced. This counts as a failure of its environment, as if that had raised."""
+    """A worker's process ended unannounced. This counts as if its environment had raised an exception."""
 
     json_name: ClassVar[str] = "process_failed"
 

@@ -39,7 +39,7 @@ class FailureCount:
         self._began_s = began_s
         self._in_a_row: dict[int | str, float] = {}
         self._error: EnvironmentFailed | PolicyFailed | None = None
-        self._within_hour: list[tuple[float, float]] = []  # failures after env steps: time, and seconds worked before
+        self._within_hour: list[tuple[float, float]] = []  # per failure after env steps: time, and seconds worked before it
         self._told_at = TOLD_FIRST  # the number of failures within an hour at which the log warns next
 
     def failed(self, lanes: Collection[int | str], worked_s: float | None, now: float) -> str:

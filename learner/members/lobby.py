@@ -134,7 +134,7 @@ class Lobby:
         """Called when a message was sent. Does nothing."""
 
     def listen(self) -> None:
-        """Answer the workers while the learner prepares the run. Raises what `describe` raises if none can take part."""
+        """Answer the workers while the learner prepares the run. If none can take part, raises what `describe` raises."""
         self._server.listen(0.0)
         self._check()
 

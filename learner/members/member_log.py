@@ -81,7 +81,7 @@ class MemberLog:
 
     def _budget_of_worker(self, source: str, worker: str) -> LogBudget:
         budget = self._of_worker.pop((source, worker), None) or LogBudget(OF_A_WORKER)
-        self._of_worker[source, worker] = budget  # last in the table, whose first worker is the one least recently logged
+        self._of_worker[source, worker] = budget  # moved to the end: the first worker is the one logged least recently
         if len(self._of_worker) > MOST_WORKERS:
             del self._of_worker[next(iter(self._of_worker))]
         return budget

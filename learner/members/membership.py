@@ -259,7 +259,7 @@ class Membership(Generic[M]):
         return self._refuse_and_remove(self.members[peer], KeyRevoked, f"was shut out: {why}", why)
 
     def hear_supervisor(self, peer: bytes, alive: Alive, now: float) -> tuple[list[Outgoing], list[WorkerExit]]:
-        """Record a supervisor's statements about members. They count only for members with its key whose nonce it knows.
+        """Record a supervisor's statements about members. Only those about members with its key and a nonce it knows count.
 
         Returns the answer, and the exits of processes that removed members.
         """

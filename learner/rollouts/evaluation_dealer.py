@@ -61,7 +61,7 @@ class EvaluationPlan:
     of_best: bool = False
     """whether the weights are those of the best policy of the run"""
     opponents: tuple[int, ...] = ()
-    """with teams, the opponents, numbered as in a `Permit`, which play in turn"""
+    """in a run with teams, the opponents, which play in turn. They are numbered as in a `Permit`"""
 
     @staticmethod
     def of(episodes: int, seed: int, copies: int, max_steps: int, purpose: Purpose = Purpose.EPISODES) -> EvaluationPlan:
@@ -85,7 +85,7 @@ class EvaluationPlan:
 
 
 def episode_seeds(seed: int, episodes: int, purpose: Purpose = Purpose.EPISODES) -> tuple[int, ...]:
-    """The reset seed of each episode. With fewer episodes, the seeds are the first of those with more."""
+    """The reset seed of each episode. If there are fewer episodes, they have the first of the same seeds."""
     return tuple(env_seed(seed, purpose, episode) for episode in range(episodes))
 
 
@@ -119,11 +119,11 @@ class EvaluationDealer:
         self.second: dict[int, Member] = {}
         """the second worker of each of these tickets that has one, by number"""
         self.most_copies: int | None = None
-        """the most env copies that play, summed over all workers; a single worker plays even with more; None: no limit"""
+        """the most env copies that play, summed over all workers, though one worker may always play; None for no limit"""
         self._run = run
         self.beside = False
         """whether the pending evaluation runs alongside training"""
-        self._most_workers = 0  # the most workers that play if copies are limited; 0: as many as the limit allows
+        self._most_workers = 0  # if copies are limited, the most workers that play; 0 for as many as the limit allows
         self._plan: EvaluationPlan | None = None
         self.version = -1
         """the version of the weights that are evaluated"""
@@ -161,7 +161,7 @@ class EvaluationDealer:
         return list({member.peer: member for member in [*self.held.values(), *self.second.values()]}.values())
 
     def begin(self, plan: EvaluationPlan, version: int, on_rows: OnRows | None = None, *, beside: bool = False) -> None:
-        """Begin to evaluate this version, alongside training if `beside`. Then call `deal`, which gives out the tickets."""
+        """Begin to evaluate this version, alongside training if `beside`. Then call `deal` to give out the tickets."""
         assert not self.pending, "an evaluation is pending"
         self._first += len(self._seeds)
         self._plan = plan
@@ -175,7 +175,7 @@ class EvaluationDealer:
         self._rows = {}
 
     def all_play(self) -> None:
-        """Let all workers play the pending evaluation, which has run alongside training.
+        """Let all workers play the pending evaluation, which has run alongside training so far.
 
         If copies are limited, only one of the other workers plays.
         """
@@ -197,9 +197,9 @@ class EvaluationDealer:
         return [PlayedEpisode(*both) for answer in answers for both in zip(answer.episodes, answer.cut, strict=True)]
 
     def deal(self, active: Sequence[Member]) -> list[Outgoing]:
-        """Give a ticket to each of these workers that plays, and then a second one as long as there are plenty.
+        """Give each of these workers that plays a ticket, and then a second one if there are more tickets than workers.
 
-        Workers that only evaluate come first; otherwise, they are in the order of joining. If copies are limited, only the
+        Workers that only evaluate come first, then the others, each in the order of joining. If copies are limited, only the
         first workers play, because a worker keeps its copies.
         """
         plan = self._plan
@@ -231,7 +231,7 @@ class EvaluationDealer:
         return self.send(idle[0], alone[:1])
 
     def send(self, member: Member, tickets: Iterable[int]) -> list[Outgoing]:
-        """The orders for those of these tickets that belong to the evaluation."""
+        """Make the orders for those of these tickets that belong to the evaluation."""
         return [(member.peer, self._order(member, number)) for number in tickets if number in self.held]
 
     def take_in(self, member: Member, answer: Evaluated) -> str:
@@ -240,7 +240,7 @@ class EvaluationDealer:
         Returns what is wrong with it, or an empty string; a wrong answer's ticket goes to another worker.
         """
         if not self._plays(member, answer.ticket):
-            return ""  # the answer arrived twice, after the end, or after another worker's answer
+            return ""  # a second answer, one after the end, or one after another worker's answer
         index = answer.ticket - self._first
         if why := self._wrong(answer, len(self._seeds[index])):
             self.lose(member, answer.ticket)
@@ -248,7 +248,7 @@ class EvaluationDealer:
         rows = self._rows.get((index, member.peer), {})
         if self._on_rows is not None:
             if [_end(rows.get(n, ())) for n in range(len(answer.episodes))] != [one.length for one in answer.episodes]:
-                self.lose(member, answer.ticket)  # a message with rows was lost: the episodes are played again
+                self.lose(member, answer.ticket)  # a message with rows was lost, so the episodes are played again
                 return ""
             assert self._plan is not None
             for episode, messages in sorted(rows.items()):
@@ -299,7 +299,7 @@ class EvaluationDealer:
         return Counter(member.peer for member in [*self.held.values(), *self.second.values()])
 
     def _who_may_play(self, members: Sequence[Member], plan: EvaluationPlan) -> list[Member]:
-        """Those of these workers that may play. Late workers play only if all are late.
+        """Those of these workers that may play. A worker that was late may play only if all were.
 
         Workers that only evaluate come first. If copies are limited, only the first workers play, because a worker keeps its
         copies.

@@ -1,4 +1,4 @@
-"""The hub: joins link, ticket coordinator and clock. Through it, a training loop gathers rollouts and publishes weights.
+"""The hub: it joins link, ticket coordinator and clock, and lets a training loop gather rollouts and publish weights.
 
 `millrace.learner.train` deals with workers only through the hub, and so does `millrace.RolloutService` for your own loop. A
 loop waits only in `wait_for`, `gather`, `end_evaluation` and `drain`. Rule: every wait has a deadline, and the log says what
@@ -47,8 +47,8 @@ log = logging.getLogger("millrace.learner")
 T = TypeVar("T")
 POLL_S = 0.1
 GOODBYE_WITHIN_S = 5.0  # how long to wait for Goodbyes at the end of a run; late rollouts are still counted meanwhile
-GOODBYE_IF_CUT_SHORT_S = 2.0  # how long to wait if the work is cut short, or if no episode is missing
-# Least interval between two pulses that do something. A pulse takes as long as a small minibatch, of which there may be ten
+GOODBYE_IF_CUT_SHORT_S = 2.0  # the same, if the work is cut short or no episode is missing
+# Least interval between two pulses that do any work. A pulse takes as long as a small minibatch, of which there may be ten
 # within this interval.
 PULSE_S = 0.003
 
@@ -245,7 +245,7 @@ class Hub:
         """
         evaluation = self.coordinator.evaluation
         steps_before = self._worker_steps()
-        wait = LongWait(self._clock())  # begins again with each new env step
+        wait = LongWait(self._clock())  # starts again with each new env step
         steps = steps_before  # the number of env steps when `wait` began
 
         def watch_and_log() -> None:
@@ -257,7 +257,7 @@ class Hub:
                 steps = steps_now
             elif wait.due(now):
                 log.warning("no env steps for %.0f s: %s", wait.seconds(now), self._server.what_workers_do())
-            watch(evaluation.episodes_played, max(0, steps_now - steps_before))  # the difference falls if a worker is lost
+            watch(evaluation.episodes_played, max(0, steps_now - steps_before))  # steps_now falls if a worker is lost
 
         def done() -> bool | None:
             if not evaluation.done and evaluation.beside:
@@ -275,11 +275,11 @@ class Hub:
         finally:
             played = evaluation.end()
             self._time.turn("learning", self._clock())
-        self.lag_statistics.published(self.coordinator.version, self._clock())  # from now on rollouts use these weights
+        self.lag_statistics.published(self.coordinator.version, self._clock())  # from now on, rollouts use these weights
         return played
 
     def pulse(self) -> None:
-        """Answer the workers, then remove those that have been silent for too long, unless this was done just before.
+        """Answer the workers, then remove those that have been silent for too long, unless that was done a moment ago.
 
         Called between minibatches. Never waits, never ends the run, and takes no longer than the work since the last call.
         """
@@ -349,7 +349,7 @@ class Hub:
             refused_handshakes=link.refused,
         )
 
-    # ---------------------------------------------------------------- what the server tells
+    # ---------------------------------------------------------------- called by the server
 
     def happened(self, event: Event) -> None:
         """Count rollouts and episodes that have arrived, and failures."""

@@ -15,7 +15,7 @@ class Rounds:
     """The rounds of one run, counted from 0."""
 
     def __init__(self, max_lag: int, next_round: int = 0, versions: Mapping[int, int] = MappingProxyType({})) -> None:
-        """For a resumed run, `next_round` is its next round, and `versions` are those that act in its open rounds."""
+        """For a resumed run, `next_round` is the round of its next update, and `versions` act in its open rounds."""
         self.max_lag = max_lag
         """L"""
         self.next = next_round
@@ -26,7 +26,7 @@ class Rounds:
         self._versions: dict[int, int] = {}
 
     def begin(self, newest: int) -> range:
-        """Begin the next update, with `newest` as the newest version. Returns the rounds that this opens.
+        """Begin the next update. `newest` is the newest version. Returns the rounds that this opens.
 
         A second call for the same update opens none.
         """

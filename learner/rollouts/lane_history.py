@@ -1,9 +1,9 @@
 """The learner's record of a lane's past, accumulated from its rollouts. Pure.
 
 Rule: a history is a fold over the rollouts of a lane in the order of their rounds, whoever collected them, and whether or
-not an update used them. It keeps only what a worker needs to continue where they end (`protocol/lane_past.py`): how the
-newest episode of each copy began, and the actions since. An episode cannot be replayed if it is longer than the limit, or if
-it isn't known how it began. If the lane is lost, the copy of such an episode starts afresh.
+not an update used them. It keeps only what a worker needs to continue where the rollouts end (`protocol/lane_past.py`): how
+the newest episode of each copy began, and the actions since. An episode cannot be replayed if it is longer than the limit,
+or if it isn't known how it began. If the lane is lost, the copy of such an episode starts afresh.
 """
 
 from __future__ import annotations
@@ -56,9 +56,9 @@ class LaneHistory:
         return replace(self, copies=list(self.copies), rows=self.rows.copy(), too_long=dict(self.too_long))
 
     def add(self, rollout: Rollout, attributes: bytes) -> Bools:
-        """Add the next rollout of the lane. Returns [N], True for copies that had started afresh when it began.
+        """Add the next rollout of the lane. Returns [N], True for copies that had started afresh when the rollout began.
 
-        `attributes` are those of its env copies, packed.
+        `attributes` are the packed attributes of the rollout's env copies.
         """
         T = len(rollout.action)
         began = {each.copy: each for each in rollout.begun}
@@ -85,7 +85,8 @@ class LaneHistory:
     def start_anew(self, attempts: int, *, from_past: bool = True) -> None:
         """Let all copies start afresh after this many failed attempts to continue. No start number is used twice.
 
-        `from_past` says whether the first attempt began from this history, so that some copies started afresh in it.
+        `from_past` says whether the first attempt began from this history. Then only some of the copies started afresh in
+        it.
         """
         tried = [last.start + (from_past and not last.goes_on) for last in self.copies]  # the starts of the first attempt
         self.copies = [LastEpisode(number + attempts - 1, None, self.count, False) for number in tried]
@@ -131,7 +132,7 @@ class LaneHistory:
 
     def _after(self, last: LastEpisode, began: EpisodeBegin | None, resets: Bools, T: int) -> LastEpisode:
         """The newest episode of a copy after T more rows. `resets` [T+1] is True for rows that only reset it."""
-        start = last.start if began is None else max(last.start, began.start)  # never use a start number twice
+        start = last.start if began is None else max(last.start, began.start)  # so that no start number is used twice
         random = None if began is None else began.random
         if resets[T]:
             return LastEpisode(start, random, self.count + T, True)
@@ -171,7 +172,7 @@ class LaneHistory:
 
 
 def _needed_from(last: LastEpisode) -> int:
-    """The first row needed to replay an episode: the row that reset the copy counts, for the attributes at that time."""
+    """The first row needed to replay an episode: the one that reset the copy, because the attributes at that time matter."""
     return last.first - 1 if last.random and last.is_repeated else last.first
 
 

@@ -19,7 +19,7 @@ from millrace.protocol.arrays import Bools
 from millrace.protocol.messages import Hello, LanePast, Permit
 from millrace.protocol.rollout import Rollout
 
-MOST_ATTEMPTS = 3  # after this many attempts to continue a lane that each lost its worker, its copies start afresh
+MOST_ATTEMPTS = 3  # copies start afresh after this many attempts to continue their lane have each lost a worker
 
 
 @dataclass
@@ -37,15 +37,15 @@ class TicketedLane(PlacedLane):
     out_of_order: set[int] = field(default_factory=set)
     """Larger sequence numbers whose rollouts have arrived."""
     newest_taken: tuple[int, int] | None = None
-    """Incarnation and sequence number of the rollout that was taken last; None if none was since the learner began."""
+    """Incarnation and sequence number of the rollout that was taken last; None if none was taken since the learner began."""
     history: LaneHistory | None = None
-    """History of the rollouts that were taken; None if none was since the run began."""
+    """History of the rollouts that were taken; None if none was taken since the run began."""
     failures: int = 0
     """How many times its environment has failed since its last rollout arrived."""
     failed_at_once: bool = True
     """Whether the first of these failures and losses happened before any rollout of its incarnation arrived."""
     losses: int = 0
-    """How many times its worker was lost while collecting since its last rollout arrived."""
+    """How many times, since its last rollout arrived, its worker was lost while it collected."""
 
     @property
     def busy(self) -> int:
@@ -109,7 +109,7 @@ class TicketedLane(PlacedLane):
         return anew if (continues or sequence == 0) and not begins else np.ones_like(anew)
 
     def lost(self, *, failed: bool) -> None:
-        """Record that the lane's worker was lost while collecting, or because the environment `failed`."""
+        """Record that the lane's worker was lost while it collected or, if `failed`, because its environment failed."""
         if not self.failures and not self.losses:
             self.failed_at_once = not self.next_sequence
         self.losses += not failed

@@ -21,7 +21,7 @@ Past = Annotated[int, Meta(ge=0, le=LARGEST >> 2)]
 
 
 class Ledger(msgspec.Struct, kw_only=True):
-    """The counts since the run began, which checkpoints save."""
+    """The counts since the run began. Checkpoints save them."""
 
     issued: Past = 0
     used: Past = 0
@@ -41,7 +41,7 @@ class Ledger(msgspec.Struct, kw_only=True):
     messages_bad: Past = 0
     """messages that could not be read"""
     late_actions: Past = 0
-    """actions that arrived too late at a program that runs its own loop, so that it chose the action itself"""
+    """actions that arrived too late at a program that runs its own loop, so that the program chose its own action"""
 
     @property
     def outstanding(self) -> int:

@@ -107,7 +107,7 @@ class OpponentPool:
         return tuple(-1 - k for k in range(programs)) or tuple(self.versions[:1])
 
     def made(self, version: int, env_steps: int) -> bool:
-        """Make a snapshot of new weights if one is due. Returns whether they became one."""
+        """Make a snapshot of new weights if one is due. Returns whether the weights became one."""
         snapshots = self.state.snapshots
         settings = self._settings
         if not settings.window:
@@ -115,12 +115,13 @@ class OpponentPool:
         if snapshots and (version <= snapshots[-1].version or env_steps < snapshots[-1].env_steps + settings.save_steps):
             return False
         snapshots.append(Snapshot(version, env_steps, self.state.rating))
-        # Older weights that still act, within max_lag, may meet snapshots that were in the window when they were made.
+        # Older weights that still act, within max_lag, may meet snapshots that were in the window when those weights were
+        # made.
         del snapshots[1 : max(1, len(snapshots) - settings.window - settings.max_lag)]
         return True
 
     def of(self, lane: int, round_number: int, version: int) -> int:
-        """The opponent in episodes that begin in a rollout: that of this lane and round, collected with this version.
+        """The opponent in episodes that begin in the rollout of this lane and round, which is collected with this version.
 
         A number of at least 0 is the version of a snapshot or of the acting weights; -1 - k is program k.
         """

@@ -37,7 +37,7 @@ class PastRollouts(NamedTuple):
     """the next incarnation of each lane"""
     rounds: RoundsState = RoundsState()
     lanes: Sequence[LanePast] = ()
-    """the past of each lane of which rollouts were taken"""
+    """the past of each lane from which rollouts were taken"""
     acting: Sequence[Weights] = ()
     """the weights that act in open rounds, except the newest"""
 

@@ -26,14 +26,14 @@ from millrace.protocol.messages import Collect, LanePast, Received, Rollout
 
 @dataclass(frozen=True, slots=True)
 class AcceptedRollout:
-    """A rollout that was accepted, with data about it that its message doesn't have."""
+    """A rollout that was accepted, with facts about it that its message doesn't contain."""
 
     rollout: Rollout
     incarnation: int
     """The incarnation of the lane when the ticket was dealt. Each incarnation has new env copies."""
     fresh: Bools | bool = True
-    """[N] True for env copies that don't continue the previous rollout that was taken of the lane, because the copy has
-    started afresh, or because a rollout in between was rejected. A single value applies to all copies.
+    """[N] True for env copies that don't continue the previous rollout taken from the lane, because the copy has started
+    afresh or a rollout in between was rejected. A single value applies to all copies.
     """
     from_past: bool = False
     """Whether the worker was told to continue the lane's past with this rollout."""
@@ -83,7 +83,7 @@ class RolloutDealer:
     # ---------------------------------------------------------------- the learner's side
 
     def begin_update(self, version: int) -> None:
-        """Begin the next update, unless it has begun, with `version` as the newest. `deal` then deals the new rounds."""
+        """Begin the next update, unless it has begun. `version` is the newest version. `deal` then deals the new rounds."""
         for number in self.rounds.begin(version):
             for lane in self.lanes:
                 lane.due.append(number)
@@ -122,11 +122,11 @@ class RolloutDealer:
         return sum(map(len, self.ready.values()))
 
     def incarnations(self) -> list[int]:
-        """The next incarnation of each lane, for a checkpoint. An incarnation that got a ticket is never used again."""
+        """For a checkpoint, the next incarnation of each lane. An incarnation that got a ticket is never used again."""
         return [*(lane.incarnation + (lane.dealt > 0) for lane in self.lanes), *self._absent]
 
     def pasts(self) -> list[LanePast]:
-        """The past that each lane continues after the last round that was taken, for a checkpoint."""
+        """For a checkpoint, the past from which each lane continues after the last round that was taken."""
         here = [lane.history.past(lane.number) for lane in self.lanes if lane.history is not None]
         return [*here, *self._absent_pasts]
 
@@ -153,7 +153,7 @@ class RolloutDealer:
         return [order for peer, numbers in dealt.items() for order in self.send(members[peer], numbers)]
 
     def send(self, member: Member, tickets: Iterable[int]) -> list[Outgoing]:
-        """The orders for those of these tickets that are for rollouts: one order for each version that they name.
+        """Make the orders for those of these tickets that are for rollouts: one order for each version that they name.
 
         A ticket that includes the past of a lane has an order of its own, because a past is long.
         """
@@ -206,7 +206,7 @@ class RolloutDealer:
         return self.rounds.next + self.rounds.max_lag + 1 if ticket is None else ticket.round + 1
 
     def worker_lost(self, member: Member) -> None:
-        """Count the failures and losses of a lost member's lanes, so that steps that led to a failure are not replayed."""
+        """Count the failures and losses of a lost member's lanes. Lanes that fail too often aren't replayed."""
         for number in member.lanes:
             lane = self.lanes[number]
             failed = number == member.failed_lane or (member.hung and bool(lane.outstanding))
@@ -252,7 +252,7 @@ class RolloutDealer:
         return lane.past(self.histories, waiting)
 
     def _drop_after(self, lane: TicketedLane, first: int) -> None:
-        """Drop the lane's rollouts after round `first`, which was lost, because they don't continue its replacement."""
+        """Drop the lane's rollouts after round `first`, which was lost, because its replacement is another rollout."""
         for number in [number for number in self.ready if number > first and lane.number in self.ready[number]]:
             dropped = self.ready[number].pop(lane.number)
             self.ledger.lost += 1

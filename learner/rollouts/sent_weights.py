@@ -59,7 +59,7 @@ class WeightsHeld:
         self.named: dict[bytes, dict[int, set[int]]] = {}
         """the versions that each ticket names, by routing id and ticket; may include tickets that have ended"""
         self.by_supervisor = WeakKeyDictionary[SharingSupervisor, dict[int, SentAfter]]()
-        """the supervisors' weights, by version, the newest last; dropped with the last member that has the supervisor"""
+        """by supervisor, its weights by version, the newest last; dropped with the last member of that supervisor"""
 
     def versions(self, peer: bytes) -> Set[int]:
         """The versions that this worker holds or is about to get."""
@@ -84,7 +84,7 @@ class WeightsHeld:
         return supervisor.peer
 
     def needs(self, member: CollectingMember, tickets: Collection[int]) -> set[int]:
-        """The versions that are named by those of these tickets that the worker holds and that have not ended."""
+        """The versions that these tickets name, apart from tickets that the worker doesn't hold or that have ended."""
         named = self.named.get(member.peer, {})
         return {version for ticket in member.tickets.keys() & tickets for version in named[ticket]}
 
@@ -123,7 +123,7 @@ class WeightsHeld:
         self.named.pop(peer, None)
 
     def _may_be_under_way(self, version: int, supervisor: SharingSupervisor | None) -> bool:
-        """Whether these weights may not have reached the supervisor yet. False if it no longer shares weights."""
+        """Whether these weights may still be on their way to the supervisor. False if it no longer shares weights."""
         if supervisor is None:
             return False
         sent = self.by_supervisor.get(supervisor, {}).get(version)
@@ -154,7 +154,7 @@ class SentWeights:
             if isinstance(order, Collect | Evaluate):
                 member = members[peer]
                 for version in sorted(order.versions - self.held.versions(peer)):
-                    # Opponents differ from worker to worker, so theirs are not shared.
+                    # Opponents differ from worker to worker, so their weights are not shared.
                     supervisor = member.shared_by if version == order.version else None
                     weights += self._send(member, version, supervisor)
                 keep = self.held.needs(member, member.tickets)  # including those that later orders in this list name
@@ -164,7 +164,7 @@ class SentWeights:
         return out + weights
 
     def again(self, member: CollectingMember, heartbeat: Heartbeat) -> list[Outgoing]:
-        """The weights to send again: the worker's unfinished tickets name them, and this heartbeat shows them as lost."""
+        """The weights to send again: those that unfinished tickets name and that, according to this heartbeat, were lost."""
         self.held.hear(member, heartbeat)
         lost = sorted(self.held.needs(member, heartbeat.tickets) - self.held.versions(member.peer))
         return [message for version in lost for message in self._send(member, version, None)]

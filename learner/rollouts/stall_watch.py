@@ -20,13 +20,13 @@ from millrace.learner.rollouts.collecting_member import CollectingMember
 from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
 from millrace.protocol.call_timeouts import CallTimeouts
 
-ENDED_WITHIN_S = 5.0  # how long after a timeout the learner may learn that a worker was ended
+ENDED_WITHIN_S = 5.0  # how long after the timeout of a call the learner may hear that the worker was ended
 CHECK_BUDGETS_EVERY_S = 1.0
 
 
 @dataclass(frozen=True)
 class Standstill:
-    """A verdict: refuse these members or, if there are none, end the run."""
+    """A verdict: refuse these members or, if there are no members, end the run."""
 
     refuse: tuple[CollectingMember, ...]
     why: str
@@ -83,7 +83,7 @@ class StallWatch:
         return Standstill(idle, f"it holds tickets and has made no progress for {self._stall_timeout_s:.0f} s")
 
     def _takes_too_long(self, now: float) -> bool:
-        """Whether no episode of the evaluation has arrived for too long. If so, the time starts again."""
+        """Whether no episode of the evaluation has arrived for too long. If so, starts to measure the time anew."""
         answered = self._coordinator.evaluation.episodes_played
         overdue = answered == self._answered and now - self._answered_s > self._stall_timeout_s
         if overdue or answered != self._answered:

@@ -44,10 +44,11 @@ from millrace.protocol.rows.rollout_checks import validate
 from millrace.protocol.specs import RunSpec
 
 CheckRows = Callable[[Rollout, RunSpec, int], None]
-"""Raises `BadRollout` if the rows of a rollout break the row format, don't fit the run, or contain an episode that is longer
-than this number of steps."""
+"""Checks the rows of a rollout. Raises `BadRollout` if they break the row format, don't fit the run, or contain an episode
+with more steps than the last argument.
+"""
 
-MOST_NOTES = 10  # the most notes of all workers together that are logged
+MOST_NOTES = 10  # how many notes are logged, of all workers together
 STRIKES = 3  # a worker is refused after this many rollouts or messages that could not be used
 
 
@@ -151,7 +152,7 @@ class TicketCoordinator(Coordinator[CollectingMember]):
         return self._deal()
 
     def share_evaluation(self) -> list[Outgoing]:
-        """Let a second worker, if one is idle, play the oldest ticket too, because no answer has arrived for a long time."""
+        """Let an idle worker, if there is one, also play the oldest ticket, because no answer has arrived for long."""
         return self.weights.after(self.evaluation.share(self.membership.active()), self.members)
 
     def collected(self) -> int:
@@ -183,7 +184,7 @@ class TicketCoordinator(Coordinator[CollectingMember]):
         dealt = self.rollouts.deal(self.members)
         for peer, order in dealt:
             for permit in order.permits if isinstance(order, Collect) else ():
-                if (past := permit.past) is not None and past.memory:  # only then has the lane had rollouts
+                if (past := permit.past) is not None and past.memory:  # true only if the lane has had rollouts
                     worker = self.members[peer].hello.worker
                     history = self.rollouts.lanes[permit.lane].history
                     longest = 0 if history is None else history.longest_given_up
@@ -221,7 +222,7 @@ class TicketCoordinator(Coordinator[CollectingMember]):
                 return self._unusable(member, why) if why else []
             case Goodbye(_, reason):
                 self.membership.leave(member, reason)
-        return []  # including for answers to orders that a run never sends
+        return []  # answers to orders that a run never sends are ignored
 
     def _take_rollout(self, member: CollectingMember, rollout: Rollout) -> list[Outgoing]:
         """Accept a rollout, unless it had arrived before. If it can't be used, it is counted, and its ticket is lost."""
@@ -264,7 +265,7 @@ class TicketCoordinator(Coordinator[CollectingMember]):
         described = member.describes
         out = super()._heartbeat(member, heartbeat)
         if described and not member.describes:
-            self._placement.joined()  # it may have lanes from now on
+            self._placement.joined()  # from now on, the worker may have lanes
         return out
 
     def _again(self, member: CollectingMember, heartbeat: Heartbeat, lost: Sequence[int]) -> list[Outgoing]:

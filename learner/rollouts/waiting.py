@@ -1,10 +1,10 @@
 """A line that says who waits for whom in a run, and for what share of the time. Pure: the state and `now` in, a line out.
 
 Rule: waits shorter than `LONG_S` aren't mentioned. Between two long waits for rollouts, the line mentions the last one, so
-that it does not appear and disappear all the time. While the learner waits, the line names the lanes whose rollouts are
-missing for the next update, and says how many of that update's env steps have been made, because with a slow simulator the
-first update may be far away. While the learner learns, the line says how many workers wait for weights. The shares are those
-of training time since the learner started, without evaluations.
+that the text does not appear and disappear all the time. While the learner waits, the line names the lanes whose rollouts
+are missing for the next update, and says how many of that update's env steps have been made, because with a slow simulator
+the first update may be far away. While the learner learns, the line says how many workers wait for weights. The shares are
+those of training time since the learner started, without evaluations.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ class LearnerTime:
         return f"learning for {now - self.since_s:.0f} s{waiting}"
 
     def _awaited(self, now: float) -> str:
-        """The worker that has been held up longest, its awaited lanes, and the number of other awaited lanes."""
+        """A clause about the worker that has been held up longest, its awaited lanes, and the number of other ones."""
         lanes = dict[bytes, set[int]]()
         members = self._coordinator.members
         for ticket in self._coordinator.rollouts.awaited():
@@ -128,7 +128,7 @@ class LearnerTime:
         return f"{done} (at most {plan.most_steps:,} env steps each); {who}"
 
     def _held_up_longest(self, members: list[Member], now: float) -> str:
-        """The worker that has been held up longest: of these members or, if others step for them, of those."""
+        """The worker that has been held up longest, among these members or, if other workers step for them, among those."""
         return max((held_up(member, now) for member in self._processes.stepping() or members), default=("nobody plays",))[-1]
 
 

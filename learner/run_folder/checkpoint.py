@@ -29,7 +29,7 @@ FOLDER = "checkpoints"
 SUFFIX = ".pt"
 ZIP_BEGINS = b"PK\x03\x04"  # if a file begins with anything else, torch reads a pickle before the archive
 PICKLE = "data.pkl"  # suffix of the pickle's name in the archive; torch accepts capital letters, too
-MOST_VIEWS = 16  # the most views of the same numbers, because an algorithm may save parts of a tensor besides the whole
+MOST_VIEWS = 16  # the most views of the same numbers; an algorithm may save parts of a tensor in addition to the whole
 
 
 class Checkpoint(NamedTuple):
@@ -41,7 +41,7 @@ class Checkpoint(NamedTuple):
 
 
 class CheckpointSchedule:
-    """Says when a checkpoint is due: at intervals, and after the first update, so that a killed run can soon be resumed."""
+    """Says when a checkpoint is due: at intervals, and after the first update, so that even a young run can be resumed."""
 
     def __init__(self, every_s: float, now: float) -> None:
         self._every_s = every_s
@@ -135,7 +135,7 @@ def _read(path: Path) -> Checkpoint:
                 raise _Unreadable("it isn't an archive that torch.save wrote")
             with zipfile.ZipFile(file) as archive:
                 if any(entry.compress_type != zipfile.ZIP_STORED for entry in archive.infolist()):
-                    raise _Unreadable("it is compressed, which torch never does")  # when read, it could fill the memory
+                    raise _Unreadable("it is compressed, which torch never does")  # decompressing it could fill the memory
                 if (damaged := archive.testzip()) is not None:
                     raise _Unreadable(f"checksum of {damaged} does not match")
                 for entry in archive.infolist():

@@ -1,4 +1,4 @@
-"""The log as JSON, one event per line: all of it on stderr (`--log-json`), warnings and notices also in log.jsonl.
+"""The log as JSON, one event per line: all of it on stderr (`--log-json`), and its warnings and notices in log.jsonl.
 
 log.jsonl is in the run folder.
 
@@ -70,7 +70,7 @@ class LoggedLine(msgspec.Struct, frozen=True):
     time: Annotated[datetime, Meta(tz=True)]
     level: str
     message: str
-    """The text for people. Lines after the first are a traceback."""
+    """The text for people. If it has several lines, those after the first are a traceback."""
 
 
 @contextmanager

@@ -15,7 +15,7 @@ from millrace.flags.program_name import typed_name
 from millrace.protocol.bounds import MAX_TEXT, one_line
 from millrace.protocol.errors import UserFacingError, first_line
 
-OURS = "millrace."  # the beginning of the names of millrace's modules
+OURS = "millrace."  # prefix of the names of millrace's modules
 OF_LEARNER = "millrace.learner."
 
 

@@ -1,4 +1,4 @@
-"""The lease behind a run's lock, which lapses unless its owner renews it. Has the content of the lock file. Pure.
+"""The lease behind a run's lock, which lapses unless the lock's owner renews it, and the content of the lock file. Pure.
 
 Rule: a living owner rewrites the lock file every few seconds with another count. An observer doesn't compare the clocks of
 two machines; it measures with its own clock how long the content stays the same.
@@ -22,7 +22,7 @@ HIGHEST_COUNT = 10**12
 
 
 class Unreachable(Enum):
-    """Why nobody can ask the learner of a run."""
+    """Why `millrace status` can't ask a run's learner."""
 
     INPROC = "inproc"
     """Its workers are threads, so it listens in its own process only."""
@@ -107,7 +107,7 @@ class Verdict(Enum):
 
 
 class LeaseWatch:
-    """Watches one lock file to decide whether its owner is alive: it is once the content has changed."""
+    """Watches one lock file to decide whether its owner is alive. The owner is alive if the content changes."""
 
     def __init__(self, content: bytes, now: float, dead_after_s: float) -> None:
         self._content = content

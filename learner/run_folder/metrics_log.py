@@ -2,7 +2,7 @@
 
 Rule: the file ends with a complete row, and there is one row for each update. Rows that can't be written now are written
 later. A resumed run first removes the rows after its checkpoint. If the run was interrupted before an evaluation, the
-resumed run makes it and adds the metrics to the row of the same update.
+resumed run makes this evaluation and adds its metrics to the row of the same update.
 """
 
 from __future__ import annotations

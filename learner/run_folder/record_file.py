@@ -28,7 +28,7 @@ class RecordFile:
         self._path = run / name
         self._waiting: deque[bytes] = deque(maxlen=MOST_WAITING)
         self._bytes = 0
-        self._cut = 0  # number of bytes at the end of the file that the first waiting record replaces
+        self._cut = 0  # how many bytes at the end of the file the first waiting record replaces
         self._open()
 
     @property
@@ -64,7 +64,7 @@ class RecordFile:
                 self._cut = 0
             while self._waiting:
                 rest = self._waiting[0]
-                while rest:  # if only a part can be written, the next write raises and says why
+                while rest:  # if only a part was written, the next write raises and says why
                     rest = rest[self._file.write(rest) :]
                 self._bytes += len(self._waiting.popleft())
         except OSError as error:

@@ -86,7 +86,7 @@ def _expect(kind: int, mode: int, path: Path) -> None:
 
 
 def _is(kind: int, path: Path) -> bool:
-    """Whether the file is of this kind; otherwise the log says what it is."""
+    """Whether the file is of this kind. If it isn't, the log says what it is."""
     try:
         _expect(kind, path.lstat().st_mode, path)
     except FileNotFoundError:

@@ -158,7 +158,7 @@ class RunFolder:
         self.path = path
         self._made = made
         self._is_relative = False
-        self._workers_elsewhere = False  # the last argument that `write_config` got
+        self._workers_elsewhere = False  # the argument of this name that `write_config` last got
         self.started_from = ""
         """See `RunFormat`."""
         self.writes = Writes()

@@ -34,7 +34,7 @@ HEAD = "# Repeat this run: millrace train --config THIS_FILE (it is whole if it 
 END = "# end\n"
 """The last line of config.toml; `HEAD` is the first. Without it, a file that was cut off could still be valid TOML."""
 MOST_CONFIG_BYTES = 1 << 18
-MOST_NESTED = 1_000_000  # limit of lines times dots in a line: for each line, tomllib visits all parts of a table's name
+MOST_NESTED = 1_000_000  # limit of (lines) × (dots in a line): for each line, tomllib visits all parts of a table's name
 
 
 class RunFormat(msgspec.Struct, frozen=True, kw_only=True):
@@ -85,7 +85,7 @@ def write_format(folder: Path, *, workers_elsewhere: bool = False, started_from:
 
 
 def read_config(run: Path) -> dict[str, Any]:
-    """The settings in the config.toml of a run folder, as they are there; they include env, algo and seed.
+    """The settings in the config.toml of a run folder, not converted. They include env, algo and seed.
 
     Raises `UsageError` if the file is missing, cannot be read, or names a module in the run folder.
     """

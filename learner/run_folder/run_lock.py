@@ -53,7 +53,7 @@ WHY_UNREACHABLE = {
         "with --transport tcp and --keys, the keys of its local workers are not in any file; run it with --transport ipc"
     ),
 }
-JOIN_S = 5.0  # how long to wait for the thread at the end, because a file system that doesn't answer must not block that
+JOIN_S = 5.0  # how long to wait for the thread at the end, which a file system that doesn't answer must not block
 
 
 class RunLock:
@@ -131,7 +131,7 @@ class RunLock:
         self._rewrite()
         self.check()
 
-    # ---------------------------------------------------------------- taking it
+    # ---------------------------------------------------------------- taking the lock
 
     def _take(self) -> None:
         while True:
@@ -143,12 +143,12 @@ class RunLock:
                     self._file = open_regular(self._path, os.O_RDWR)
                     made = False
                 except FileNotFoundError:
-                    continue  # its owner has released it in between
+                    continue  # its owner has released the lock in between
             try:
                 if self._take_open_file(made=made):
                     return
             except BaseException as error:
-                if made and isinstance(error, OSError):  # such as on a full disk
+                if made and isinstance(error, OSError):  # for example, because the disk is full
                     self._path.unlink(missing_ok=True)
                 self._close()
                 raise
@@ -210,7 +210,7 @@ class RunLock:
             try:
                 content = read(self._path)  # opens it again, because a file system may cache the content of an open file
             except FileNotFoundError:
-                return  # the owner has released it
+                return  # the owner has released the lock
             match watch.judge(content, self._clock()):
                 case Verdict.ALIVE:
                     raise self._refusal(decoded(content) or owner)
@@ -218,7 +218,7 @@ class RunLock:
                     return
 
     def _refusal(self, owner: Owner | None) -> UsageError:
-        if owner is not None and _is_gone(owner):  # another process has locked the file: whoever can read it can do so
+        if owner is not None and _is_gone(owner):  # any process that can read the file can lock it
             return UsageError(
                 f"run {self._folder}: {owner}, which trained it, is gone, but another process has locked "
                 f"{self._path}; end that process (`lslocks` shows it) or delete the file, then resume"
@@ -228,7 +228,7 @@ class RunLock:
         how = f"kill {owner.pid}" if here and owner is not None else "end that process"
         return UsageError(f"run {self._folder}: {who} is training it; wait until it ends, or end it ({how}), then resume")
 
-    # ---------------------------------------------------------------- holding it
+    # ---------------------------------------------------------------- holding the lock
 
     def _rewrite_often(self) -> None:
         while not self._stop.wait(self._pace.rewrite_every):
@@ -262,7 +262,7 @@ class RunLock:
 
     def _write(self) -> None:
         os.pwrite(self._file, self._owner.encoded(), 0)
-        os.fdatasync(self._file)  # so that other machines see it
+        os.fdatasync(self._file)  # so that other machines see the new content
 
     def _read_open_file(self) -> bytes:
         return os.pread(self._file, 1 << 16, 0)
@@ -272,7 +272,7 @@ class RunLock:
         return owner is not None and owner.token == self._owner.token
 
     def _is_open_file(self) -> bool:
-        """Whether the open file is still the one at this path. Its owner may have removed it."""
+        """Whether the open file is still the one at this path. The owner may have removed the file."""
         with suppress(FileNotFoundError):
             return os.path.samestat(os.fstat(self._file), os.lstat(self._path))
         return False
@@ -313,9 +313,9 @@ def learner_of_run(folder: Path) -> LearnerOfRun:
 def living_owner(folder: Path, now: float) -> Owner:
     """The process that seems to train the run in this folder, for display. `now` is wall-clock time.
 
-    A process on this machine is looked up by its process number. Other ones, including those in containers, rewrite the file
-    every few seconds; if the clocks of two machines differ by much, the answer is wrong, so no write depends on it. Raises
-    `UsageError`, with a one-line message, if no process seems to train the run.
+    A process on this machine is looked up by its process number. Any other, such as one in a container, counts as alive if
+    it rewrote the file in the last few seconds. If the clocks of two machines differ by much, the answer is wrong, so no
+    write depends on it. Raises `UsageError`, with a one-line message, if no process seems to train the run.
     """
     path = folder / LOCK_FILE
     try:

@@ -18,7 +18,7 @@ from millrace.protocol.messages import Status
 from millrace.protocol.progress import RunProgress
 
 ABOUT_EQUAL = 0.2  # if the shares of time for which the two sides wait differ by less, neither is called slower
-BOTH_WAIT = 0.1  # how far the two shares must exceed 1 together before both sides are said to wait at once
+BOTH_WAIT = 0.1  # how far the sum of the two shares must exceed 1 before both sides are said to wait at once
 LEAST_PER_S = 1e-4  # one env step in three hours; a lower speed is shown as 0
 LONG_RETURN = 1e12  # from this size on, all digits of a return would make a table too wide
 COLLECTING = ("act", "step", "wait")
@@ -34,7 +34,7 @@ WRONG = {
 
 
 def steps_in_words(progress: RunProgress) -> str:
-    """How many env steps have been made, and of how many in all."""
+    """How many env steps have been made, out of how many in all."""
     made = f"{progress.env_steps_made:,}"
     return f"{made} of {progress.total_steps:,}" if progress.total_steps else made
 
@@ -52,7 +52,7 @@ def return_in_words(mean: float | None) -> str:
 
 
 def workers_in_words(progress: RunProgress) -> str:
-    """How many workers are alive, and of how many expected ones."""
+    """How many workers are alive, out of how many that are expected."""
     expected = f" of {progress.workers_expected}" if progress.workers_expected else ""
     return f"{progress.workers_alive}{expected}"
 

@@ -142,7 +142,7 @@ class Sharded(ActorCritic):
         return metrics
 
     def _learned_from(self, rows: Minibatch, gradient: Tensor) -> Report:
-        """Write the gradient of a shard's loss, times the number of its rows. Saves an exception for `_reports` to raise."""
+        """Write a shard's gradient, times its number of rows, to `gradient`. If this fails, `_reports` raises the error."""
         count = len(rows.action)
         if not count or self._failed is not None:
             return Report(0)

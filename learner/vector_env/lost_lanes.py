@@ -64,7 +64,7 @@ class LostLanes:
 
 
 def replacement_seeds(seeds: Iterable[int | None], incarnation: int) -> tuple[int | None, ...]:
-    """Seeds for copies that replace lost ones. They differ from the old seeds and depend on nothing else."""
+    """Seeds for copies that replace lost ones. They differ from the old seeds, but are reproducible."""
     return tuple(None if seed is None else env_seed(seed, Purpose.REPLACEMENT, incarnation) for seed in seeds)
 
 
