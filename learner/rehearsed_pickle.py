@@ -15,7 +15,7 @@ VALUES = {"NONE", "NEWTRUE", "NEWFALSE", "BININT", "BININT1", "BININT2", "LONG1"
 CONTAINERS = {"EMPTY_LIST", "EMPTY_DICT"}
 TUPLES = {"EMPTY_TUPLE": 0, "TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3}
 ADD = {"APPEND": 1, "SETITEM": 2}
-"""The opcodes that are allowed, by the names of pickletools, and how many items they pop from the stack. torch.save writes
+"""The allowed opcodes, by their names in pickletools, and how many items each pops from the stack. torch.save writes
 protocol 2."""
 
 REBUILD = {f"torch._utils {name}" for name in ("_rebuild_tensor_v2", "_rebuild_tensor_v3", "_rebuild_parameter")}

@@ -55,7 +55,7 @@ def policy_to_start_from(config: Config) -> StoredPolicy:
 def check_settings(config: Config, run: Path) -> list[str]:
     """Check that the run in this folder can be resumed with these settings. Returns lines about what will be different.
 
-    Raises `UsageError` if this isn't a run folder, or if fixed settings differ, which it names.
+    Raises `UsageError` if this isn't a run folder, or if fixed settings differ. The error names these settings.
     """
     RunFolder.open(run)
     before = _with_present_names(config_of_run(run, config.algo), config)
@@ -143,7 +143,10 @@ def _differences(before: Config, config: Config, changed: Sequence[Change]) -> l
 
 @contextmanager
 def naming_run(run: Path | None) -> Iterator[None]:
-    """Let errors name the run that is resumed, because the wrong setting may be in its folder. None for a new run."""
+    """Let errors name the run that is resumed, because the wrong setting may be in its folder.
+
+    `run` is None for a new run.
+    """
     try:
         yield
     except UsageError as error:

@@ -55,7 +55,7 @@ class RunLine(NamedTuple):
     """how far the run has got"""
     summary: Summary | None = None
     problem: str = ""
-    """why it cannot be read; empty if it can"""
+    """why the run cannot be read; empty if it can"""
 
     @property
     def name(self) -> str:

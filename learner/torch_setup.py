@@ -2,10 +2,10 @@
 acts.
 
 Rules: a run has PyTorch's initial defaults: float32, the CPU, gradients on. So the calling program's own choices don't
-change its results. Nor do the numbers of threads depend on who imported PyTorch and numpy first: a script, a notebook or the
-command line. numpy's matrices are so small that more threads of its BLAS gain nothing, and alongside other busy processes
-they would wait for one another, so that an update takes up to thirty times as long. Afterwards, the calling program gets its
-threads and defaults back.
+change the run's results. Nor do the numbers of threads depend on who imported PyTorch and numpy first: a script, a notebook
+or the command line. numpy's matrices are so small that more threads of its BLAS gain nothing, and alongside other busy
+processes they would wait for one another, so that an update takes up to thirty times as long. Afterwards, the calling
+program gets its threads and defaults back.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def one_thread(*, uses_torch: bool = True) -> Iterator[None]:
         with _lock:
             later = _inside[_inside.index(own) + 1 :]
             _inside.remove(own)
-            if later:  # leave it to the context that was entered next to restore the numbers from before this one
+            if later:  # the context that was entered next then restores the numbers from before this one
                 own[0].callback(later[0][0].close)
                 later[0][0] = own[0]
             else:

@@ -71,7 +71,7 @@ class Subject(NamedTuple):
     """The algorithm takes gradient steps on the last `MORE_UPDATES` of them."""
 
     def new(self, total_steps: int = TOTAL_STEPS) -> Algorithm:
-        """Make a new object. The global random generators have the same state for each."""
+        """Make a new object. The global random generators are in the same state each time."""
         _seed_everything(0)
         return self.algorithm(self.config, self.policy, total_steps=total_steps, seed=SEED)
 
@@ -186,7 +186,7 @@ def weights_are_copies(subject: Subject) -> Iterator[str]:
 
 
 def metrics_are_finite_numbers(subject: Subject) -> Iterator[str]:
-    """Check that metrics are names and finite floats, which can be logged."""
+    """Check that metrics have names and are finite floats, so that they can be logged."""
     algorithm = subject.new()
     for batch in subject.copies():
         metrics: Any = algorithm.update(batch, _no_pulse)

@@ -1,7 +1,7 @@
 """Batches for the check of an algorithm, made in this process: random ones, and those of the identity environment.
 
-Both follow the row format (`millrace.protocol.rollout`), with both terminated and truncated episodes in the random ones.
-Rows that are not valid hold rewards that an algorithm must not use. Pure: weights and a generator in, a batch out.
+Both follow the row format (`millrace.protocol.rollout`). The random ones contain terminated and truncated episodes. Rows
+that are not valid hold rewards that an algorithm must not use. Pure: weights and a generator in, a batch out.
 """
 
 from __future__ import annotations
@@ -55,10 +55,11 @@ def noise_batch(acting: ToyActor, steps: int, generator: np.random.Generator, fr
 
 
 def identity_batch(acting: ToyActor, steps: int, generator: np.random.Generator) -> tuple[Batch, float]:
-    """A batch of the identity environment, in which the right action is the one that is observed, and its mean reward.
+    """A batch of the identity environment, and its mean reward.
 
-    Each episode has one step. A discrete action gets 1 if it is the right one. A Box action gets minus its squared distance
-    from the observation. For a Dict or Tuple, the two rewards are added.
+    In this environment, the right action is the one that is observed. Each episode has one step. A discrete action gets 1 if
+    it is the right one. A Box action gets minus its squared distance from the observation. For a Dict or Tuple, the two
+    rewards are added.
     """
     columns = LANES * COPIES
     choice = generator.integers(0, CHOICES, (steps + 1, columns))
@@ -103,7 +104,8 @@ def with_other_invalid_rows(batch: Batch, generator: np.random.Generator) -> Bat
 def with_waiting_seats(batch: Batch) -> Batch:
     """The same rows, as if seats had to wait for one step before the outcome of each action is known.
 
-    Each row becomes two, in the first of which the seat waits. Where a row only resets, the reset is the first of the two.
+    Each row becomes two rows, and in the first of these the seat waits. Where a row only resets, the reset is the first of
+    the two.
     """
     T, columns = batch.valid.shape
     waits = np.zeros_like(batch.valid)
@@ -144,7 +146,7 @@ def with_rewards(batch: Batch, reward: float) -> Batch:
 
 
 class _OtherColumns(NamedTuple):
-    """The columns of a batch besides observations and actions, [T, ΣN] each."""
+    """The arrays of a batch other than observations and actions, [T, ΣN] each."""
 
     reward: Floats
     terminated: Bools

@@ -41,7 +41,7 @@ def value_loss(value: Tensor, target: Tensor) -> Tensor:
 
 
 def clipped_value_loss(value: Tensor, target: Tensor, old_value: Tensor, clip_range: float) -> Tensor:
-    """The value loss of OpenAI's PPO. Moving a value further than `clip_range` from `old_value` doesn't lower it.
+    """The value loss of OpenAI's PPO. Moving a value further than `clip_range` from `old_value` doesn't lower the loss.
 
     L = E[max((V − G)², (clip(V, V_old−ε, V_old+ε) − G)²)].  Stable-Baselines3 uses only the second square, which gives no
     gradient even to a value that moved too far in the wrong direction.

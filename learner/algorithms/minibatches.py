@@ -198,7 +198,7 @@ class WholeBatch(NamedTuple):
 def endless_epochs(
     minibatches: Callable[[torch.Generator | None], Iterable[Sequence[Minibatch]]], count: int, generator: torch.Generator
 ) -> Iterator[Iterable[Sequence[Minibatch]]]:
-    """Yield epochs without end. `minibatches` makes those of one epoch, in order if its argument is None.
+    """Yield epochs without end. `minibatches` makes one epoch's minibatches, in order if its argument is None.
 
     If an epoch is a single minibatch, it is made once, with its rows in order, and yielded every time.
     """

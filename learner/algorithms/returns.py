@@ -144,7 +144,7 @@ def n_step_returns(reward: Floats, ends: EpisodeEnds, gamma: float, n_step: int)
 
 
 def complete(ends: EpisodeEnds) -> Bools:
-    """[T, N] True for valid rows whose episode ends within the rollout, so that all later rewards of it are known."""
+    """[T, N] True for valid rows whose episode ends within the rollout, so that all its later rewards are known."""
     return np.asarray(np.logical_or.accumulate((ends.ended & ends.valid)[::-1])[::-1] & ends.valid)
 
 

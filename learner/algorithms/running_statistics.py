@@ -28,7 +28,7 @@ from millrace.protocol.policy.normalize import CLIP, normalize
 from millrace.protocol.rollout import Batch
 from millrace.protocol.specs import PolicySpec
 
-TINY = 1e-12  # a smaller standard deviation is only rounding: the value did not vary
+TINY = 1e-12  # a smaller standard deviation is only a rounding error; the value did not vary
 FAR = 100.0  # distance from the mean, in standard deviations, beyond which a value is far
 FEW = 100  # number of rows after which the scale counts as known
 ROUNDING_32 = 1e-6  # rounding error of float32, as a fraction of the mean

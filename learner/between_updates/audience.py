@@ -74,7 +74,7 @@ class Audience:
             self._callbacks.meanwhile(progress)
 
     def gathered(self, rollouts: Sequence[AcceptedRollout]) -> bool:
-        """Report that these rollouts have arrived. Returns whether an update should use them: no callback ended the run."""
+        """Report that these rollouts have arrived. Returns False if a callback ended the run, so that they aren't used."""
         began_s = time.monotonic()
         if self._callbacks.wants("on_rollouts"):
             progress = msgspec.structs.replace(

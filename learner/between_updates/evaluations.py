@@ -37,8 +37,7 @@ class Evaluations:
         self.final: Evaluation | None = None
         """The evaluation of the final policy that is reported. Set by `conclude`."""
         self.ended_by: Evaluation | None = None
-        """The evaluation that ended the run, if it was one of the final policy. Then `final` is a second one, on other
-        episodes."""
+        """The evaluation of the final policy that ended the run, if one did. `final` is then another, on other episodes."""
         self._run = run
         self._config = run.config
         self._time_limit = time_limit

@@ -100,7 +100,7 @@ class Tally:
     # ---------------------------------------------------------------- seconds
 
     def updated(self, seconds: float) -> None:
-        """Count the time of an update, which was published this many seconds after its rollouts arrived.
+        """Count the time of an update: the `seconds` from the arrival of its rollouts until its weights were published.
 
         These seconds include the time that callbacks and the dataset took for the rollouts, which is subtracted.
         """

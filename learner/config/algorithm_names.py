@@ -98,7 +98,7 @@ def name_of(algorithm: type) -> str:
 
 
 def moved(before: str, now: str) -> bool:
-    """Whether a run of the algorithm `before` may continue with `now`: the same class, but in a module now."""
+    """Whether a run of algorithm `before` may continue with `now`, because the same class was moved to a module."""
     module, _, qualname = before.partition(":")
     return (module == "__main__" or "<locals>" in qualname) and is_own(now) and last_part(before) == last_part(now)
 

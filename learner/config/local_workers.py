@@ -23,7 +23,7 @@ def local_workers(config: RolloutConfig, cores: int | None = None) -> int:
 
 
 def _as_fast(lanes: int, workers: int) -> int:
-    """The least number of workers at which none steps more lanes than with `workers` workers."""
+    """The least number of workers with which the busiest one has no more lanes than with `workers` workers."""
     return -(-lanes // -(-lanes // workers))
 
 

@@ -76,7 +76,7 @@ class Coordinator(ABC, Generic[M]):
         return self._unusable(member, why) + self._deal()
 
     def revoke(self, peer: bytes, why: str) -> list[Outgoing]:
-        """Remove a member whose key was revoked, at once, whatever it holds, and send it the reason."""
+        """Remove a member at once, whatever work it has, because its key was revoked. Sends it the reason."""
         return self.membership.revoke(peer, why) + self._deal()
 
     def process_ended(self, ended: WorkerExit | StartFailed) -> list[Outgoing]:

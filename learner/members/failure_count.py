@@ -30,7 +30,7 @@ TOLD_FIRST = 4
 
 
 class FailureCount:
-    """The failures of a run. Lanes are counted by number, and a worker without a lane by name."""
+    """The failures of a run. Each counts for a lane, by its number, or for a worker without a lane, by its name."""
 
     def __init__(self, allowed: int, copies: int = 1, began_s: float = 0.0) -> None:
         """`allowed` is `max_env_failures`, `copies` the number of env copies, `began_s` the time when the learner began."""
@@ -70,7 +70,7 @@ class FailureCount:
         return f"failure {in_a_row:g} in a row{why}; max_env_failures allows {allowed} in a row"
 
     def count(self, event: Event, now: float) -> str:
-        """Count an event if it is a failure of the environment or of a policy that the user wrote, which count together.
+        """Count an event if it is a failure of the environment or of the user's policy. Both are counted together.
 
         Returns a line for the log if the user should know how often the environment fails; otherwise an empty string.
         """

@@ -1,9 +1,9 @@
 """Assignment of lanes to workers. Pure: no clock, no socket.
 
-Rule: every lane has an owner as long as there are workers, and no worker has two more lanes than another. Workers that only
-evaluate, or that are still describing an environment, have no lanes. A lane moves only between its rollouts. The placement
-is recomputed only after an event that can change it: with a thousand workers, checking all of them at each rollout would
-take longer than the rollout.
+Rule: every lane has an owner as long as there are workers, and the numbers of lanes of two workers differ by at most one.
+Workers that only evaluate, or that are still describing an environment, have no lanes. A lane moves only between its
+rollouts. The placement is recomputed only after an event that can change it: with a thousand workers, checking all of them
+at each rollout would take longer than the rollout.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class PlacedLane:
 
     @property
     def busy(self) -> int:
-        """The number of its tickets that its worker holds. A lane moves only if there are none."""
+        """How many of the lane's tickets its worker holds. A lane moves only if there are none."""
         return 0
 
     def restart(self) -> None:

@@ -38,8 +38,9 @@ class SharingSupervisor:
 class Speed:
     """How fast a worker steps.
 
-    A step may take minutes, and a client may count the steps of a rollout only when that is complete. So the speed is
-    measured between the last two heartbeats with more steps. The speed falls once the next measurement is overdue.
+    A step may take minutes, and a client may count the steps of a rollout only when the rollout is complete. So the speed is
+    measured between the last two heartbeats that reported more steps than before. The speed falls once the next measurement
+    is overdue.
     """
 
     steps: int
@@ -91,7 +92,7 @@ class Member:
     heartbeat: Heartbeat | None = None
     """Newest heartbeat."""
     stages_before: Stages = field(default_factory=dict)
-    """Seconds in each stage of the worker's process before this session."""
+    """Seconds that the worker's process spent in each stage before this session."""
     speed: Speed | None = None
     """The worker's speed; None before its first heartbeat."""
     first_step_s: float | None = None
@@ -145,7 +146,7 @@ class Member:
             self.first_step_s = self.heard_s
 
     def record_activity(self, activity: WorkerActivity, now: float) -> bool:
-        """Record a supervisor's statement. Returns whether calls of the environment have returned since the last one."""
+        """Record a supervisor's statement. Returns whether calls of the environment have returned since the last."""
         before = self.activity
         self.activity = activity
         self.activity_s = now

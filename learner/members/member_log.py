@@ -19,11 +19,11 @@ log = logging.getLogger("millrace.learner")
 MOST_WORKERS = 1_000  # how many workers' budgets are remembered
 OF_A_WORKER = Allowance(lines=30, lines_per_s=0.2, bytes=MAX_TEXT, bytes_per_s=100)
 OF_A_KEY = Allowance(lines=5_000, lines_per_s=1, bytes=6 * MAX_TEXT, bytes_per_s=100)
-LINE_BYTES = 100  # size of the rest of a line: time, level, line break
+LINE_BYTES = 100  # size of a line without its text: time, level, line break
 
 
 class MemberLog:
-    """Log lines caused by workers: few for each worker and for each key, however much it sends."""
+    """Writes log lines about workers, but only a few for each worker and for each key, however much they send."""
 
     def __init__(self, link: LearnerLink, clock: Callable[[], float]) -> None:
         self._link = link

@@ -67,7 +67,7 @@ STATUS_SHARE = 20  # answers to Inquire take at most 1 / STATUS_SHARE of the tim
 
 
 class ServedHub(Protocol):
-    """The owner of a server. The server calls it with each event, while the owner waits for the server."""
+    """The owner of a server, which the server calls with each event."""
 
     def status(self, now: float) -> Status:
         """The answer to `millrace status`."""

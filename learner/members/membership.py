@@ -113,7 +113,7 @@ class Membership(Generic[M]):
         self._joins = 0
         self._none_silent_before_s = -math.inf  # before this time, no member can have been silent for too long
         self._of_process: dict[tuple[str, int], M] = {}  # the members by name and process_nonce
-        self._removed_for_silence: dict[str, int] = {}  # by name, the process_nonce, until it joins again; oldest first
+        self._removed_for_silence: dict[str, int] = {}  # process_nonce by worker, until it joins again; oldest first
         self._stages_of_left: Stages = {}  # total seconds in each stage of the members that have left
         self._refused: dict[bytes, tuple[int, str]] = {}  # by peer, the nonce of the process that was refused, and why
 
@@ -143,7 +143,7 @@ class Membership(Generic[M]):
         return events
 
     def hear(self, peer: bytes, message: ToLearner, now: float) -> M | Answered:
-        """The member, if one sent this message in its session, for the caller to answer. Otherwise, the answer to it."""
+        """The member that sent this message in its session, which the caller must answer; otherwise the answer."""
         match message:
             case Hello():
                 out, joined = self.join(peer, message, now)
@@ -255,13 +255,14 @@ class Membership(Generic[M]):
         return self._refuse_and_remove(member, event, f"refused: {why}", why)
 
     def revoke(self, peer: bytes, why: str) -> list[Outgoing]:
-        """Remove a member whose key was revoked, at once, whatever work it has."""
+        """Remove a member at once, whatever work it has, because its key was revoked."""
         return self._refuse_and_remove(self.members[peer], KeyRevoked, f"was shut out: {why}", why)
 
     def hear_supervisor(self, peer: bytes, alive: Alive, now: float) -> tuple[list[Outgoing], list[WorkerExit]]:
-        """Record a supervisor's statements about members. Only those about members with its key and a nonce it knows count.
+        """Record a supervisor's statements about members.
 
-        Returns the answer, and the exits of processes that removed members.
+        A statement counts only if the member has the supervisor's key, and if the supervisor knows the member's nonce. Returns
+        the answer, and the exits of processes that removed members.
         """
         key = key_of_peer(peer)
         found = [self.record_activity(activity, now, key) for activity in alive.running]

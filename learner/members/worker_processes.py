@@ -15,7 +15,7 @@ from millrace.protocol.alive import StartFailed, WorkerActivity, WorkerExit
 
 
 class WorkerProcesses:
-    """No worker processes of this program; workers may join from elsewhere."""
+    """The worker processes of a program that starts none. Workers may join from elsewhere."""
 
     expected: int = 0
     """The number of processes that the user asked for; 0 for any number."""

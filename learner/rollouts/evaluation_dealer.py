@@ -85,7 +85,7 @@ class EvaluationPlan:
 
 
 def episode_seeds(seed: int, episodes: int, purpose: Purpose = Purpose.EPISODES) -> tuple[int, ...]:
-    """The reset seed of each episode. If there are fewer episodes, they have the first of the same seeds."""
+    """The reset seed of each episode. More episodes only add seeds at the end."""
     return tuple(env_seed(seed, purpose, episode) for episode in range(episodes))
 
 
@@ -218,7 +218,7 @@ class EvaluationDealer:
         return out
 
     def share(self, active: Sequence[Member]) -> list[Outgoing]:
-        """Give the oldest ticket that only one worker plays to a second worker that plays nothing."""
+        """Give the oldest ticket that only one worker plays to a second worker, which must be idle."""
         plan = self._plan
         assert plan is not None
         who = [member for member in active if member.hello.evaluates or not self.beside or self.most_copies is None]

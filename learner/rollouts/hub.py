@@ -89,7 +89,7 @@ class HubSnapshot(NamedTuple):
     evaluate_s: float = 0.0
     """Seconds spent in evaluations since this learner started."""
     learn_s: float = 0.0
-    """Seconds spent on anything else, since the learner first waited for rollouts."""
+    """Seconds spent on anything but these waits and evaluations, since the learner first waited for rollouts."""
     waiting: str = ""
     """A line for people that says who waits for whom; empty if nobody has waited for long."""
     roles: Mapping[str, str] = {}

@@ -43,7 +43,7 @@ class TicketedLane(PlacedLane):
     failures: int = 0
     """How many times its environment has failed since its last rollout arrived."""
     failed_at_once: bool = True
-    """Whether the first of these failures and losses happened before any rollout of its incarnation arrived."""
+    """Whether the first of these failures and losses happened before any rollout of the incarnation arrived."""
     losses: int = 0
     """How many times, since its last rollout arrived, its worker was lost while it collected."""
 
@@ -148,7 +148,7 @@ class Ticket:
     peer: bytes
     opponent: int | None = None
     past: LanePast | None = None
-    """`opponent` and `past` have the meanings that they have in a `Permit`."""
+    """`opponent` and `past` mean the same as in a `Permit`."""
 
     def permit(self, worker: Hello) -> Permit:
         """The ticket in the form that is sent to this worker."""

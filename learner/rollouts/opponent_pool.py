@@ -83,7 +83,7 @@ class PoolSettings(NamedTuple):
     scripted: int = 0
     """How many of the opponents are programs that the user wrote."""
     teams: int = 2
-    """How many teams there are, of which the policy plays one."""
+    """The number of teams. The policy plays one of them."""
 
 
 class OpponentPool:

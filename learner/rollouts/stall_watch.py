@@ -47,7 +47,7 @@ class StallWatch:
         self._mark: object = None
         self._progress_s = self._answered_s = 0.0
         self._answered = 0  # number of episodes of the pending evaluation that have arrived
-        self._dealt_s: dict[tuple[bytes, int], float] = {}  # by worker and ticket, when this file first saw the ticket
+        self._dealt_s: dict[tuple[bytes, int], float] = {}  # by worker and ticket, when this object first saw the ticket
         self._budgets_due_s = -math.inf
 
     def begin(self, now: float) -> None:

@@ -277,7 +277,7 @@ class TicketCoordinator(Coordinator[CollectingMember]):
         return self.rollouts.received(member)
 
     def _removed(self, member: CollectingMember, why: str) -> None:
-        """Count a lost worker's tickets as lost, and take its lanes, so that `_deal` gives both to other workers."""
+        """Count a lost worker's tickets as lost, and take away its lanes, so that `_deal` gives both to other workers."""
         self.rollouts.worker_lost(member)
         for number in list(member.tickets):
             dealer = self.rollouts if number in self.rollouts.held else self.evaluation

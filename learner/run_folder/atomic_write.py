@@ -70,7 +70,7 @@ def _flush_folder(folder: Path) -> None:
 
 
 class Writes:
-    """Makes the writes of a run, and remembers those that have failed, by name."""
+    """Calls the functions that write a run's files, and remembers those that have failed, by name."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic, sleep: Callable[[float], None] = time.sleep) -> None:
         self._clock = clock

@@ -1,9 +1,7 @@
-"""The log as JSON, one event per line: all of it on stderr (`--log-json`), and its warnings and notices in log.jsonl.
+"""The log as JSON, one event per line: all of it on stderr (`--log-json`), and its warnings and notices in a file.
 
-log.jsonl is in the run folder.
-
-Every line has `time` (UTC, ISO 8601), `level`, `event` and `message`, the text for people. `event` is "joined",
-"left", "refused", "environment_raised", "policy_raised", "process_failed" or "asked_to_rejoin"
+The file is log.jsonl in the run folder. Every line has `time` (UTC, ISO 8601), `level`, `event` and `message`, the text for
+people. `event` is "joined", "left", "refused", "environment_raised", "policy_raised", "process_failed" or "asked_to_rejoin"
 (`millrace.learner.members.events`, with the fields of the event), "progress", or "said" for any other line of the log.
 
 Rule: the size of log.jsonl is bounded, and nothing depends on the file. If it grows too long, only the newer half is kept.

@@ -100,7 +100,7 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
 
 
 def read_and_count_rows(path: Path) -> tuple[list[dict[str, Any]], int]:
-    """The readable rows, and the number of unreadable ones, without a last line that was cut off. Raises OSError."""
+    """The readable rows, and the number of unreadable ones. A last line that was cut off is ignored. Raises OSError."""
     *lines, _ = read(path, MOST_BYTES).split(b"\n")
     rows = [row for line in lines if (row := decoded_row(line)) is not None]
     return rows, len(lines) - len(rows)

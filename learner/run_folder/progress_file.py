@@ -55,7 +55,7 @@ class ProgressFile:
 def last_progress(run: Path, summary: Summary | None, total_steps: int = 0) -> RunProgress:
     """The last known progress of a run, from its `summary` if there is one, otherwise from its progress.json.
 
-    `total_steps` is from its settings, and all that is known if neither can be read.
+    `total_steps`, from the run's settings, is all that is known if neither can be read.
     """
     if summary is not None:
         return of_summary(summary, total_steps)

@@ -30,7 +30,7 @@ WRONG = {
     "messages_bad": ("message could not be read", "messages could not be read"),
     "late_actions": ("action came too late", "actions came too late"),
 }
-"""The words for one and for several of each count of the ledger."""
+"""For each count of the ledger, the words for one and for several."""
 
 
 def steps_in_words(progress: RunProgress) -> str:
@@ -66,7 +66,7 @@ def lag_in_words(progress: RunProgress) -> str:
 
 
 def weights_in_words(version: int, newest: int) -> str:
-    """How old the weights that a worker holds are: `version` compared with the `newest`. -1 means that it has none."""
+    """How old a worker's weights are: `version` compared with the `newest`. Version -1 means that it has none."""
     if version < 0:
         return "none"
     return f"{newest - version} behind" if version < newest else "newest"

@@ -72,7 +72,7 @@ class Learners:
         """`reply_s` is how many seconds the others wait for a message."""
         self.division = division
         self.others_wait = True
-        """Whether the others wait for a message. They don't during an update or a message, or once one was cut off."""
+        """Whether the others wait for a message. False during an update or a message, and after an interrupted one."""
         self._tell_every_s = reply_s * TELL_BEFORE
         self._told_s = time.monotonic()
 

@@ -1,4 +1,4 @@
-"""The rows of a batch whose shards are divided among learner processes. Each has only the observations of its own shards.
+"""The rows of a batch whose shards are divided among learner processes. Each process has only the observations of its own.
 
 Law: every minibatch consists of one part per shard. All processes know the small arrays of the whole batch, so they draw the
 same parts for all shards, and standardize advantages over the whole minibatch. A shard without rows in a minibatch has an
@@ -109,7 +109,7 @@ class ShardRows(NamedTuple):
         return endless_epochs(minibatches, count, generator)
 
     def _standardized(self, advantages: Sequence[Tensor]) -> Sequence[Tensor]:
-        """The advantages of all parts, scaled, if so set, to mean 0 and standard deviation 1 over the whole minibatch."""
+        """The advantages of all parts, standardized over the whole minibatch if the settings say so."""
         if not self.standardizes:
             return advantages
         return torch.split(standardized(torch.cat(list(advantages))), [len(each) for each in advantages])

@@ -138,7 +138,7 @@ class SendRecv:
         for lane in lanes:
             if lane in unreported:
                 continue  # this step reports the loss in place of a result
-            if lane in awaiting_reset:  # in NextStep mode, the step after a truncation resets, too
+            if lane in awaiting_reset:  # as in NextStep mode, the step after a truncation resets
                 hub.send_order(lane, parts.reset_of_new_copies(lane).order())
             elif fit and hub.can_share(lane):
                 shared.append(lane)
@@ -327,12 +327,12 @@ class SendRecv:
                 case AfterLoss.RAISE:
                     self._to_raise[lane] = parts.lost_lanes.unreported[lane]
                     if asked is not Asked.CALL or parts.on_worker_loss == "raise":
-                        parts.lost_lanes.report([lane])  # after other calls, the next step reports the loss
+                        parts.lost_lanes.report([lane])  # otherwise, the next step reports it
                     sent.drop(lane)
                 case AfterLoss.RESET_AGAIN:
                     assert isinstance(asked, AskedReset)
                     if len(asked.copies) == len(copies):
-                        parts.lost_lanes.forget([lane])  # all copies are reset; otherwise the next step reports the others
+                        parts.lost_lanes.forget([lane])  # nothing is left to report, because all copies are reset
                     self._reset_instead(lane, asked, {})
                 case AfterLoss.RESET_NEW_COPIES:
                     self._warn(lane, parts.lost_lanes.report([lane])[lane])

@@ -202,9 +202,10 @@ class SentLanes:
 
 
 class WatchedTime:
-    """A clock for the timeouts of workers. If nobody looked for longer than `LONGEST_GAP_S`, only that much time counts.
+    """A clock for the timeouts of workers. Between two looks at the clock, at most `LONGEST_GAP_S` counts.
 
-    So if the learner computed for a minute, or was stopped together with its workers, no worker is treated as lost for that.
+    So if the learner computed for a minute, or was stopped together with its workers, no worker is treated as lost because
+    of that.
     """
 
     def __init__(self, now: float) -> None:
@@ -212,7 +213,7 @@ class WatchedTime:
         self._total_s = 0.0
 
     def look(self, now: float) -> float:
-        """Record that somebody looks now. Returns the number of seconds that were watched until now."""
+        """Look at the clock. Returns the seconds that have counted so far."""
         self._total_s += min(now - self._looked_s, LONGEST_GAP_S)
         self._looked_s = now
         return self._total_s

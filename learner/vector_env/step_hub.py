@@ -182,7 +182,7 @@ class StepHub:
             self._turn(0.0)
 
     def give_up(self, lane: int, timeout_s: float) -> None:
-        """Treat the worker of a lane that took longer than `timeout_s` as lost.
+        """Treat a lane's worker as lost, because it took longer than `timeout_s`.
 
         Raises `NoWorkers` if the lane had no worker all that time.
         """

@@ -1,4 +1,4 @@
-"""The base of CrossQ and XQC: SAC with batch normalization in actor and critics, whose actor learns at every k-th step.
+"""The base of CrossQ and XQC: SAC with batch normalization in actor and critics. The actor learns at every k-th step.
 
 Rule: observations and next observations, with their actions, pass the critics in one minibatch. They come from different
 distributions. In separate minibatches they would be normalized by different means, and values and targets would not be

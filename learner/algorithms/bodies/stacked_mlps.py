@@ -180,6 +180,6 @@ class StackedMLPs:
 
 
 def _linear(layer: Layer, running: RunningStatistics) -> tuple[Tensor, Tensor]:
-    """The scale and the shift, [K, n, 1] each, to which a normalization by running statistics amounts."""
+    """The scale and the shift, [K, n, 1] each, that have the effect of a normalization by running statistics."""
     scale = layer.gain * (running.variance + EPS).rsqrt()
     return scale, layer.shift - running.mean * scale

@@ -44,7 +44,7 @@ class Linear(NamedTuple):
 
     @staticmethod
     def stacked(names: Sequence[str], values: Mapping[str, Array], grads: Mapping[str, Array]) -> Linear:
-        """Stack the layers with these names, each of which belongs to another network, into one `Linear`."""
+        """Stack the layers with these names, each of which belongs to a different network, into one `Linear`."""
         weight, bias, weight_grad, bias_grad = (
             _stacked_view([of[f"{name}.{kind}"] for name in names]) for of in (values, grads) for kind in ("weight", "bias")
         )
@@ -235,7 +235,7 @@ class _Workspace:
     def backward(
         self, by_results: Sequence[Tensor], wants_x: bool, wants_parameters: bool
     ) -> tuple[Tensor | None, Tensor | None]:
-        """The gradients with respect to x and to all parameters, or None if not wanted, from those of the results."""
+        """From the gradients of the results, those of x and of all parameters; None for a gradient that isn't wanted."""
         by_heads = self._top.backward([by_result.numpy() for by_result in by_results])
         by_x = self.by_input(by_heads) if wants_x else None
         return by_x, self.by_parameters(by_heads) if wants_parameters else None
@@ -251,7 +251,7 @@ class _Workspace:
         return self._gradient.clone()
 
     def by_input(self, by_heads: Sequence[Array]) -> Tensor:
-        """∂L/∂x [B, D]. There must be a hidden layer. The argument is that of `by_parameters`."""
+        """∂L/∂x [B, D]. There must be a hidden layer. For the argument, see `by_parameters`."""
         self._place(by_heads)
         for chunk in self._plan.chunks:
             for call in chunk.heads_to_input + chunk.hidden_to_input:

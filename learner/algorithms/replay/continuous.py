@@ -112,20 +112,20 @@ class Continuous(OffPolicy):
         self._generator = torch.Generator().manual_seed(torch_seed(seed, Purpose.NOISE))
         self._counted = {"updates_per_step": config.updates_per_step, "env_steps": config.learning_starts, "made": 0}
         self._learning_starts = config.learning_starts
-        self._acts_at_once = False  # True if the policy starts trained: then no uniform actions precede it
+        self._acts_at_once = False  # True if the policy was trained before; then uniform actions don't come first
         self.tensors = {"parameters": self.net.flat, "target": self.target.flat}
         trained = {"actor_optimizer": self.net.actor, "critic_optimizer": self.net.critics}
         self.optimizers = {name: make_optimizer("adam", part, **self.ADAM) for name, part in trained.items()}
 
     def networks(self, device: str) -> Networks:
-        """Make new networks, equal each time. Called twice: for the networks that are trained, and for their targets."""
+        """Make new networks, equal each time. Called for the networks that are trained, and again for their targets."""
         return actor_and_critics(self.policy, device, self.seed)
 
     def after_step(self, name: str) -> None:
-        """Move weights back to where the algorithm keeps them. Called after each step of NAME_optimizer, and in cloning."""
+        """Enforce the algorithm's constraints on weights. Called after each step of NAME_optimizer, including in cloning."""
 
     def begin_with_actor(self) -> None:
-        """Let an actor that was trained before the first rollouts act from the first env step, and copy it to its target."""
+        """Let an actor that was trained before the first rollouts act from the first env step. Copies it to its target."""
         self.target.actor.copy_(self.net.actor)
         self._acts_at_once = True
 

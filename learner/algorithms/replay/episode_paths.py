@@ -63,7 +63,7 @@ class EpisodePaths:
         self._number[slots] = NO_PATH
 
     def append(self, slots: Ints, after: Ints) -> None:
-        """Append each of the slots [K] to the path whose newest slot is in `after` [K], or to a new path for NO_SLOT."""
+        """Append each of the slots [K] to the path whose newest slot is in `after` [K], or to a new one for NO_SLOT."""
         for slot, before in zip(slots.tolist(), after.tolist(), strict=True):
             if before == NO_SLOT:
                 number = self._next
@@ -79,7 +79,7 @@ class EpisodePaths:
     def later(self, slots: Ints, chance: Doubles) -> Ints:
         """For each of the slots [K], one of the slots that follow it on its path.
 
-        `chance` [K], in [0, 1), selects which one: uniform random numbers draw uniformly.
+        `chance` [K], in [0, 1), selects which one. If `chance` is uniform, so is the choice.
         """
         found = np.empty(len(slots), np.int64)
         wanted = zip(self._number[slots].tolist(), self._place[slots].tolist(), chance.tolist(), strict=True)

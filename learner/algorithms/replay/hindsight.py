@@ -182,7 +182,7 @@ class Hindsight:
         """The rewards and ends [K] of steps under other goals `goal` [K, *goal].
 
         The steps led to the goals `achieved` while `desired` applied, and `terminated` [K] says which of them terminated
-        their episode then. A termination whose cause wasn't the desired goal stays.
+        their episode. A termination stays if reaching the desired goal did not cause it.
         """
         led_to = _flat(achieved)
         wanted = _flat(goal)

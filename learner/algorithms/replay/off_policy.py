@@ -102,8 +102,8 @@ class OffPolicy(GradientDescent):
     def update(self, batch: Batch, pulse: Callable[[], None]) -> UpdateMetrics:
         """Add a batch to the replay buffer, then take the gradient steps that are due. Returns metrics.
 
-        Calls `pulse` between gradient steps.
-        If a loss or a gradient is not finite, raises `RunError` before it reaches the weights.
+        Calls `pulse` between gradient steps. If a loss or a gradient is not finite, raises `RunError` before it changes the
+        weights.
         """
         self.set_schedules()
         beta = 1 - (1 - self.config.priority_beta) * self.remaining()
@@ -202,7 +202,7 @@ class OffPolicy(GradientDescent):
         self.statistics = self.normalizer.buffers()
 
     def learn_from_prior(self, pulse: Callable[[], None]) -> None:
-        """Take `prior_steps` gradient steps on prior data alone, less those already taken."""
+        """Take `prior_steps` gradient steps on prior data alone, except those already taken."""
         self.set_schedules()  # a state that was loaded may have changed the learning rate
         for _ in self.steps(self.config.prior_steps - self.prior_gradient_steps, pulse):
             self.prior_gradient_steps += 1

@@ -36,7 +36,7 @@ from millrace.protocol.specs import PolicySpec
 NONE = -1  # stands for "no sequence" where a sequence's number is expected
 FEWEST = 16
 """The least number of sequences in a draw. Rows of a sequence are alike, so few sequences would give a noisy gradient."""
-HIGHEST_SHARE = 0.9  # share of the highest error in a sequence's priority; the rest is the mean (Kapturowski et al. 2019)
+HIGHEST_SHARE = 0.9  # weight of the highest error in a priority; the mean error has the rest (Kapturowski et al. 2019)
 
 
 class SequenceSample(NamedTuple):

@@ -69,7 +69,7 @@ class Transitions(NamedTuple):
     """how the rows lie in sequences; None without a recurrent core, and after the rows were encoded"""
 
     def encoded(self, encode: Encoder) -> Transitions:
-        """A copy with an encoder's outputs [B, H] in place of features and images. Those of `next_x` have no gradient."""
+        """A copy with an encoder's outputs [B, H] in place of features and images. Outputs for `next_x` have no gradient."""
         if self.sequences is not None:
             h = self.sequences.outputs(encode, self.x, self.images)
             x = h[self.sequences.rows]
