@@ -261,8 +261,8 @@ class Membership(Generic[M]):
     def hear_supervisor(self, peer: bytes, alive: Alive, now: float) -> tuple[list[Outgoing], list[WorkerExit]]:
         """Record a supervisor's statements about members.
 
-        A statement counts only if the member has the supervisor's key, and if the supervisor knows the member's nonce. Returns
-        the answer, and the exits of processes that removed members.
+        A statement counts only if the member has the supervisor's key, and if the supervisor knows the member's nonce.
+        Returns the answer, and the exits of processes that removed members.
         """
         key = key_of_peer(peer)
         found = [self.record_activity(activity, now, key) for activity in alive.running]
