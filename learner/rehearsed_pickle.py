@@ -87,7 +87,7 @@ def _gather(stack: list[object], first: int) -> None:
 
 
 def _cost(called: object, arguments: object) -> int:
-    """How many bytes a call allocates besides tensors. Raises `Unfit` for a call that torch.save does not write."""
+    """How many bytes a call allocates, apart from tensors. Raises `Unfit` for a call that torch.save does not write."""
     match called, arguments:
         case _Function(name), tuple() if name in REBUILD:
             return 0

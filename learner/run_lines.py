@@ -35,8 +35,8 @@ from millrace.protocol.errors import UsageError
 from millrace.protocol.progress import RunProgress
 
 RunCondition = Literal["training", "finished", "interrupted", "dead", "unreadable"]
-MOST_RUNS = 1_000  # the most runs that are listed
-MOST_REASON = 40  # the most characters of a reason
+MOST_RUNS = 1_000  # how many runs are listed at most
+MOST_REASON = 40  # limit on the characters of a reason
 STARTED = re.compile(r"-(\d{8}-\d{6})(?:-\d{1,9})?")
 
 
@@ -175,7 +175,7 @@ def algorithm_label(algo: str) -> str:
 
 
 def _started(path: Path) -> str:
-    """When the run began, according to the name of its folder or, if that has no time, to the age of its run.json."""
+    """When the run began, according to the time in its folder's name or, if there is none, to the age of its run.json."""
     stamp = STARTED.search(path.name)
     try:
         began = time.strptime(stamp[1], "%Y%m%d-%H%M%S") if stamp else time.localtime((path / RUN_FILE).lstat().st_mtime)

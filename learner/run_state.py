@@ -1,4 +1,4 @@
-"""The state of a run: the content of a checkpoint besides the algorithm's own state, and how it is restored.
+"""The state of a run: the content of a checkpoint apart from the algorithm's own state, and how it is restored.
 
 A resumed run restores all of it (`restore`). A new run may take over a part of another run's state (`start_from`), but only
 numbers, for a policy that its own settings describe. Modules that the other run folder names are not imported.

@@ -44,7 +44,7 @@ from millrace.protocol.policy.own_encoder import describe_encoder
 from millrace.protocol.rollout import Batch
 from millrace.protocol.specs import PolicySpec
 
-MOST_STEPS = 64  # the most steps of a rollout in this check
+MOST_STEPS = 64  # rollouts in this check have at most this many steps
 MOST_WARM_UP = 24  # the most updates before the first gradient step, because an algorithm may fill a replay buffer first
 MORE_UPDATES = 3  # number of updates that follow the first gradient step
 TOTAL_STEPS = 20_000  # env steps of the toy run, for schedules

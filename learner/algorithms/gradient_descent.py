@@ -155,7 +155,7 @@ class GradientDescent(Algorithm):
         return bool(all(tensor.isfinite().all() for tensor in self.tensors.values()) and np.isfinite(self.statistics).all())
 
     def other_state(self) -> dict[str, Any]:
-        """A copy, as plain data, of what the next update depends on besides tensors, optimizers and statistics."""
+        """A copy, as plain data, of what else the next update depends on, apart from tensors, optimizers and statistics."""
         return {"env_steps": self.env_steps, "version": self.version, "pretraining_steps": self.pretraining_steps}
 
     def load_other_state(self, state: dict[str, Any]) -> None:

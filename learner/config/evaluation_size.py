@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from millrace.learner.config.config import Config
 
-MOST_EPISODES = 100  # the most episodes of an evaluation, unless the settings give a number
+MOST_EPISODES = 100  # the largest number of episodes in an evaluation, unless the settings give a number
 FEWEST_EPISODES = 10
 LONGEST_EPISODE = 10  # without a time limit, episodes are cut at this many times the mean length of training episodes
 

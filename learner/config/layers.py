@@ -35,7 +35,7 @@ ALL_BUT_TABLES = {*Config.__struct_fields__} - {"algorithm", *TABLES}
 
 
 class SettingsLayer(NamedTuple):
-    """The settings from one source, with those of the run and those of its algorithm in one mapping."""
+    """The settings from one source. The run's and the algorithm's settings are in one mapping."""
 
     where: str
     """how an error begins: with a file, `preset NAME` or `train`; empty for flags, whose names say enough"""

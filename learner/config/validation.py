@@ -22,7 +22,7 @@ from millrace.protocol.envs.wrappers import wrapper_name
 from millrace.protocol.errors import UsageError, safe_repr
 from millrace.protocol.own_module import is_name
 
-MOST_TICKETS = 1 << 15  # the most outstanding tickets, because one worker may get them all in one message
+MOST_TICKETS = 1 << 15  # limit on outstanding tickets, because one worker may get them all in one message
 LARGEST_SEED = 2**64 - 1  # the largest seed that PyTorch accepts
 
 

@@ -115,7 +115,7 @@ class Coordinator(ABC, Generic[M]):
     def _again(self, member: M, heartbeat: Heartbeat, lost: Sequence[int]) -> list[Outgoing]:
         """The messages to send again because this heartbeat shows that they were lost.
 
-        `lost` are those of the member's tickets that were lost.
+        `lost` are the member's tickets that were lost.
         """
         return []
 

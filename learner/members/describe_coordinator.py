@@ -43,7 +43,7 @@ class Unknown:
 
     env: EnvSpec
     vector: str = "loop"
-    """The kind of env copies, whose spaces must equal those of a single copy."""
+    """The kind of env copies. Copies of this kind must have the same spaces as a single copy."""
     render_mode: str | None = None
     accept: Accept = accept_any
 

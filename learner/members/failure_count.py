@@ -86,7 +86,7 @@ class FailureCount:
         return int(self._allowed * (1 + copy_hours + self._worked_s() / WORK_S))
 
     def _worked_s(self) -> float:
-        """The total number of seconds that the workers that failed within the hour had worked."""
+        """How many seconds, in total, the workers that failed within the hour had worked."""
         return sum(before_s for _, before_s in self._within_hour)
 
     def _how_often(self, now: float) -> str:

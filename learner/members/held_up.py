@@ -23,7 +23,7 @@ DOING = {
     "closing": "in close",
 }
 """What a worker is doing, in words. Only workers with a supervisor report it."""
-MOST_TOLD = 4  # how many workers a line about what workers do may name
+MOST_TOLD = 4  # the largest number of workers named in one line
 LONG_S = 2.0  # shorter times aren't shown; by default, heartbeats are sent every second
 
 

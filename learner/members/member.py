@@ -16,7 +16,7 @@ from millrace.protocol.bounds import Stages
 from millrace.protocol.call_timeouts import OUR_CODE
 from millrace.protocol.messages import Heartbeat, Hello, WorkerActivity, WorkerStatus
 
-MEASURE_S = 0.5  # least time between the two heartbeats that measure a worker's speed, because several may be read at once
+MEASURE_S = 0.5  # heartbeats closer together than this don't measure a worker's speed; several may be read at once
 MAX_LATE_ACTIONS = 1_000_000  # a larger number of late actions between two heartbeats is not believed
 SUPERVISOR_WORD_S = 5.0  # how long a supervisor's statement is valid
 

@@ -62,7 +62,7 @@ TURN_S = 0.2  # longest time for reading messages before the caller continues
 SHORT_TURN_S = 0.003  # shortest time for reading messages, even in a short turn
 FAIR_SHARE = 10_000  # number of messages after which every connection has been read, because ZeroMQ reads them in turn
 LAST_MESSAGES_WAIT_S = 0.1  # how long to wait for the last messages of an ended process, which may still be on their way
-LAST_MESSAGES_TURNS = 10  # the most such waits, because other workers keep sending
+LAST_MESSAGES_TURNS = 10  # limit on the number of such waits, because other workers keep sending
 STATUS_SHARE = 20  # answers to Inquire take at most 1 / STATUS_SHARE of the time
 
 

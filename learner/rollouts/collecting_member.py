@@ -17,7 +17,7 @@ class CollectingMember(Member):
     strikes: int = 0
     """The number of the worker's rollouts and messages that could not be used."""
     ended_steps: int = 0
-    """The env steps that its process made before this session, plus those of its rollouts and evaluations that arrived."""
+    """The env steps that its process made before this session, plus those in its rollouts and evaluations that arrived."""
 
     @property
     def steps_under_way(self) -> int:

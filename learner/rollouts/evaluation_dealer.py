@@ -35,7 +35,7 @@ from millrace.protocol.rows.rollout_checks import wrong_episode
 from millrace.protocol.specs import RunSpec
 
 FIRST_TICKET = 1 << 52
-HELD_AT_ONCE = 2  # the most tickets of a worker: while the learner reads the answer to one, the worker plays the other
+HELD_AT_ONCE = 2  # how many tickets a worker may hold: while the learner reads one answer, the worker plays the other
 
 OnRows = Callable[[int, EpisodeRows], None]
 """Called with the number of an episode (the index of its seed in the plan) and some of its rows, in order.
@@ -117,7 +117,7 @@ class EvaluationDealer:
         self.held: dict[int, Member] = {}
         """the tickets that workers hold, by number"""
         self.second: dict[int, Member] = {}
-        """the second worker of each of these tickets that has one, by number"""
+        """the second worker of each ticket in `held` that has one, by number"""
         self.most_copies: int | None = None
         """the most env copies that play, summed over all workers, though one worker may always play; None for no limit"""
         self._run = run
@@ -231,7 +231,7 @@ class EvaluationDealer:
         return self.send(idle[0], alone[:1])
 
     def send(self, member: Member, tickets: Iterable[int]) -> list[Outgoing]:
-        """Make the orders for those of these tickets that belong to the evaluation."""
+        """Make the orders for the evaluation's tickets among these."""
         return [(member.peer, self._order(member, number)) for number in tickets if number in self.held]
 
     def take_in(self, member: Member, answer: Evaluated) -> str:

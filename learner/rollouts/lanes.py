@@ -74,8 +74,8 @@ class TicketedLane(PlacedLane):
     def past(self, histories: LaneHistories, waiting: Iterable[tuple[int, Rollout, bytes]]) -> LanePast | None:
         """The past that a new owner continues; None if the lane has not begun.
 
-        `waiting` are the rollouts after the history, in order: for each, its incarnation, the rollout, and the attributes of
-        its env copies.
+        `waiting` are the rollouts that follow the history, in order. For each, it has the incarnation, the rollout, and the
+        attributes of the env copies.
         """
         history = None if self.history is None else self.history.copy()
         newest = self.newest_taken

@@ -39,7 +39,7 @@ class Snapshot(msgspec.Struct):
 
 
 class PoolState(msgspec.Struct, kw_only=True):
-    """The part of the pool that a checkpoint saves, besides the weights of the snapshots."""
+    """The part of the pool that a checkpoint saves in addition to the weights of the snapshots."""
 
     rating: Real = FIRST_RATING
     """the rating of the policy"""

@@ -153,7 +153,7 @@ class RolloutDealer:
         return [order for peer, numbers in dealt.items() for order in self.send(members[peer], numbers)]
 
     def send(self, member: Member, tickets: Iterable[int]) -> list[Outgoing]:
-        """Make the orders for those of these tickets that are for rollouts: one order for each version that they name.
+        """Make the orders for the rollout tickets among these: one order for each version that the tickets name.
 
         A ticket that includes the past of a lane has an order of its own, because a past is long.
         """

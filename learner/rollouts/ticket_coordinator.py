@@ -193,7 +193,7 @@ class TicketCoordinator(Coordinator[CollectingMember]):
         return dealt
 
     def _needed(self) -> set[int]:
-        """The versions, besides the newest, that orders may name."""
+        """The versions, other than the newest, that orders may name."""
         opponents = self.rollouts.opponents
         needed = self.rollouts.rounds.acting()
         if self.evaluation.pending:

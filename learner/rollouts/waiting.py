@@ -22,7 +22,7 @@ from millrace.protocol.bounds import one_line
 Phase = Literal["starting", "gathering", "learning", "evaluating"]
 SHARES_AFTER_S = 30.0
 SHORT_S = 180.0  # longer times are given in minutes
-MOST_LANES = 4  # the most lanes whose numbers are given
+MOST_LANES = 4  # the largest number of lanes that a line names
 
 
 class LearnerTime:
@@ -34,7 +34,7 @@ class LearnerTime:
         """`no_worker` returns a text that says what is awaited while there is no member."""
         self.phase: Phase = "starting"
         self.since_s = now
-        self._last = ""  # the last wait in words; empty if the last wait for rollouts was short
+        self._last = ""  # the last wait for rollouts in words; empty if it was short
         self.spent_s: dict[Phase, float] = dict.fromkeys(get_args(Phase), 0.0)
         """total seconds of each phase, without the current one"""
         self._coordinator = coordinator

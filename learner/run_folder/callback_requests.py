@@ -12,8 +12,8 @@ from millrace.learner.run_folder.env_attributes import EnvAttributes
 from millrace.protocol.bounds import one_line
 from millrace.protocol.errors import UsageError, safe_repr
 
-MOST_LOGGED = 1_000  # the most numbers that callbacks may log in one row
-LONGEST_NAME = 200  # the most characters of a number's name
+MOST_LOGGED = 1_000  # limit on the numbers that callbacks may log in one row
+LONGEST_NAME = 200  # limit on the characters in a number's name
 
 
 class Requests:

@@ -29,7 +29,7 @@ FOLDER = "checkpoints"
 SUFFIX = ".pt"
 ZIP_BEGINS = b"PK\x03\x04"  # if a file begins with anything else, torch reads a pickle before the archive
 PICKLE = "data.pkl"  # suffix of the pickle's name in the archive; torch accepts capital letters, too
-MOST_VIEWS = 16  # the most views of the same numbers; an algorithm may save parts of a tensor in addition to the whole
+MOST_VIEWS = 16  # limit on views of the same numbers; an algorithm may save parts of a tensor in addition to the whole
 
 
 class Checkpoint(NamedTuple):

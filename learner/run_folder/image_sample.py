@@ -21,7 +21,7 @@ from millrace.protocol.specs import Leaf
 ROWS = 4  # number of rows in the picture
 GAP = 2  # pixels between images
 GRAY = 128  # brightness of the gap
-MOST_PIXELS = 256  # largest height and width of an image
+MOST_PIXELS = 256  # limit on the height and the width of an image
 Pixels = npt.NDArray[np.uint8]
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from millrace.learner.run_folder.regular_files import open_regular, subfolder
 from millrace.protocol.errors import RunError
 
-MOST_WAITING = 100_000  # the most records that wait to be written; rows of metrics then take 100 MB of memory
+MOST_WAITING = 100_000  # limit on the records that wait to be written; that many rows of metrics take 100 MB of memory
 
 
 class RecordFile:
@@ -23,7 +23,7 @@ class RecordFile:
     """
 
     def __init__(self, run: Path, name: str) -> None:
-        """`name` is that of a file in this run folder or in one of its subfolders. Raises OSError."""
+        """`name` is the name of a file in this run folder or in one of its subfolders. Raises OSError."""
         self._run = run
         self._path = run / name
         self._waiting: deque[bytes] = deque(maxlen=MOST_WAITING)

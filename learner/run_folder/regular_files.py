@@ -16,8 +16,8 @@ from pathlib import Path
 
 from millrace.protocol.errors import first_line
 
-MOST_TEXT_BYTES = 1 << 22  # largest file of settings or results
-MOST_BYTES = 1 << 31  # largest file of metrics, or of a policy's arrays
+MOST_TEXT_BYTES = 1 << 22  # limit on the size of a file of settings or results
+MOST_BYTES = 1 << 31  # limit on the size of a file of metrics, or of a policy's arrays
 
 log = logging.getLogger("millrace.learner")
 

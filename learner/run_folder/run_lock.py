@@ -155,9 +155,9 @@ class RunLock:
             self._close()
 
     def _take_open_file(self, *, made: bool) -> bool:
-        """Take the lock of the open file. Returns False if its owner released it meanwhile.
+        """Take the lock of the open file. Returns False if the lock's owner released it meanwhile.
 
-        Raises `UsageError` if its owner is alive.
+        Raises `UsageError` if the owner is alive.
         """
         alone = self._lock_by_system()
         if not self._is_open_file():
@@ -195,7 +195,7 @@ class RunLock:
     def _wait_until_dead(self, owner: Owner | None) -> None:
         """Wait until the content has stayed the same for long enough, or the file is gone.
 
-        Raises `UsageError` if the content changes, because then its owner is alive.
+        Raises `UsageError` if the content changes, because the owner is then alive.
         """
         pace = self._pace
         log.warning(

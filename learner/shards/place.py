@@ -1,4 +1,4 @@
-"""Which of the learner processes this one is, according to the environment variables of torchrun or another launcher."""
+"""Finds this process's place among the learner processes, from the environment variables of torchrun or another launcher."""
 
 from __future__ import annotations
 

@@ -181,7 +181,7 @@ class OrderCoordinator(Coordinator[Member]):
 
 
 def _by_name(member: Member) -> tuple[int, str]:
-    """Sort key of workers with equally few lanes: the first in the order of their names gets the next lane."""
+    """Sort key of workers with equally few lanes: the one whose name comes first gets the next lane."""
     return len(member.hello.worker), member.hello.worker
 
 

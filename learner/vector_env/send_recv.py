@@ -54,12 +54,12 @@ class VectorEnvParts:
     on_worker_loss: Literal["truncate", "raise"] = "truncate"
 
     def replacement_seeds(self, lane: int) -> tuple[int | None, ...]:
-        """Seeds for the copies that replace those of a lost lane."""
+        """Seeds for the copies that replace a lost lane's copies."""
         seeds = [self.seeds[n] for n in self.layout.copies(lane)]
         return replacement_seeds(seeds, self.hub.coordinator.lanes[lane].incarnation)
 
     def reset_of_new_copies(self, lane: int) -> AskedReset:
-        """The reset of the copies that replace those of a lost lane."""
+        """The reset of the copies that replace a lost lane's copies."""
         return AskedReset(tuple(range(self.layout.size(lane))), self.replacement_seeds(lane), packed(None))
 
 

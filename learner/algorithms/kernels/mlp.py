@@ -235,7 +235,7 @@ class _Workspace:
     def backward(
         self, by_results: Sequence[Tensor], wants_x: bool, wants_parameters: bool
     ) -> tuple[Tensor | None, Tensor | None]:
-        """From the gradients of the results, those of x and of all parameters; None for a gradient that isn't wanted."""
+        """The gradients of x and of all parameters, from those of the results; None for a gradient that isn't wanted."""
         by_heads = self._top.backward([by_result.numpy() for by_result in by_results])
         by_x = self.by_input(by_heads) if wants_x else None
         return by_x, self.by_parameters(by_heads) if wants_parameters else None
@@ -284,7 +284,7 @@ class _Workspace:
 
 
 class _MinibatchPlan:
-    """The calls for minibatches of one size: those of each chunk in turn, then those that sum the chunks' gradients."""
+    """The calls for minibatches of one size: first each chunk's calls in turn, then the calls that sum the gradients."""
 
     def __init__(
         self, rows: int, hidden: Sequence[Linear], heads: Sequence[Head], relu: bool, workspace: _Workspace

@@ -63,7 +63,7 @@ class OffPolicy(GradientDescent):
         super().__init__(config, policy, total_steps=total_steps)
         self.replay = self._make_replay(config, policy, seed)
         self.gradient_steps = 0  # all gradient steps so far, which Stable-Baselines3 calls n_updates
-        self.prior_gradient_steps = 0  # those of them that preceded the first rollouts
+        self.prior_gradient_steps = 0  # how many of them preceded the first rollouts
 
     @staticmethod
     def _make_replay(config: OffPolicyConfig, policy: PolicySpec, seed: int) -> MixedReplay | SequenceReplay:

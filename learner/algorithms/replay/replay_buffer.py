@@ -40,7 +40,7 @@ from millrace.protocol.rollout import Batch
 from millrace.protocol.specs import ActionSpec, Leaf
 
 PRIORITY_OFFSET = 1e-6  # added to each error, so that every transition can be drawn again
-DRAWN_AT_ONCE = 1 << 20  # the most bytes of transitions to draw together, so that they stay in the cache
+DRAWN_AT_ONCE = 1 << 20  # transitions are drawn together up to this many bytes, so that they stay in the cache
 DISCRETE = ActionSpec("discrete", (), "int64")
 
 
