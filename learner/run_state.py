@@ -183,7 +183,7 @@ def _of_policy_alone(config: Config, policy: PolicySpec, parameters: Floats, buf
 
 
 def _newest(run: Path) -> checkpoint.Checkpoint:
-    """The newest undamaged checkpoint; logs a warning for each newer, damaged one. Raises `CheckpointError`."""
+    """The newest undamaged checkpoint. Logs a warning for each newer one, which is damaged. Raises `CheckpointError`."""
     newest, warnings = checkpoint.newest(run)
     for line in warnings:
         log.warning("%s", line)

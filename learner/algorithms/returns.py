@@ -5,8 +5,8 @@ The replay buffer of single rows has its own n-step returns, because it follows 
 
 Every function follows the row format (`millrace.protocol.rollout`): row t bootstraps from `values[t+1]`, the value of
 `obs[t+1]`, which is the true final observation of a truncated episode. No function adds rewards or values across the end of
-an episode. A row that is not valid gives zero and does not affect other rows, whatever it contains: the value carried from
-later rows to earlier ones, or from earlier to later, passes through it unchanged.
+an episode. A row that is not valid gives zero and does not affect other rows, whatever it contains: what a computation
+carries from later rows to earlier ones, or from earlier to later, passes through it unchanged.
 """
 
 from __future__ import annotations

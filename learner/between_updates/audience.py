@@ -186,7 +186,7 @@ class Audience:
         self._hub.report_progress(progress)
 
     def _write_logged(self) -> None:
-        """Add the numbers that callbacks logged to the row of this update, if there was one."""
+        """Add the numbers that callbacks logged to this update's row. Before the first update, there is no row."""
         if (logged := self._requests.take_logged()) and self._state.version:
             self._files.write_row(self.progress(), logged)
 

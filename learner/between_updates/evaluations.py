@@ -186,7 +186,7 @@ class Evaluations:
         return evaluation_of(played, self._run.spec.facts)
 
     def _keep_if_best(self, evaluation: Evaluation, env_steps: int, policy: Callable[[], tuple[Floats, Floats]]) -> None:
-        """Keep the evaluated policy, which was reached after `env_steps`, as the best one, unless an earlier one was better.
+        """Keep the evaluated policy, which was reached after `env_steps`, as the best, unless an earlier policy was better.
 
         In a tie, the newer policy is kept, because it has learned for longer. If all returns are equal, as in a zero-sum
         game that the policy plays against itself, there is no other criterion.

@@ -28,7 +28,7 @@ class Callbacks:
     """The callbacks of one run."""
 
     def __init__(self, callbacks: Sequence[object] = ()) -> None:
-        """`callbacks` are functions, or objects with some of the methods of `Callback`. Raises `UsageError` for others."""
+        """`callbacks` are functions, or objects with some of `Callback`'s methods. Raises `UsageError` for anything else."""
         self.stop_reason: str | None = None
         """Why a callback ended the run; None if none did."""
         self._callbacks = [_checked(callback) for callback in callbacks]

@@ -6,13 +6,13 @@ Rule: there are two counts of failures, and either can end the run.
   `MOST_IN_A_ROW`, so that an environment that never works ends the run quickly even if many failures are allowed. A failure
   after env steps counts as only `AFTER_STEPS`, because a simulator that crashes often may by chance fail a few times before
   a rollout is complete.
-* Within an hour: the failures of all lanes that occurred after env steps. `max_env_failures` are allowed; as many again for
-  each env copy and each hour since the learner began, up to one hour; and as many again for each `WORK_S` that the failed
-  workers had worked. So a mistake in an environment's code ends a run that has just begun, but a simulator that crashes now
-  and then does not, as long as its workers work most of the time.
+* Within an hour: the failures of all lanes that occurred after env steps. `max_env_failures` × (1 + env copies × h + w /
+  `WORK_S`) are allowed. Here, h is the number of hours since the learner began, but at most 1, and w the number of seconds
+  that the failed workers had worked. So a mistake in an environment's code ends a run that has just begun, but a simulator
+  that crashes now and then does not, as long as its workers work most of the time.
 
 These limits end a run late, so the log warns early: at the fourth failure within an hour, and whenever the number of
-failures within an hour has doubled.
+failures within an hour has doubled since the last warning.
 """
 
 from __future__ import annotations

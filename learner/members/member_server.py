@@ -227,7 +227,7 @@ class MemberServer:
         del self._hub, self._processes
 
     def no_workers(self, workers: int, timeout_s: float) -> NoWorkers:
-        """The error to raise when fewer than `workers` have joined within `timeout_s`. It says how to start one."""
+        """The error to raise when fewer than `workers` have joined within `timeout_s`. It says how to start a worker."""
         address = self._link.address
         reached_at = advertised_address(address, "", socket.gethostname())
         start = f"millrace worker {reached_at}{'' if self._link.keyring is None else ' --token FILE'}"

@@ -41,7 +41,7 @@ class Ledger(msgspec.Struct, kw_only=True):
     messages_bad: Past = 0
     """messages that could not be read"""
     late_actions: Past = 0
-    """actions that arrived too late at a program that runs its own loop, so that the program chose its own action"""
+    """actions that a program with its own loop received too late, so that it chose an action itself"""
 
     @property
     def outstanding(self) -> int:
@@ -69,6 +69,6 @@ class Ledger(msgspec.Struct, kw_only=True):
         return msgspec.structs.replace(self)
 
     def counts(self) -> dict[str, int]:
-        """All counts by name, including the two derived ones."""
+        """All counts by name, including the two that are derived from others."""
         stored = {name: int(getattr(self, name)) for name in self.__struct_fields__}
         return stored | {"outstanding": self.outstanding, "transitions_waiting": self.transitions_waiting}

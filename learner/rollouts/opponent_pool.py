@@ -107,7 +107,7 @@ class OpponentPool:
         return tuple(-1 - k for k in range(programs)) or tuple(self.versions[:1])
 
     def made(self, version: int, env_steps: int) -> bool:
-        """Make a snapshot of new weights if one is due. Returns whether the weights became one."""
+        """Make a snapshot of new weights if one is due. Returns whether the weights became a snapshot."""
         snapshots = self.state.snapshots
         settings = self._settings
         if not settings.window:

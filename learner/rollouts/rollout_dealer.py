@@ -239,7 +239,7 @@ class RolloutDealer:
     # ---------------------------------------------------------------- inside
 
     def _end(self, member: Member, ticket: Ticket) -> TicketedLane:
-        """Remove a ticket from the outstanding ones. Returns its lane."""
+        """Remove a ticket from the outstanding tickets. Returns its lane."""
         del self.held[ticket.number], member.tickets[ticket.number]
         lane = self.lanes[ticket.lane]
         lane.outstanding.remove(ticket.number)

@@ -96,7 +96,7 @@ class LearnerTime:
         return f"learning for {now - self.since_s:.0f} s{waiting}"
 
     def _awaited(self, now: float) -> str:
-        """A clause about the worker that has been held up longest, its awaited lanes, and the number of other ones."""
+        """A clause about the worker that has been held up longest, its awaited lanes, and how many others are awaited."""
         lanes = dict[bytes, set[int]]()
         members = self._coordinator.members
         for ticket in self._coordinator.rollouts.awaited():

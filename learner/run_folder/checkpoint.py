@@ -87,7 +87,7 @@ def save(folder: Path, state: dict[str, Any], env_steps: int, keep: int) -> Path
 
 
 def newest(folder: Path) -> tuple[Checkpoint, list[str]]:
-    """Read the newest undamaged checkpoint of a run folder. Also returns a warning for each newer, damaged one.
+    """Read the newest undamaged checkpoint of a run folder. Also returns a warning for each damaged one that is newer.
 
     Raises `CheckpointError` if there is none, or if the newest undamaged one has another format.
     """

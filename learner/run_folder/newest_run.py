@@ -40,7 +40,7 @@ def newest_run(config: RunSettings) -> Path | None:
 
 
 def _can_be_resumed(path: Path, config: RunSettings) -> bool:
-    """Whether this is a run of the same environment and algorithm, and has a checkpoint."""
+    """Whether this is a run of this environment and algorithm that has a checkpoint."""
     if not os.path.lexists(path / CONFIG_FILE):
         return False
     try:

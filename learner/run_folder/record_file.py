@@ -44,7 +44,7 @@ class RecordFile:
         self._waiting.append(record)
 
     def replace(self, newest: bytes, record: bytes) -> None:
-        """Add a record in place of the newest one, whose content is `newest`."""
+        """Replace the newest record, whose content is `newest`, with this record."""
         if self._waiting:
             self._waiting.pop()
         else:

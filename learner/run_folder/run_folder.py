@@ -403,7 +403,7 @@ def _split(content: bytes) -> tuple[bytes, bytes]:
 
 
 def _checksum_matches(content: bytes) -> bool:
-    """Whether the numbers of a safetensors file match its checksum. True for a file without one."""
+    """Whether the numbers of a safetensors file match its checksum. True for a file without a checksum."""
     head, numbers = _split(content)
     match msgspec.json.decode(head):
         case {"__metadata__": {"crc32": checksum}}:

@@ -40,7 +40,7 @@ class Division(NamedTuple):
     """the number of this process, from 0"""
 
     def of_process(self, rank: int) -> range:
-        """The shards of a process: S / R consecutive ones."""
+        """The shards of a process: S / R consecutive shards."""
         count = self.shards // self.processes
         return range(rank * count, (rank + 1) * count)
 

@@ -47,7 +47,7 @@ JOINED = "millrace/rank/"
 
 
 class Timeouts(NamedTuple):
-    """How many seconds a process waits for others."""
+    """How many seconds a process waits for the other processes."""
 
     join_s: float
     """until all processes have connected"""

@@ -19,7 +19,7 @@ UNKNOWN_REASON = "its worker is gone"
 
 
 class LostLanes:
-    """The lanes whose loss has not been reported yet, and those whose loss was reported but that were not reset yet."""
+    """The lanes whose loss has not been reported yet, and the lanes that wait for a reset after the report."""
 
     def __init__(self) -> None:
         self._unreported: dict[int, str] = {}  # by lane, why it was lost

@@ -1,4 +1,4 @@
-"""The learner's half of the conversation of a vector environment. Pure: messages and `now` in, messages out.
+"""The learner's half of a vector environment's conversation with its workers. Pure: messages and `now` in, messages out.
 
 Rule: an order goes to one lane, and a lane has one order at a time; lanes do not wait for each other. Either the order is
 answered, or its lane is lost with its worker. A lost lane starts again on new env copies, in its next incarnation. If a

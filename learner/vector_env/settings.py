@@ -26,7 +26,7 @@ ObservationMode = Literal["same", "different"] | tuple[Space[Any], Space[Any]]
 
 @dataclass(frozen=True)
 class VectorEnvSettings:
-    """The arguments of `millrace.make_vec`, with the same meanings and defaults. Raises `UsageError` for invalid ones."""
+    """The arguments of `millrace.make_vec`, with the same meanings and defaults. Raises `UsageError` if one is invalid."""
 
     env: EnvLike | EnvSpec | Sequence[EnvLike]
     num_envs: int | None = None

@@ -14,7 +14,7 @@ from millrace.protocol.arrays import Array, Bools
 from millrace.protocol.specs import Leaf
 
 SEEDS = range(-(2**63), 2**64)
-"""Seeds that a message can carry. The environment refuses others that it cannot use."""
+"""Seeds that a message can carry. If the environment cannot use one of these, it refuses the seed."""
 
 
 def seed_list(seed: int | Sequence[int | None] | None, num_envs: int) -> list[int | None]:

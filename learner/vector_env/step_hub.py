@@ -1,7 +1,7 @@
 """The hub of a vector environment: a shell around its coordinator and its shared memory.
 
 Rule: a lane gets its orders as messages, or steps through shared memory; results are taken lane by lane. A worker that does
-not answer in time is treated as lost, and killed if it is a child process of this one. Workers that have been silent for too
+not answer in time is treated as lost, and killed if it is a child of this process. Workers that have been silent for too
 long are removed only while the hub listens, so the caller may take as long as it likes between two waits.
 """
 

@@ -417,7 +417,7 @@ def _product(a: Array, b: Array, out: Array) -> MLPPass:
 
 
 def _stacked_view(arrays: Sequence[Array]) -> Array:
-    """One or two views of one array, both of the same shape, as a single view [S, *shape]."""
+    """Combine one or two views of one array, which have the same shape, into a single view [S, *shape]."""
     first = arrays[0]
     last = arrays[-1]
     distance = last.__array_interface__["data"][0] - first.__array_interface__["data"][0]
