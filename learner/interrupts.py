@@ -65,7 +65,7 @@ def _set(handler: Handler) -> dict[int, Any]:
 
 
 class Interrupts:
-    """Notes signals inside the context, and restores the handlers afterwards. Does nothing outside the main thread."""
+    """Records signals inside the context, and restores the handlers afterwards. Does nothing outside the main thread."""
 
     def __init__(self, grace_s: float = 0.0) -> None:
         """`grace_s` is the number of seconds from the first signal to the end of the process; 0 means no limit."""

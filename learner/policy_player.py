@@ -85,7 +85,7 @@ class PolicyPlayer:
         """`settings` has the timeouts and the number of allowed failures.
 
         `check_interrupt` is called while this waits, and an exception that it raises ends the wait. `watch` is called
-        several times a second with a text that says how far the episodes have got. `described` is the environment, if a
+        several times a second with a line that says how far the episodes have got. `described` is the environment, if a
         worker has already described it. Raises `UsageError` if one policy cannot play against the other.
         """
         self.policy = policy
@@ -136,7 +136,7 @@ class PolicyPlayer:
 
         Against another policy, both policies sample their actions, because two greedy ones would repeat the same few games.
 
-        `bound` and `before` are arguments of `EvaluationPlan.how_far`, which makes the text for `watch`.
+        `bound` and `before` are arguments of `EvaluationPlan.how_far`, which makes the line for `watch`.
         """
         if self._hub is None:
             self._hub = self._published()

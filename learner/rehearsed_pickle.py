@@ -1,7 +1,7 @@
 """Checks the calls in a checkpoint's pickle before torch's loader makes them. Pure.
 
 Rule: a pickle may contain only what torch.save writes for tensors and plain data. torch's loader for untrusted files
-(`weights_only`) doesn't run code from them, but it calls `bytearray` with any length, and copies a container or a text as
+(`weights_only`) doesn't run code from them, but it calls `bytearray` with any length, and copies a container or a string as
 many times as the file says, so a few bytes could fill the memory. This file interprets the pickle without making its
 objects.
 """

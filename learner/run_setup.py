@@ -71,7 +71,7 @@ class RunSetup:
     folder: RunFolder
     resumed: bool
     interrupts: Interrupts
-    """Must be entered, so that signals are noted."""
+    """Must be entered, so that signals are recorded."""
     elsewhere: bool = False
     """Whether the workers are started elsewhere, and not by this program."""
     learners: Learners | None = None

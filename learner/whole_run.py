@@ -86,6 +86,6 @@ def _tell_of_error(end: Callable[[], None]) -> None:
 
 
 def _why(error: BaseException) -> str:
-    """One line that says why the run ended. The error may have been raised by the user's code, with any text."""
+    """One line that says why the run ended. The user's code may have raised the error, with any message."""
     text = first_line(error, type(error).__name__)
     return one_line(text if isinstance(error, MillraceError) else f"{type(error).__name__}: {text}")

@@ -300,7 +300,7 @@ def a_saved_state_goes_on_as_if_nothing_had_happened(subject: Subject) -> Iterat
 
 
 def an_update_can_be_taken_back(subject: Subject) -> Iterator[str]:
-    """Check `roll_back`, after a whole update and after one that stopped in the middle. Also check the update after it."""
+    """Check `roll_back`, after a whole update and after one that stopped in the middle. Also check the next update."""
     *first, second, third = subject.copies()
     disturbed = subject.new()
     undisturbed = subject.new()

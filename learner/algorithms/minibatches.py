@@ -3,8 +3,8 @@
 Rule: rows that are not valid never enter a loss, and each valid row enters exactly one loss per epoch. A recurrent core
 still runs over the rows that are not valid, because it processes whole columns.
 
-A batch has T rows for each of ΣN env copies (columns). Row numbers count all T · ΣN rows as one flat sequence in time order.
-B is the number of rows of a minibatch, and C the number of its columns if the policy has a recurrent core.
+A batch has T rows for each of ΣN env copies (columns). Row indices refer to all T · ΣN rows as one flat sequence in time
+order. B is the number of rows of a minibatch, and C the number of its columns if the policy has a recurrent core.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ class Observations(Protocol):
     def evaluate(self, steps: int, function: Callable[[NetworkInput, Index], Tensor], pulse: Callable[[], None]) -> Floats:
         """Apply `function` to the observations of the first `steps` steps, in chunks and without gradients.
 
-        `function` gets the network input of a chunk and the numbers of its rows in the batch, and returns one number for
-        each row. All results are returned as one array [steps, ΣN]. Calls `pulse` after each chunk.
+        `function` gets the network input of a chunk and the indices of the chunk's rows in the batch, and returns one number
+        for each row. All results are returned as one array [steps, ΣN]. Calls `pulse` after each chunk.
         """
         ...
 
@@ -237,9 +237,9 @@ def flat_tensor(array: Array, device: torch.device | str) -> Tensor:
 
 
 def units_in_order(used: Bools, generator: torch.Generator | None, *, whole_columns: bool) -> Tensor:
-    """The numbers of the rows where `used` [T, N] is True, shuffled, or in order if there is no generator.
+    """The indices of the rows where `used` [T, N] is True, shuffled, or in order if there is no generator.
 
-    If `whole_columns`, returns the numbers of the columns that have such a row. Other columns are left out, because they
+    If `whole_columns`, returns the indices of the columns that have such a row. Other columns are left out, because they
     could make a minibatch empty.
     """
     units = torch.from_numpy(np.flatnonzero(used.any(0) if whole_columns else used))
@@ -247,7 +247,7 @@ def units_in_order(used: Bools, generator: torch.Generator | None, *, whole_colu
 
 
 def rows_of_columns(steps: int, columns: int, chosen: Tensor) -> Tensor:
-    """The numbers of all rows of the chosen columns, in time order, in a batch of `steps` × `columns` rows."""
+    """The indices of all rows of the chosen columns, in time order, in a batch of `steps` × `columns` rows."""
     return (torch.arange(steps, device=chosen.device)[:, None] * columns + chosen).flatten()
 
 

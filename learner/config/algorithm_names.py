@@ -50,7 +50,7 @@ NOT_SETTINGS = {"config", "preset", "resume", "log_json", "debug", "progress"}
 """Flags and arguments of `millrace train` and `millrace.train` that are not settings."""
 
 _given: dict[str, type] = {}
-"""The classes that were passed in Python and can't be imported, by name. Of several with the same name, the newest."""
+"""The classes that were passed in Python and can't be imported, by name. A newer one replaces one of the same name."""
 
 
 def is_own(algo: str) -> bool:

@@ -7,7 +7,7 @@ environment that fails everywhere is discovered after a few attempts.
 
 Rule: the run uses the first description that can be read and is accepted; other workers compare their env copies with it
 when they open lanes. A worker that declines, or whose description is not accepted, is refused; once `decliners_to_end`
-different workers have been refused, the start ends with the reason. A worker whose environment fails may come back.
+different workers have been refused, the start fails with the reason. A worker whose environment fails may come back.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class DescribeCoordinator(Coordinator[Member]):
     """The members that wait for the run, one of which describes the environment."""
 
     def __init__(self, wait: WaitSpec, first_session: int, *, worker_timeout_s: float, decliners_to_end: int) -> None:
-        """The start ends once `decliners_to_end` different workers cannot describe the environment; 0 means never."""
+        """The start fails once `decliners_to_end` different workers cannot describe the environment; 0 means never."""
         super().__init__(Membership(wait, Member, self._removed, first_session), worker_timeout_s)
         self.described: DescribedEnv | None = None
         """The first usable description of the newest environment."""

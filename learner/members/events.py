@@ -204,7 +204,7 @@ def describe(event: LoggedEvent) -> str:
     """The text of an event for the log: one line, then the traceback or the last lines of output, if there are any.
 
     The lines after the first are indented, so that none of them looks like a log line of its own. Control characters in a
-    peer's texts are replaced.
+    peer's strings are replaced.
     """
     line = one_line(_line(event), 4 * MAX_LINE)
     match event:

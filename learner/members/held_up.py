@@ -1,4 +1,4 @@
-"""What a member is doing, and what holds it up, in words for people. Pure.
+"""What a member is doing, and what holds it up, as text for people. Pure.
 
 Rule: a member counts as held up if a single call of the user's code takes long, or if it is silent. If it is slow because of
 many short calls, its env steps per second are shown instead.

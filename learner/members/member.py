@@ -107,7 +107,7 @@ class Member:
     """Whether its process was ended because a call took too long."""
     in_env_code_s: float = -math.inf
     """Time when the supervisor last said that the worker is in code of the environment or of a policy that the user wrote.
-    Until then the worker doesn't count as silent.
+    Up to that time, the worker doesn't count as silent.
     """
     supervisor: SharingSupervisor | None = None
     """Its supervisor, if it shares weights."""

@@ -1,7 +1,7 @@
 """A rate-limited log of workers' messages and events.
 
 Rule: lines and bytes are limited for each worker, and for all workers of one key together; workers without keys share one
-limit. So a peer that keeps joining under new names, or sends long texts, cannot fill the log. Omitted lines are counted.
+limit. So a peer that keeps joining under new names, or sends long strings, cannot fill the log. Omitted lines are counted.
 """
 
 from __future__ import annotations

@@ -160,7 +160,7 @@ class Membership(Generic[M]):
         return member
 
     def member_of_session(self, peer: bytes, message: ToLearner, now: float) -> M | None:
-        """The member that sent this message in its current session, or None. Records that the member was heard."""
+        """The member that sent this message in its current session, or None. Records when the member was last heard from."""
         member = self.members.get(peer)
         if member is None or isinstance(message, Hello | Alive) or member.session != message.session:
             return None

@@ -56,5 +56,5 @@ class WorkerProcesses:
         return None
 
     def take_failures(self) -> Sequence[Failed]:
-        """The failures of the workers of `stepping` since the last call."""
+        """The failures, since the last call, of the workers that `stepping` returns."""
         return ()

@@ -240,7 +240,7 @@ class EvaluationDealer:
         Returns what is wrong with it, or an empty string; a wrong answer's ticket goes to another worker.
         """
         if not self._plays(member, answer.ticket):
-            return ""  # a second answer, one after the end, or one after another worker's answer
+            return ""  # the answer is a repetition, or came after the end or after another worker's answer
         index = answer.ticket - self._first
         if why := self._wrong(answer, len(self._seeds[index])):
             self.lose(member, answer.ticket)

@@ -36,7 +36,7 @@ class LagStatistics:
         newest = self._newest_used.pop(worker, -1)
         if version > newest and version in self._published_s:
             self._first_use_s[worker].append(now - self._published_s[version])
-        self._newest_used[worker] = max(version, newest)  # moved to the end, so the first one was heard least recently
+        self._newest_used[worker] = max(version, newest)  # moved to the end: the first was heard from longest ago
         if len(self._newest_used) > MOST_WORKERS:
             forgotten = next(iter(self._newest_used))
             del self._newest_used[forgotten]

@@ -24,7 +24,7 @@ class _OfRound:
     """The rows of one rollout."""
 
     first: int
-    """the number of the first row, counted since the history began"""
+    """the index of the first row, counted since the history began"""
     action: Array
     """[T, N · A, *action] the actions"""
     attributes: bytes
@@ -47,7 +47,7 @@ class LaneHistory:
     """[N · A, *leaf] each: the observations after the last row, then the masks if there are any"""
     memory: tuple[Array, ...] = ()
     too_long: dict[int, int] = field(default_factory=dict)
-    """for each copy whose running episode has become too long to be replayed, the number of the episode's first row"""
+    """for each copy whose running episode has become too long to be replayed, the index of the episode's first row"""
     no_rows: Array = field(default_factory=lambda: np.zeros(0, np.float32))
     """[0, N · A, *action] an empty array with the shape and dtype of actions"""
 

@@ -83,7 +83,7 @@ class StallWatch:
         return Standstill(idle, f"it holds tickets and has made no progress for {self._stall_timeout_s:.0f} s")
 
     def _takes_too_long(self, now: float) -> bool:
-        """Whether no episode of the evaluation has arrived for too long. If so, starts to measure the time anew."""
+        """Whether no episode of the evaluation has arrived for too long. If so, starts to measure the time again."""
         answered = self._coordinator.evaluation.episodes_played
         overdue = answered == self._answered and now - self._answered_s > self._stall_timeout_s
         if overdue or answered != self._answered:

@@ -31,7 +31,7 @@ class LearnerTime:
     def __init__(
         self, coordinator: TicketCoordinator, now: float, no_worker: Callable[[], str], processes: WorkerProcesses
     ) -> None:
-        """`no_worker` returns a text that says what is awaited while there is no member."""
+        """`no_worker` returns a clause that says what is awaited while there is no member."""
         self.phase: Phase = "starting"
         self.since_s = now
         self._last = ""  # the last wait for rollouts in words; empty if it was short

@@ -35,7 +35,7 @@ def png(pixels: Pixels) -> bytes:
     """A PNG file of pixels [height, width] in gray, or [height, width, 3] in color (ISO/IEC 15948)."""
     height, width = pixels.shape[:2]
     color = 2 if pixels.ndim == 3 else 0
-    lines = np.concatenate([np.zeros((height, 1), np.uint8), pixels.reshape(height, -1)], axis=1)  # 0: no filter
+    lines = np.concatenate([np.zeros((height, 1), np.uint8), pixels.reshape(height, -1)], axis=1)  # leading 0: no filter
     head = struct.pack(">IIBBBBB", width, height, 8, color, 0, 0, 0)
     chunks = ((b"IHDR", head), (b"IDAT", zlib.compress(lines.tobytes())), (b"IEND", b""))
     return b"\x89PNG\r\n\x1a\n" + b"".join(

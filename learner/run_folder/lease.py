@@ -49,7 +49,7 @@ class Owner(msgspec.Struct, frozen=True, kw_only=True):
     boot_id: Line
     """The boot id of the kernel on `host`. Processes with the same boot id are on the same machine."""
     token: Line
-    """A random text, which no two locks share."""
+    """A random string, which no two locks share."""
     network_namespace: Line = ""
     """The network namespace of the process; empty if unknown. A container may have its own."""
     pid_namespace: Line = ""

@@ -52,7 +52,7 @@ class RecordFile:
         self._waiting.append(record)
 
     def flush(self) -> None:
-        """Write the waiting records. Raises `RunError` if that fails; the remaining records then go on waiting."""
+        """Write the waiting records. Raises `RunError` if that fails; the remaining records then keep waiting."""
         try:
             if self.gone:
                 gone = self._file

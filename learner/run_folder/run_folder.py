@@ -162,7 +162,7 @@ class RunFolder:
         self.started_from = ""
         """See `RunFormat`."""
         self.writes = Writes()
-        """Makes the run's writes into the folder, and retries those that fail."""
+        """Writes the files of the run, and retries writes that fail."""
         self.lock: RunLock | None = None
         """The lock of the run, while this process trains it."""
 

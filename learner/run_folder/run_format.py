@@ -131,7 +131,7 @@ def is_run_folder(folder: Path) -> bool:
 
 
 def _texts(value: Any) -> Iterator[str]:
-    """Yield every text in nested tables and lists."""
+    """Yield every string in nested tables and lists."""
     match value:
         case str():
             yield value

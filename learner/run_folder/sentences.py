@@ -4,8 +4,9 @@ Everything that shows a `RunProgress` takes its words from here, so that the sam
 
 Rule: the side that waits less is the slower one. If learner and workers take turns, one waits while the other works, so the
 shares of time that they wait add up to about 1; if they work at the same time, only the faster one waits. If the shares add
-up to more, both wait at once, for some of the workers or for messages on their way. The sentence says so only if the learner
-waits for longer than it works, because otherwise faster workers or messages would change little.
+up to more than 1, both sides sometimes wait at the same time, for some of the workers or for messages on their way. A
+sentence says so only if the learner waits for longer than it works, because otherwise faster workers or messages would
+change little.
 """
 
 from __future__ import annotations

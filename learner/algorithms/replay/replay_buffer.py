@@ -168,7 +168,7 @@ class ReplayBuffer(Rewinding[Overwritten]):
         self._gamma = gamma
         self._alpha = alpha
         self._seed = seed
-        self.generator = generator(seed, self._purpose)  # the random numbers of all draws
+        self.generator = generator(seed, self._purpose)  # the source of random numbers for all draws
         self._obs = tuple(self._room(leaf) for leaf in observation)
         self._mask: Bools | None = None  # [size, choices], the masks of `_obs`; allocated when the first masks arrive
         self._row = np.zeros(size, row_dtype(action))

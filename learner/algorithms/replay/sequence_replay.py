@@ -107,7 +107,7 @@ class SequenceReplay(Rewinding[ReplacedSequences]):
         self.arrays = {name: np.zeros((self.size, *shape), dtype) for name, (shape, dtype) in shapes.items()}
         """Arrays with one entry for each slot, by name. `begins` is True where obs[t+1] begins an episode. `before` is the
         number of the previous sequence; sequences are numbered in the order in which they were written."""
-        self.generator = generator(seed, Purpose.REPLAY)  # the random numbers of all draws
+        self.generator = generator(seed, Purpose.REPLAY)  # the source of random numbers for all draws
         self._tree = None if alpha is None else SumTree(self.size)
         self._highest = 1.0  # the highest priority so far, which new sequences get
         self._written = 0  # number of sequences ever written; modulo the size, it is the next slot
