@@ -98,7 +98,7 @@ class RunState(msgspec.Struct, kw_only=True):
 def restore(folder: RunFolder, algorithm: Algorithm) -> RunState:
     """Load the newest undamaged checkpoint into the algorithm. Returns the state of the run.
 
-    Raises `CheckpointError` if there is no such checkpoint, or if it does not fit.
+    Raises `CheckpointError` if there is no such checkpoint, or if the newest does not fit this run.
     """
     newest = _newest(folder.path)
     try:

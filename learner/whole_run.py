@@ -27,7 +27,7 @@ def train_to_the_end(run: OpenRun, workers: int) -> None:
     """Wait for this number of `workers`, then train to the end.
 
     `run.setup.interrupts` must be entered. Raises `Interrupted` if the user interrupts the run, and `MillraceError`, with a
-    one-line message, if it fails.
+    one-line message, if the run fails.
     """
     setup = run.setup
     hub = run.parts.hub

@@ -220,7 +220,7 @@ class LossInput(NamedTuple):
     advantage: Tensor
     """[B] how much better the action was than expected; standardized if `standardizes_advantages()`"""
     raw_advantage: Tensor
-    """[B] the advantage as it was estimated"""
+    """[B] the advantage as estimated, never standardized"""
     target: Tensor
     """[B] target of the value function"""
     log_prob_now: Tensor

@@ -190,7 +190,7 @@ class MemberServer:
             turn()
 
     def check_members(self, timeout_s: float, *, collecting: bool = False) -> None:
-        """Raise `NoWorkers` if there has been no worker for `timeout_s`, or at once if none can join any more.
+        """Raise `NoWorkers` if there has been no worker for `timeout_s`, or at once if no worker can join any more.
 
         Call this after each turn of a wait. If `collecting`, workers that only evaluate don't count.
         """

@@ -296,7 +296,8 @@ class LearnerOfRun(NamedTuple):
 def learner_of_run(folder: Path) -> LearnerOfRun:
     """Where the learner that now trains the run in this folder listens.
 
-    Raises `UsageError`, with a one-line message, if none trains it, or if it cannot be asked from this machine.
+    Raises `UsageError`, with a one-line message, if no learner trains the run, or if the learner cannot be asked from this
+    machine.
     """
     owner = living_owner(folder, time.time())
     if not owner.address:

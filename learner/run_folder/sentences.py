@@ -86,7 +86,7 @@ def bottleneck(progress: RunProgress) -> str:
 
 
 def who_waits(progress: RunProgress) -> str:
-    """Whom the learner waits for now. Empty if it has not waited for long, or if the run has ended."""
+    """Whom the learner waits for now. Empty if the learner has not waited for long, or if the run has ended."""
     waiting = progress.waiting
     if not waiting or progress.stop_reason:
         return ""

@@ -186,7 +186,7 @@ def _by_name(member: Member) -> tuple[int, str]:
 
 
 def check(answer: Answer, order: Order, spec: StepSpec) -> None:
-    """Check that the answer belongs to this order. Raises `BadMessage`, with a one-line message, if it does not."""
+    """Raise `BadMessage`, with a one-line message, if the answer does not belong to this order."""
     if (answer.lane, answer.incarnation) != (order.lane, order.incarnation):
         raise BadMessage(f"answer: expected one from lane {order.lane}, got one from lane {answer.lane}")
     if isinstance(answer, Returned) != isinstance(order, Call):

@@ -138,7 +138,7 @@ class Hindsight:
     """the name of the reward function in the settings"""
     reward_of: GoalReward
     ends_within: float | None
-    """the distance from the goal at which the episode terminates; None if it doesn't terminate at its goal"""
+    """the distance from the goal at which the episode terminates; None if the episode doesn't terminate at its goal"""
     roundoff: float
     """the largest relative rounding error of a goal's numbers in observations"""
 
