@@ -81,7 +81,7 @@ def read_config(command: str, argv: list[str]) -> tuple[Config, Path | None]:
         resume = newest_run(config)
         if resume is None:
             return config, None
-        # the settings of the run that was found already contain them
+        # the settings of the run that was found already include those of the file and the preset
         file = None
         preset = "none"
     lower = read_lower_layers(algo, file=file, resume=resume, preset=preset)

@@ -146,7 +146,7 @@ class Member:
             self.first_step_s = self.heard_s
 
     def record_activity(self, activity: WorkerActivity, now: float) -> bool:
-        """Record a supervisor's statement. Returns whether calls of the environment have returned since the last."""
+        """Record a supervisor's statement. Returns whether environment calls have returned since the previous statement."""
         before = self.activity
         self.activity = activity
         self.activity_s = now

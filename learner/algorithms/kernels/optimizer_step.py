@@ -124,7 +124,7 @@ def _adam_step(name: str, decayed_parameter: float) -> Callable[[Tensor, dict[st
 
 @cache
 def _is_adam(kernel: Kernel, decayed_parameter: float) -> bool:
-    """Whether a first step gives `decayed_parameter`, from 1, with learning rate 0.1, gradient 1 and weight decay 0.5.
+    """Whether a first step leads from 1 to `decayed_parameter`, with learning rate 0.1, gradient 1, weight decay 0.5.
 
     Adam adds the decay to the gradient, whose size does not matter in a first step, so the result is 1 - 0.1. AdamW reduces
     the parameter itself, so the result is (1 - 0.1 · 0.5) - 0.1.

@@ -50,7 +50,7 @@ class SumTree:
             nodes[i] = nodes[2 * i] + nodes[2 * i + 1]
 
     def find(self, mass: Doubles) -> Ints:
-        """The first indices at which the cumulative sum of the weights exceeds `mass` [B], whose numbers are in [0, total).
+        """The first indices at which the cumulative sum of the weights exceeds `mass` [B], which must be in [0, total).
 
         An index of weight 0 is never returned.
         """
