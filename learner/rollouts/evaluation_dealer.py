@@ -299,7 +299,7 @@ class EvaluationDealer:
         return Counter(member.peer for member in [*self.held.values(), *self.second.values()])
 
     def _who_may_play(self, members: Sequence[Member], plan: EvaluationPlan) -> list[Member]:
-        """Those of these workers that may play. A worker that was late may play only if all were.
+        """The workers among these that may play. A worker that was late may play only if all were.
 
         Workers that only evaluate come first. If copies are limited, only the first workers play, because a worker keeps its
         copies.

@@ -18,10 +18,10 @@ from collections.abc import Mapping
 from millrace.protocol.messages import Status
 from millrace.protocol.progress import RunProgress
 
-ABOUT_EQUAL = 0.2  # if the shares of time for which the two sides wait differ by less, neither is called slower
+ABOUT_EQUAL = 0.2  # learner and workers whose shares of waiting time differ by less count as equally fast
 BOTH_WAIT = 0.1  # how far the sum of the two shares must exceed 1 before both sides are said to wait at once
 LEAST_PER_S = 1e-4  # one env step in three hours; a lower speed is shown as 0
-LONG_RETURN = 1e12  # from this size on, all digits of a return would make a table too wide
+LONG_RETURN = 1e12  # larger returns are rounded: all their digits would make a table too wide
 COLLECTING = ("act", "step", "wait")
 WRONG = {
     "lost": ("rollout was lost and dealt again", "rollouts were lost and dealt again"),

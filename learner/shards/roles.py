@@ -92,7 +92,7 @@ def follow(config: Config, place: Place) -> Path:
 
 
 def algorithm_of(begin: Begin, learners: Learners) -> Sharded:
-    """Make the algorithm of rank 0 in this process. If that fails, all processes raise `UsageError`."""
+    """Make, in this process, the same algorithm as rank 0. If any process can't, all raise `UsageError`."""
     rank = learners.division.rank
     try:
         config = config_from_toml(begin.config, "the settings of rank 0")

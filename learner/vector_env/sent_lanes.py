@@ -123,7 +123,7 @@ class SentLanes:
         return self._copies(sorted(self._results))
 
     def among(self, lanes: Iterable[int]) -> list[int]:
-        """Those of these lanes that have not come back."""
+        """The lanes among these that have not come back."""
         return [lane for lane in lanes if lane in self.sent] if self.sent else []
 
     def send(self, lanes: Iterable[int], sent: Sent) -> None:
@@ -180,7 +180,7 @@ class SentLanes:
         return ready
 
     def take_some(self, lanes: Iterable[int]) -> Ready:
-        """Take those of these lanes that are ready. They now count as having come back; other ready lanes stay."""
+        """Take whichever of these lanes are ready; they now count as having come back. Other ready lanes are left for later."""
         taken = [lane for lane in sorted(lanes) if lane in self._results]
         rows = self._layout.rows_of(self._layout.copies_of(taken)) if self._losses else ()
         for lane in taken:

@@ -110,7 +110,7 @@ class Client(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defau
 
 @dataclass(frozen=True)
 class ClientList:
-    """The clients that may connect, and those that were revoked."""
+    """The clients that may connect, and those whose keys were revoked."""
 
     clients: tuple[Client, ...] = ()
 

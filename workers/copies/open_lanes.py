@@ -60,7 +60,7 @@ class OpenLanes(dict[int, L]):
         return lane
 
     def close(self, lanes: Iterable[int]) -> None:
-        """Close those of these lanes that are open: immediately, or, within `in_use`, at its end."""
+        """Close whichever of these lanes are open: immediately, or, within `in_use`, at its end."""
         for number in lanes:
             if number == self._opening:
                 self._opening = None

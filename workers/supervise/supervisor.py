@@ -283,7 +283,9 @@ class Supervisor:
         while True:
             ended = self._ended()
             for each, end in ended:
-                if len(self._workers) > 1 or not end.on_purpose:  # a single worker has said itself why it leaves
+                if (
+                    len(self._workers) > 1 or not end.on_purpose
+                ):  # a lone worker that ends on purpose has already said why it left
                     report(f"{each.worker} {each.reason}")
             if notice is not None:
                 notice.send(self.activities(), [each for each, _ in ended], self._clock())

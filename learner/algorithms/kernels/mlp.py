@@ -30,7 +30,7 @@ from millrace.protocol.policy.layout import Field, named_views
 MLPPass = Callable[[], object]
 
 CHUNK_ROWS = 512  # the largest number of rows in a chunk
-THREADED_PRODUCT_SIZE = 64 * 64 * 128  # from this many multiplications on, torch's threads speed a product up
+THREADED_PRODUCT_SIZE = 64 * 64 * 128  # torch's threads speed up matrix products of at least this many multiplications
 MAX_PLANS = 256  # how many minibatch sizes have plans; the size varies with the number of valid rows
 
 

@@ -49,7 +49,7 @@ class EpisodePaths:
         return 3 * size * np.dtype(np.int64).itemsize
 
     def overwrite(self, slots: Ints) -> None:
-        """Forget these slots [K], which must be the oldest slots, in order of age."""
+        """Forget these slots [K], which must be the oldest slots, oldest first."""
         for number, place in zip(self._number[slots].tolist(), self._place[slots].tolist(), strict=True):
             if number == NO_PATH:
                 continue
