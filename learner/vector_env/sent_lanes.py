@@ -180,7 +180,7 @@ class SentLanes:
         return ready
 
     def take_some(self, lanes: Iterable[int]) -> Ready:
-        """Take whichever of these lanes are ready; they now count as having come back. Other ready lanes are left for later."""
+        """Take whichever of these lanes are ready; they now count as having come back. Others are left for later."""
         taken = [lane for lane in sorted(lanes) if lane in self._results]
         rows = self._layout.rows_of(self._layout.copies_of(taken)) if self._losses else ()
         for lane in taken:
