@@ -26,7 +26,7 @@ from millrace.protocol.policy.policy import Policy
 from millrace.protocol.random_streams import Purpose, RoundStreams, generator
 from millrace.protocol.rollout import Rollout
 from millrace.protocol.specs import RunSpec
-from millrace.workers.acting import ActedRows
+from millrace.workers.acting import ActedRows, RolloutActions
 from millrace.workers.conversation.held import Assignment
 from millrace.workers.copies.env_copies import EnvCopies, check_spaces
 from millrace.workers.copies.env_errors import environment_failures
@@ -134,7 +134,7 @@ class Collector:
             for (rows, acted), state, assignment in zip(filled, states, assignments, strict=True)
         ]
 
-    def _part(self, lanes: Sequence[Lane], drawn: Sequence[np.random.Generator]) -> Part:
+    def _part(self, lanes: Sequence[Lane], drawn: Sequence[np.random.Generator]) -> Part[RolloutActions]:
         """These lanes as a part that is ready for its first step; `drawn` has a random generator for each lane."""
         return Part(Rows(self._run, lanes, self._run.rollout_steps), self._runner.acting.begin(drawn))
 

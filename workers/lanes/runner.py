@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from time import perf_counter
-from typing import NamedTuple, Protocol
+from typing import Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
@@ -57,11 +57,14 @@ class NoneTogether:
         """Do nothing."""
 
 
-class Part(NamedTuple):
+Actions = TypeVar("Actions", bound=StepActions, covariant=True)
+
+
+class Part(NamedTuple, Generic[Actions]):
     """Lanes that are stepped in lock-step: their rows, and the actions that fill them."""
 
     rows: Rows
-    actions: StepActions
+    actions: Actions
 
 
 class LaneRunner:
@@ -76,7 +79,7 @@ class LaneRunner:
         self._run = run
         self._stored = stored_leaves(run)
 
-    def run(self, parts: Sequence[Part], pulse: Pulse) -> None:
+    def run(self, parts: Sequence[Part[StepActions]], pulse: Pulse) -> None:
         """Fill the rows of these parts. In an evaluation, stop when all its episodes are over.
 
         With two parts, the policy acts for one while the copies of the other step. `pulse` is called at every step and may
@@ -112,7 +115,7 @@ class LaneRunner:
 class _SteppedPart:
     """A part while it is stepped: `begin` acts and orders a step, `end` waits for it."""
 
-    def __init__(self, run: RunSpec, part: Part, together: TogetherSteps, stages: Stages) -> None:
+    def __init__(self, run: RunSpec, part: Part[StepActions], together: TogetherSteps, stages: Stages) -> None:
         self._rows, self._actions = part
         self._together = together
         self._stages = stages
