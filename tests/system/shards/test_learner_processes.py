@@ -134,13 +134,15 @@ def test_the_policy_may_act_in_rank_0(tmp_path: Path, undisturbed: bytes) -> Non
 
 
 @pytest.mark.soak
-@pytest.mark.parametrize("env", [f"{CODE}.seat_envs:RandomCrowd", f"{CODE}.mask_envs:Mixed-v0"])
-def test_seats_and_masks_are_divided_among_processes(tmp_path: Path, env: str) -> None:
+@pytest.mark.parametrize(
+    ("env", "flags"), [(f"{CODE}.seat_envs:RandomCrowd", ()), (f"{CODE}.mask_envs:Mixed-v0", ("--action-masks", "info"))]
+)
+def test_seats_and_masks_are_divided_among_processes(tmp_path: Path, env: str, flags: Sequence[str]) -> None:
     policies = set()
     for count in (1, 2):
         folder = tmp_path / str(count)
         folder.mkdir()
-        with ranks(folder, count, env=env) as started:
+        with ranks(folder, count, *flags, env=env) as started:
             for code, said in started.end():
                 assert code == 0, said
         policies.add(policy(folder))
