@@ -6,8 +6,8 @@ without such a name isn't logged as an event.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import ClassVar
+from dataclasses import asdict, dataclass
+from typing import Any, ClassVar
 
 from millrace.protocol.bounds import MAX_LINE, indented, one_line
 from millrace.protocol.errors import EnvironmentFailed, PolicyFailed, joined
@@ -198,6 +198,13 @@ LoggedEvent = (
     | LaneContinued
 )
 Event = LoggedEvent | RolloutRejected | RolloutArrived | EpisodesArrived
+
+
+def as_extra(event: LoggedEvent) -> dict[str, Any]:
+    """The attributes of a log record that describes the event. They are plain data: formatters of other programs write all
+    attributes of a record as JSON.
+    """
+    return {"event": event.json_name, "event_fields": asdict(event)}
 
 
 def describe(event: LoggedEvent) -> str:

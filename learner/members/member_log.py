@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 
-from millrace.learner.members.events import LoggedEvent, WorkerToldToRejoin
+from millrace.learner.members.events import LoggedEvent, WorkerToldToRejoin, as_extra
 from millrace.protocol.bounds import MAX_TEXT, one_line
 from millrace.protocol.logs.log_rate_limiter import Allowance, LogBudget, LogRateLimiter, suppressed_note
 from millrace.protocol.wire.learner_link import LearnerLink
@@ -71,7 +71,7 @@ class MemberLog:
             first = f"{first}; its traceback is the same as the one before"
             more = ""
         self._traceback = more or self._traceback
-        log.log(level, "%s%s%s", first, note, f"\n{more}" if more else "", extra={"event": event} if event else None)
+        log.log(level, "%s%s%s", first, note, f"\n{more}" if more else "", extra=None if event is None else as_extra(event))
 
     def _budget_of_key(self, peer: bytes | None) -> LogBudget:
         return self._of_key.setdefault(self._source(peer), LogBudget(OF_A_KEY))

@@ -11,7 +11,6 @@ between.
 
 from __future__ import annotations
 
-import dataclasses
 import logging
 import os
 from collections.abc import Iterator
@@ -41,11 +40,9 @@ class JsonLines(logging.Formatter):
 
     def format(self, record: logging.LogRecord) -> str:
         """The line, without a line break."""
-        event = getattr(record, "event", None)
-        fields: dict[str, Any] = {} if event is None else dataclasses.asdict(event)
-        kind = "said" if event is None else event.json_name
         level = "info" if is_notice(record) else record.levelname.lower()
-        return _line(record.created, level, kind, record.getMessage(), fields)
+        kind = getattr(record, "event", "said")
+        return _line(record.created, level, kind, record.getMessage(), getattr(record, "event_fields", {}))
 
 
 def progress_line(progress: Progress, now: float) -> str:

@@ -13,7 +13,7 @@ import pytest
 import zmq
 
 from millrace.cli.status import as_table, ask, in_json, observer_name
-from millrace.learner.members.events import LoggedEvent, WorkerLeft, WorkerToldToRejoin, describe
+from millrace.learner.members.events import LoggedEvent, WorkerLeft, WorkerToldToRejoin, as_extra, describe
 from millrace.learner.members.member import MAX_LATE_ACTIONS
 from millrace.learner.rollouts.hub import Hub, HubSettings
 from millrace.learner.rollouts.run_status import progress_now, status
@@ -294,7 +294,7 @@ EVENTS: list[tuple[LoggedEvent, dict[str, Any]]] = [
 @pytest.mark.parametrize(("event", "expected"), EVENTS)
 def test_an_event_is_one_line_of_json(event: LoggedEvent, expected: dict[str, Any]) -> None:
     record = logging.LogRecord("millrace.learner", logging.WARNING, "", 0, "%s", (describe(event),), None)
-    record.event = event
+    vars(record).update(json.loads(json.dumps(as_extra(event))))
     line = JsonLines().format(record)
     found = json.loads(line)
     assert "\n" not in line

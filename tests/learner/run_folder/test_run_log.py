@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from millrace.learner.members.events import WorkerLeft
+from millrace.learner.members.events import WorkerLeft, as_extra
 from millrace.learner.run_folder import json_log
 from millrace.learner.run_folder.json_log import RUN_LOG_FILE, kept_log, newest_lines
 from millrace.protocol.logs.notices import log_notice
@@ -20,7 +20,7 @@ log = logging.getLogger("millrace.learner")
 def test_warnings_and_notices_are_kept_and_the_rest_is_not(tmp_path: Path) -> None:
     with kept_log(tmp_path):
         log.info("a worker joined")
-        log.warning("w0 was lost", extra={"event": WorkerLeft("w0", "silent", 2, on_purpose=False)})
+        log.warning("w0 was lost", extra=as_extra(WorkerLeft("w0", "silent", 2, on_purpose=False)))
         log_notice(log, "the run continues")
     log.warning("after the run")
     assert [(line.level, line.message) for line in newest_lines(tmp_path)] == [
@@ -33,7 +33,7 @@ def test_warnings_and_notices_are_kept_and_the_rest_is_not(tmp_path: Path) -> No
 def test_a_name_that_would_change_how_a_line_looks_is_escaped(tmp_path: Path) -> None:
     name = "\u202e\u2066\x9b31m"
     with kept_log(tmp_path):
-        log.warning("lost", extra={"event": WorkerLeft(name, "silent", 2, on_purpose=False)})
+        log.warning("lost", extra=as_extra(WorkerLeft(name, "silent", 2, on_purpose=False)))
     text = (tmp_path / RUN_LOG_FILE).read_text()
     assert text.rstrip("\n").isprintable()
     assert json.loads(text)["worker"] == name
