@@ -107,7 +107,7 @@ class Sharded(ActorCritic):
         self.update(batch_of(learn, rest, columns), lambda: None)
 
     def digest(self) -> str:
-        """SHA-256 of the state, without the observation statistics, which only rank 0 counts."""
+        """SHA-256 of the state without the observation statistics, which only rank 0 maintains."""
         found = hashlib.sha256()
         for content in _contents({**self.state_dict(), "observations": None}):
             found.update(content)

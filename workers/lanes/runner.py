@@ -113,7 +113,7 @@ class LaneRunner:
 
 
 class _SteppedPart:
-    """A part while it is stepped: `begin` acts and orders a step, `end` waits for it."""
+    """A part that is being stepped: `begin` chooses the actions and orders a step; `end` waits for the step to finish."""
 
     def __init__(self, run: RunSpec, part: Part[StepActions], together: TogetherSteps, stages: Stages) -> None:
         self._rows, self._actions = part

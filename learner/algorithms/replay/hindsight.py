@@ -42,10 +42,10 @@ class GoalReward(Protocol):
 
 
 class Goals(NamedTuple):
-    """The replacement goals of some rows of a draw."""
+    """Replacement goals for some of the sampled rows."""
 
     rows: Ints
-    """[K] the indices of these rows in the draw"""
+    """[K] the indices of these rows in the sample"""
     goal: Array
     """[K, *goal] the goals, in the form in which observations hold them"""
 
@@ -126,10 +126,10 @@ def goals_not_used(config: AlgorithmConfig, observation: Sequence[Leaf], env: st
 
 @dataclass(frozen=True)
 class Hindsight:
-    """The settings of hindsight: how many rows of a draw get another goal, and how their outcome under it is computed."""
+    """The settings of hindsight: how many rows of a sample get another goal, and how their outcome under it is computed."""
 
     share: float
-    """the fraction of the rows of a draw that get another goal"""
+    """the fraction of the rows of a sample that get another goal"""
     achieved: int
     """the leaf of the observation that holds the achieved goal"""
     desired: int

@@ -1,4 +1,4 @@
-"""A replay buffer with prior data: a fixed share of each draw is transitions of a dataset (RLPD, Ball et al. 2023).
+"""A replay buffer with prior data: a fixed share of each sample consists of transitions from a dataset (RLPD, Ball et al. 2023).
 
 Rule: only the run's own transitions are added, overwritten and rolled back, and only they have priorities. Prior transitions
 never change and are drawn uniformly. They aren't part of a saved state: add the same dataset before you load the state.
@@ -40,7 +40,7 @@ class PriorTransitions(ReplayBuffer):
 
 
 class MixedReplay(ReplayBuffer):
-    """The run's own transitions, and prior ones if there are any. In a draw, the prior transitions come last."""
+    """The run's own transitions, and prior ones if there are any. In a sample, the prior transitions come last."""
 
     prior: ReplayBuffer | None = None
     _prior_share = 0.0

@@ -168,7 +168,7 @@ class ReplayBuffer(Rewinding[Overwritten]):
         self._gamma = gamma
         self._alpha = alpha
         self._seed = seed
-        self.generator = generator(seed, self._purpose)  # the source of random numbers for all draws
+        self.generator = generator(seed, self._purpose)  # the source of random numbers for all samples
         self._obs = tuple(self._room(leaf) for leaf in observation)
         self._mask: Bools | None = None  # [size, choices], the masks of `_obs`; allocated when the first masks arrive
         self._row = np.zeros(size, row_dtype(action))
@@ -338,7 +338,7 @@ class ReplayBuffer(Rewinding[Overwritten]):
         return leaves
 
     def samples(self, number: int, count: int, beta: float = 1.0) -> Iterator[Sample]:
-        """Yield `number` draws of `count` transitions each. Between the draws, nothing but priorities may change.
+        """Yield `number` samples of `count` transitions each. Between the samples, nothing but priorities may change.
 
         Small uniform draws are made many at once, because that is faster.
         """

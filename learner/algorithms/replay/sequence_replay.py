@@ -35,7 +35,7 @@ from millrace.protocol.specs import PolicySpec
 
 NONE = -1  # stands for "no sequence" where a sequence's number is expected
 FEWEST = 16
-"""The least number of sequences in a draw. Rows of a sequence are alike, so few sequences would give a noisy gradient."""
+"""The least number of sequences in a sample. Rows of a sequence are alike, so few sequences would give a noisy gradient."""
 HIGHEST_SHARE = 0.9  # weight of the highest error in a priority; the mean error has the rest (Kapturowski et al. 2019)
 
 
@@ -107,7 +107,7 @@ class SequenceReplay(Rewinding[ReplacedSequences]):
         self.arrays = {name: np.zeros((self.size, *shape), dtype) for name, (shape, dtype) in shapes.items()}
         """Arrays with one entry for each slot, by name. `begins` is True where obs[t+1] begins an episode. `before` is the
         number of the previous sequence; sequences are numbered in the order in which they were written."""
-        self.generator = generator(seed, Purpose.REPLAY)  # the source of random numbers for all draws
+        self.generator = generator(seed, Purpose.REPLAY)  # the source of random numbers for all samples
         self._tree = None if alpha is None else SumTree(self.size)
         self._highest = 1.0  # the highest priority so far, which new sequences get
         self._written = 0  # number of sequences ever written; modulo the size, it is the next slot
@@ -207,7 +207,7 @@ class SequenceReplay(Rewinding[ReplacedSequences]):
     # ---------------------------------------------------------------- reading
 
     def samples(self, number: int, count: int, beta: float = 1.0) -> Iterator[SequenceSample]:
-        """Yield `number` draws. For `count` and `beta`, see `sample`."""
+        """Yield `number` samples. For `count` and `beta`, see `sample`."""
         return (self.sample(count, beta) for _ in range(number))
 
     def sample(self, count: int, beta: float = 1.0) -> SequenceSample:

@@ -69,7 +69,7 @@ class Choice(NamedTuple):
 
     @staticmethod
     def of(query: Mapping[str, Sequence[str]]) -> Choice:
-        """The choice in the query of an address. Missing or wrong parts are replaced by defaults."""
+        """The choice that a URL's query asks for. Missing or invalid parameters get their defaults."""
 
         def first(name: str, default: str) -> str:
             return query.get(name, [default])[0]
