@@ -108,7 +108,8 @@ class RolloutService:
     `publish` sets the weights: the flat float32 vector [P] of the policy, or an array for each of its pieces. `gather`, or
     one iteration over the service, waits until one rollout of each lane has arrived, and returns them as a `RolloutBatch` of
     T = `rollout_steps` rows of `envs` env copies. With `max_lag=0`, a batch was collected with the weights that
-    you published last. With `max_lag=n`, it was collected with those that were newest at the `gather` call n batches earlier.
+    you published last. With `max_lag=n`, it was collected with those that were newest at the `gather` call n batches
+    before.
 
     `publish`, `gather`, `evaluate` and `save` raise `UsageError` after `close`, and if they are called from another thread.
     `gather` and `evaluate` raise a `RunError` if no further rollout can arrive: `NoWorkers`, `Stalled`, `EnvironmentFailed`

@@ -1,4 +1,4 @@
-"""A replay buffer with prior data: a fixed share of each sample consists of transitions from a dataset (RLPD, Ball et al. 2023).
+"""A replay buffer with prior data: a fixed share of each sample comes from a dataset (RLPD, Ball et al. 2023).
 
 Rule: only the run's own transitions are added, overwritten and rolled back, and only they have priorities. Prior transitions
 never change and are drawn uniformly. They aren't part of a saved state: add the same dataset before you load the state.
