@@ -61,9 +61,9 @@ class ActorCritic(GradientDescent):
 
     A subclass defines `loss`, with ordinary torch operations, unless its loss is the policy gradient with a squared value
     loss. Advantages are generalized advantage estimates (GAE); a subclass that needs others defines `estimate`. If an update
-    changes other state, save and load it in `other_state` and `load_other_state`.
+    of your subclass changes state of its own, save this state in `other_state` and load it in `load_other_state`.
 
-    `Config` is the class of the settings, and `self.config` holds their values. It must have the settings of
+    `Config` is the class of the settings, and `self.config` holds their values. The class must have the settings of
     `ActorCriticConfig`, unless the subclass overrides the methods that use them (`n_epochs`, `minibatch_count`,
     `standardizes_advantages`, `estimate`).
     """
@@ -181,7 +181,7 @@ class ActorCritic(GradientDescent):
         return self.metrics(epochs, estimates)
 
     def step(self, *minibatch: Minibatch) -> tuple[UpdateMetrics, bool]:
-        """Take one gradient step on a minibatch. Returns the metrics, and whether they end the update before the step.
+        """Take one gradient step on a minibatch, unless its metrics end the update. Returns them, and whether they do.
 
         `minibatch` holds the parts that this process learns from: all rows in one part, unless the run has shards.
 
@@ -196,7 +196,7 @@ class ActorCritic(GradientDescent):
         return metrics, ends
 
     def gradient(self, minibatch: Sequence[Minibatch]) -> UpdateMetrics:
-        """Compute a minibatch's gradient into `net.flat.grad`. Returns the loss, logged numbers and the gradient's norm."""
+        """Write a minibatch's gradient to `net.flat.grad`. Returns the loss, logged numbers and the gradient's norm."""
         (rows,) = minibatch
         loss, numbers = self.checked_loss(rows)
         return self.differentiate(loss, self.optimizers["optimizer"], {**numbers, "loss": loss})
@@ -244,7 +244,7 @@ class ActorCritic(GradientDescent):
         return WholeBatch(batch, self.observations(batch))
 
     def observations(self, batch: Batch) -> ColumnObservations:
-        """The observations of a batch, normalized as they were for the workers' policy."""
+        """The observations of a batch, normalized just as they were on the workers."""
         x, images = self.normalizer.inputs(batch.obs, self.statistics)
         recurrent = None
         if self.policy.core is not None:

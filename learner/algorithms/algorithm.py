@@ -26,8 +26,8 @@ class Start(NamedTuple):
     """The parts of an earlier run that a new run takes over. Both runs' policies have the same `PolicySpec`."""
 
     state: dict[str, Any]
-    """The `state_dict` of the earlier run's algorithm. If only the policy of that run is known, it holds just `parameters`,
-    and perhaps the observation statistics, `observations`.
+    """The `state_dict` of the earlier run's algorithm. If only the policy of that run is known, the dict holds just
+    `parameters`, and perhaps the observation statistics, `observations`.
     """
     acting: int
     """The number P of acting parameters: the first P of the `parameters` compute actions."""

@@ -1,7 +1,7 @@
 """DQN (Mnih et al. 2015), with double, dueling, n-step and prioritized variants.
 
-An update adds a batch to the replay buffer and takes a fixed number of gradient steps, so how often a transition is used is
-a setting and does not depend on speed. ε falls with the number of env steps learned from so far, and is published with the
+An update adds a batch to the replay buffer and takes a fixed number of gradient steps. So how often a transition is used
+depends on the settings, not on speed. ε falls with the number of env steps in all batches so far, and is published with the
 weights. The settings are in `learner/config/hyperparameters.py`.
 """
 

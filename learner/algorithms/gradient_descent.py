@@ -1,7 +1,7 @@
 """The base of the algorithms that train flat tensors by gradient descent: the tools of an update, and the saved state.
 
 Rule: torch differentiates exactly the loss that an algorithm defines. A step is taken only if its loss and its gradient are
-finite; `roll_back` undoes what an update had changed before it raised.
+finite; if an update raises, `roll_back` undoes the changes that it made before.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Network(Protocol):
 
 
 class GradientDescent(Algorithm):
-    """Flat tensors, an optimizer for each one that is trained, schedules, and statistics of observations and returns.
+    """Flat tensors, an optimizer for each trained one, schedules, and statistics of observations and returns.
 
     A subclass puts everything that a step changes into `tensors` and `optimizers`, and everything else that the next update
     depends on into `other_state`.
@@ -92,7 +92,7 @@ class GradientDescent(Algorithm):
         return torch.from_numpy(array).to(self.net.flat.device)
 
     def count(self, batch: Batch) -> None:
-        """Count a batch in the running statistics. Observation statistics take effect only when `statistics` is set."""
+        """Add a batch to the running statistics. New observation statistics take effect only when `statistics` is set."""
         if self.config.normalize_rewards:
             self.rewards.count(batch)
         if self.policy.normalize_observations:
@@ -103,13 +103,13 @@ class GradientDescent(Algorithm):
         return self.rewards.scaled(reward) if self.config.normalize_rewards else reward
 
     def add_prior(self, prior: PriorData) -> None:
-        """Count the rows of a dataset in all running statistics."""
+        """Add the rows of a dataset to all running statistics."""
         for batch in prior.batches():
             self.count(batch)
         self.statistics = self.normalizer.buffers()
 
     def differentiate(self, loss: Tensor, optimizer: Optimizer, numbers: Mapping[str, Tensor | float]) -> UpdateMetrics:
-        """Compute the gradient of a loss into `grad` of the optimizer's flat tensor.
+        """Compute the gradient of a loss, and store it in `grad` of the optimizer's flat tensor.
 
         Sets `grad` to zero, and calls `loss.backward()`. Returns `numbers` as floats, and the norm of the gradient as
         `grad_norm`. Raises `RunError` if one of these is not finite, and `UsageError` if one isn't a number.
@@ -155,7 +155,7 @@ class GradientDescent(Algorithm):
         return bool(all(tensor.isfinite().all() for tensor in self.tensors.values()) and np.isfinite(self.statistics).all())
 
     def other_state(self) -> dict[str, Any]:
-        """A copy, as plain data, of what else the next update depends on, apart from tensors, optimizers and statistics."""
+        """A copy, as plain data, of the state that updates depend on, apart from tensors, optimizers and statistics."""
         return {"env_steps": self.env_steps, "version": self.version, "pretraining_steps": self.pretraining_steps}
 
     def load_other_state(self, state: dict[str, Any]) -> None:
@@ -216,7 +216,7 @@ def scheduled(first: float, schedule: str, remaining: float) -> float:
 
 
 def clip_norm(flat: Tensor, norm: float, largest: float) -> None:
-    """Scale down the gradient of a flat tensor, whose norm is `norm`, so that its norm is at most `largest`."""
+    """Scale the gradient of a flat tensor, whose norm is `norm`, down to a norm of at most `largest`."""
     if norm > largest:
         assert flat.grad is not None
         flat.grad.mul_(largest / norm)

@@ -14,7 +14,7 @@ from millrace.protocol.arrays import Floats
 
 
 def standardized(advantage: Tensor) -> Tensor:
-    """Advantages [B] scaled to mean 0 and (sample, n − 1) standard deviation 1. A single row is returned unchanged."""
+    """Advantages [B] scaled to mean 0 and sample standard deviation 1 (with B − 1). A single row is returned unchanged."""
     if len(advantage) < 2:
         return advantage
     std, mean = torch.std_mean(advantage)
@@ -86,7 +86,7 @@ def clip_fraction(log_ratio: Tensor, clip_range: float) -> Tensor:
 def explained_variance(value: Floats, target: Floats) -> float:
     """1 − Var(target − value) / Var(target): 1 is perfect, 0 is no better than a constant.
 
-    NaN where the targets do not vary, or where there are none.
+    NaN if the targets do not vary, or if there are none.
     """
     variance = _variance(target) if len(target) else 0.0
     return 1 - _variance(target - value) / variance if variance > 0 else math.nan

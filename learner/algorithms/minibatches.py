@@ -96,7 +96,7 @@ class Minibatch(NamedTuple):
     log_prob: Tensor  # [B] float32 log-probability of the action under the policy that acted
     advantage: Tensor  # [B] float32, not standardized
     target: Tensor  # [B] float32 target of the value function
-    recurrent: RecurrentInput | None = None  # with a core, features and images are [T · C, …], and this selects B of them
+    recurrent: RecurrentInput | None = None  # with a core, features and images have T · C rows, of which this selects B
     mask: Tensor | None = None  # [B, choices] bool, True for allowed actions; None unless the run uses action masks
     standardized: Tensor | None = None  # [B] advantages standardized over all parts; None if this is the only part
 
@@ -117,7 +117,7 @@ class Minibatch(NamedTuple):
         )
 
     def select(self, rows: Tensor, input_rows: Tensor | None = None, recurrent: RecurrentInput | None = None) -> Minibatch:
-        """A copy of some rows. `input_rows` are the rows of the network's input, if a core needs more rows than `rows`."""
+        """A copy of some rows. `input_rows` are the rows that enter the network, if a core needs more than `rows`."""
         input_rows = rows if input_rows is None else input_rows
         return Minibatch(
             self.features.index_select(0, input_rows),

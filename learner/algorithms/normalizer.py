@@ -69,7 +69,7 @@ class Normalizer:
         return self._observations.buffers()
 
     def update(self, batch: Batch) -> None:
-        """Count the observations of a batch. Call this once for each batch, after `normalized`."""
+        """Add the observations of a batch to the statistics. Call this once for each batch, after `normalized`."""
         self._observations.update(self._features(batch)[:-1], batch.valid)
 
     def normalized(self, batch: Batch) -> Floats:
@@ -82,10 +82,10 @@ class Normalizer:
         return normalize(self._features(batch), self.mean, self.std)
 
     def scaled_rewards(self, batch: Batch, gamma: float) -> Floats:
-        """Count a batch, and return its rewards [T, N] divided by the standard deviation of the discounted return,
-        clipped to ±10.
+        """Add the rewards of a batch to the statistics, and return them scaled, as an array [T, N].
 
-        Call it once for each batch. `gamma` is the discount. Raises `UsageError` if it isn't the same each time.
+        They are divided by the standard deviation of the discounted return, and clipped to ±10. Call this once for each
+        batch. `gamma` is the discount factor. Raises `UsageError` if it isn't the same each time.
         """
         if self._rewards is None:
             self._rewards = gamma, RewardScaler(gamma)
@@ -99,7 +99,7 @@ class Normalizer:
         return features(self._policy, [obs[path] for path in paths] if paths[0] else [obs])
 
     def state(self) -> dict[str, Any]:
-        """Plain data for `restore`, without the running returns, because a restored service has new env copies."""
+        """The state for `restore`, as plain data. Without running returns, because a restored service has new env copies."""
         kept: dict[str, Any] = {"observations": _plain(self._observations.state_dict())}
         if self._rewards is not None:
             gamma, scaler = self._rewards

@@ -77,7 +77,7 @@ class PPO(ActorCritic):
         }
 
     def metrics(self, epochs: Sequence[Sequence[UpdateMetrics]], estimates: Sequence[Estimates]) -> UpdateMetrics:
-        """Add the last loss, the last epoch's KL divergence, the clip range and the number of epochs so far to the metrics.
+        """Add to the metrics the last loss, the last epoch's KL divergence, the clip range, and the number of epochs so far.
 
         If a subclass has its own loss, the KL divergence is included only if that loss logs it.
         """

@@ -26,7 +26,7 @@ class PriorData(Protocol):
         """Number of episodes."""
 
     def batches(self) -> Iterator[Batch]:
-        """Each episode as a batch of one column [T, 1]. Every call begins with the first episode.
+        """Yield each episode as a batch of one column [T, 1]. Every call starts again with the first episode.
 
         Raises `UsageError` if an episode cannot be used.
         """

@@ -3,7 +3,7 @@
 Its other parts are settings of DQN: double, dueling, n-step returns and prioritized replay. Noisy networks are left out,
 because workers would have to draw noise for each weight; workers explore with ε instead.
 
-Rule: with batch normalization, observations and next observations pass the network in one minibatch. They come from
+Rule: with batch normalization, observations and next observations pass through the network in one minibatch. They come from
 different distributions; in separate minibatches they would be normalized by different means (Bhatt et al. 2024).
 """
 
@@ -52,7 +52,7 @@ class Rainbow(DQN):
         return super().policy_spec(config, observation, action)
 
     def transitions(self, sample: Sample | SequenceSample) -> Transitions:
-        """See `OffPolicy`. Nothing is encoded yet: observations and next observations pass the encoder together."""
+        """See `OffPolicy`. Nothing is encoded yet, because observations and next observations are encoded together."""
         return OffPolicy.transitions(self, sample)
 
     @torch.no_grad()

@@ -4,9 +4,9 @@ The replay buffer of single rows has its own n-step returns, because it follows 
 (`replay/replay_buffer.py`).
 
 Every function follows the row format (`millrace.protocol.rollout`): row t bootstraps from `values[t+1]`, the value of
-`obs[t+1]`, which is the true final observation of a truncated episode. No function adds rewards or values across the end of
-an episode. A row that is not valid gives zero and does not affect other rows, whatever it contains: what a computation
-carries from later rows to earlier ones, or from earlier to later, passes through it unchanged.
+`obs[t+1]`. Where an episode was truncated, this is its true final observation. No function adds rewards or values across the
+end of an episode. A row that is not valid gives zero and does not affect other rows, whatever it contains: a value that a
+computation carries from row to row, in either direction, passes through it unchanged.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ def vtrace(
     assert values.shape == (T + 1, N), f"values: expected {(T + 1, N)}, got {values.shape}"
     zero, discount, mix = np.float32(0), np.float32(gamma), np.float32(vtrace_lambda)
     log_ratio = np.where(ends.valid, log_ratio, zero)
-    rho = np.exp(np.minimum(log_ratio, np.float32(math.log(rho_bar))))  # clipped before exp, which cannot overflow then
+    rho = np.exp(np.minimum(log_ratio, np.float32(math.log(rho_bar))))  # clipped first, so that exp cannot overflow
     c = np.exp(np.minimum(log_ratio, np.float32(math.log(c_bar))))
     bootstrap = np.where(ends.terminated, zero, values[1:])
     delta = np.where(ends.valid, rho * (reward + discount * bootstrap - values[:-1]), zero)
@@ -120,7 +120,7 @@ class NStepReturns(NamedTuple):
 
 
 def n_step_returns(reward: Floats, ends: EpisodeEnds, gamma: float, n_step: int) -> NStepReturns:
-    """The discounted sum of up to n rewards from each row on, over consecutive valid rows of its episode.
+    """For each row, the discounted sum of up to n rewards: its own, and those of the next valid rows of its episode.
 
     `reward` is [T, N].
     """

@@ -5,9 +5,9 @@ statistics; workers act with the float32 buffers that it publishes.
 
 Rule: no single observation may spoil the scale of the others. A value more than `FAR` standard deviations from the mean (a
 far value) counts as if it were `CLIP` standard deviations away, which is what the policy sees. So if a sensor fails in less
-than one row in a hundred, the standard deviation changes little. If the scale of a feature grows for good, its many far
-values quickly set a new scale. Other values are counted unchanged. Which of the first rows are far is known only after
-`FEW` rows; until then all rows are kept.
+than one row in a hundred, the standard deviation changes little. If the scale of a feature grows permanently, its many far
+values quickly set a new scale. Values that are not far are counted unchanged. Which of the first values are far is not known
+until there are `FEW` rows, so all rows are kept until then.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class RunningMoments:
         self._squares: Doubles = np.zeros(shape)  # summed squared distances from the mean
 
     def update(self, rows: npt.NDArray[Any]) -> None:
-        """Count rows [B, *shape]."""
+        """Add rows [B, *shape] to the mean and the variance."""
         if not len(rows):
             return
         mean = rows.mean(0, dtype=np.float64)
@@ -58,9 +58,9 @@ class RunningMoments:
 
     @property
     def std(self) -> Doubles:
-        """Standard deviation [*shape] of the population; 1 where the value never varied by more than rounding.
+        """Standard deviation [*shape] of the population; 1 where the values varied by no more than rounding errors.
 
-        If the mean is so large that its rounding error may exceed 1, that error is returned in place of 1.
+        Where the mean is so large that its rounding error may exceed 1, this error takes the place of the 1.
         """
         variance = self._squares / max(self.count, 1)
         rounding = self._rounding * abs(self.mean)
@@ -97,7 +97,7 @@ class ObservationNormalizer:
     def inputs(self, leaves: Sequence[Array], published: Floats) -> tuple[Array, list[Array]]:
         """The network's input for leaves [..., *leaf]: features [..., D], and the images among the leaves.
 
-        `published` are the `buffers` with which workers act, which may be older than the newest statistics.
+        `published` are the `buffers` with which workers act. They may be older than the newest statistics.
         """
         raw = self.raw(leaves)
         x = normalize(raw, *np.split(published, 2)) if self._enabled else raw
@@ -108,11 +108,11 @@ class ObservationNormalizer:
         return features(self._spec, leaves)
 
     def published(self, buffers: Floats) -> Floats:
-        """The part of `buffers` that workers need to act: without the features that only the critic sees."""
+        """The part of `buffers` that workers need to act. It leaves out the features that only the critic sees."""
         return np.concatenate([half[: self._acting] for half in np.split(buffers, 2)]) if self._enabled else buffers
 
     def update(self, raw: Floats | Doubles, valid: npt.NDArray[np.bool_]) -> None:
-        """Count features [T, N, D], not yet normalized, of the rows [T, N] that are valid."""
+        """Add the features [T, N, D], not yet normalized, of the valid rows to the statistics. `valid` is [T, N]."""
         if not self._enabled:
             return
         rows = raw[valid]
@@ -125,9 +125,9 @@ class ObservationNormalizer:
             self._update_with_first(rows)
 
     def _update_with_first(self, rows: Floats | Doubles) -> None:
-        """Count the rows [B, D] that bring the total to `FEW` or more.
+        """Add the rows [B, D] with which the total reaches or exceeds `FEW`.
 
-        The 99 % of the values so far that are nearest to the median set the scale.
+        The scale is set by the 99 % of all values so far that are nearest to the median.
         """
         so_far = np.concatenate([self._first, rows]) if len(self._first) else rows
         center = np.median(so_far, 0)
@@ -170,10 +170,10 @@ class ObservationNormalizer:
 
 
 def _bounded(rows: Floats | Doubles, center: Floats | Doubles, spread: Floats | Doubles) -> Floats | Doubles:
-    """The rows [B, D], with values that are far from the center [D] replaced; the same array if no value is far."""
+    """The rows [B, D], in which values far from the center [D] are replaced. Returns the same array if no value is far."""
     distance = rows - center.astype(rows.dtype)
     if (np.einsum("bd,bd->d", distance, distance) <= (FAR * spread) ** 2).all():
-        return rows  # true for most batches: if all squares sum to less than the square of a far value, no value is far
+        return rows  # true for most batches: if a feature's squares sum to no more than the limit squared, none is far
     far = abs(distance) > FAR * spread
     return np.where(far, center + np.copysign(CLIP * spread, distance), rows) if far.any() else rows
 
@@ -192,7 +192,7 @@ class RewardScaler:
         self._returns: dict[int, Doubles] = {}  # by lane, the running return [columns] of each env copy
 
     def count_and_scale(self, batch: Batch) -> Floats:
-        """Count the batch, then return its scaled rewards [T, ΣN], clipped to ±10."""
+        """Add the batch to the statistics, then return its rewards [T, ΣN], scaled and clipped to ±10."""
         self.count(batch)
         return self.scaled(batch.reward)
 
@@ -202,7 +202,7 @@ class RewardScaler:
         return clipped
 
     def bounded(self, reward: Floats, bound: float) -> Floats:
-        """These rewards, float32, divided by `std`, or by more to keep all discounted returns so far within the bound."""
+        """These rewards, float32, divided by `std`, or by more if discounted returns so far would exceed the bound."""
         divided: Floats = (reward / max(self.std, self._largest / bound)).astype(np.float32)
         return divided
 
@@ -212,13 +212,13 @@ class RewardScaler:
         return float(self._moments.std)
 
     def count(self, batch: Batch) -> None:
-        """Count the rewards of a batch."""
+        """Add the rewards of a batch to the statistics."""
         ends = EpisodeEnds.of(batch)
         for at in range(0, len(batch.lane), batch.columns_per_rollout):  # rollouts of a lane are in order of collection
             columns = slice(at, at + batch.columns_per_rollout)
             lane = int(batch.lane[at])
             fresh = batch.fresh[columns]
-            known = 0.0 if fresh.all() else self._returns.get(lane, 0.0)  # a fresh lane may have a new size
+            known = 0.0 if fresh.all() else self._returns.get(lane, 0.0)  # a fresh lane may have more or fewer env copies
             start = np.where(fresh, 0.0, known)
             returns, self._returns[lane] = discounted_return(
                 batch.reward[:, columns], ends.columns(columns), self._gamma, start

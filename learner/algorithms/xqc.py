@@ -1,7 +1,7 @@
-"""XQC (Palenicek et al. 2025): SAC with a better conditioned loss, so that it learns more from each step.
+"""XQC (Palenicek et al. 2025): SAC with a better-conditioned loss, so that it learns more from each step.
 
-It has three parts: batch normalization before each activation; weights of norm 1, so that an optimizer step turns them by an
-angle that doesn't shrink as weights grow; and critics that learn the probabilities of returns by cross-entropy, whose
+It has three parts: batch normalization before each activation; weights that are kept at norm 1, because optimizer steps turn
+large weights by smaller angles; and critics that predict the probabilities of returns and learn by cross-entropy, whose
 gradient is bounded. Rewards are scaled so that returns lie within the categories. `NormalizedSAC` has the parts that XQC and
 CrossQ share.
 """
@@ -77,11 +77,15 @@ class XQC(NormalizedSAC):
         with torch.no_grad():
             values = self.categories.mean(logits)
             error = (values - target @ self.categories.atoms.to(target.dtype)).abs().mean(0)
-        # The loss is finite even if a reward is not: a return beyond the bounds counts as the bound.
+        # The loss is finite even if a reward is infinite, because a return beyond the bounds counts as the bound. So the
+        # mean reward is logged: the check of the logged numbers then fails.
         return CriticLoss(loss, error, {"q_mean": values.mean(), "scaled_reward": rows.reward.mean()})
 
     def critic_loss(self, rows: Transitions) -> CriticLoss:
-        """See `cross_entropy` and `target_distribution`. Critics and targets each see s, a and s′, a′ in one minibatch."""
+        """See `cross_entropy` and `target_distribution`.
+
+        The critics, and likewise the target critics, process (s, a) and (s′, a′) together in one minibatch.
+        """
         joint = self.joint(rows)
         size = len(rows.x)
         with torch.no_grad():

@@ -1,4 +1,4 @@
-"""The available memory of this machine, or of its job or container if that has less. Read from Linux kernel files."""
+"""The available memory of this machine, or of this job or container if it has less. Read from Linux kernel files."""
 
 from __future__ import annotations
 

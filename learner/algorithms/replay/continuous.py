@@ -1,8 +1,8 @@
 """The base of SAC and TD3: an actor with critics, uniform actions at first, and an exact replay ratio.
 
 Rule: after each update, ⌊updates_per_step × (env steps used − learning_starts)⌋ gradient steps have been taken in all,
-whatever the size of the rollouts and the number and speed of the workers. If a resumed run changes one of the two settings,
-it counts env steps and gradient steps afresh from there.
+whatever the size of the rollouts and the number and speed of the workers. If a resumed run changes `updates_per_step` or
+`learning_starts`, both counts restart when it resumes.
 """
 
 from __future__ import annotations
@@ -41,11 +41,11 @@ class Networks(Protocol):
     """
 
     flat: Tensor
-    """[A + E + C] all parameters, those of the actor first, then the encoder's"""
+    """[A + E + C] all parameters: A of the actor, then E of the encoder, then C of the critics"""
     actor: Tensor
-    """[A] in the memory of `flat`, with a gradient"""
+    """[A] the actor's part of `flat`, a view with a gradient"""
     critics: Tensor
-    """[E + C] the encoder and the critics, in the memory of `flat`, with a gradient"""
+    """[E + C] the part of `flat` for the encoder and the critics, a view with a gradient"""
 
     @property
     def encode(self) -> Encoder:
@@ -112,7 +112,7 @@ class Continuous(OffPolicy):
         self._generator = torch.Generator().manual_seed(torch_seed(seed, Purpose.NOISE))
         self._counted = {"updates_per_step": config.updates_per_step, "env_steps": config.learning_starts, "made": 0}
         self._learning_starts = config.learning_starts
-        self._acts_at_once = False  # True if the policy was trained before; then uniform actions don't come first
+        self._acts_at_once = False  # True if the policy was trained before; then there is no warm-up of uniform actions
         self.tensors = {"parameters": self.net.flat, "target": self.target.flat}
         trained = {"actor_optimizer": self.net.actor, "critic_optimizer": self.net.critics}
         self.optimizers = {name: make_optimizer("adam", part, **self.ADAM) for name, part in trained.items()}
@@ -125,7 +125,7 @@ class Continuous(OffPolicy):
         """Enforce the algorithm's constraints on weights. Called after each step of NAME_optimizer, including in cloning."""
 
     def begin_with_actor(self) -> None:
-        """Let an actor that was trained before the first rollouts act from the first env step. Copies it to its target."""
+        """Act with the actor from the first env step, because it was trained before. Copies it to its target."""
         self.target.actor.copy_(self.net.actor)
         self._acts_at_once = True
 
@@ -181,9 +181,10 @@ class Continuous(OffPolicy):
         return self.net.acting_parameters(), np.concatenate((self.statistics, exploration))
 
     def exploration(self) -> list[float]:
-        """The exploration settings: the numbers in the policy's buffers after the statistics, except the last number.
+        """The exploration settings, which follow the statistics in the policy's buffers.
 
-        The last number says whether to draw uniform actions: it is 1 during the warm-up.
+        The last number of the buffers is not one of them. It says whether to draw uniform actions: it is 1 during the
+        warm-up.
         """
         return []
 

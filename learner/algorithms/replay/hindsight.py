@@ -1,9 +1,9 @@
 """Hindsight experience replay (Andrychowicz et al. 2017): learn from a row as if an outcome reached later were its goal.
 
 Law: a row shows what an action did, whatever the goal was. So when a row is drawn, its goal may be replaced with one that
-was achieved later in its episode, if its reward and its end are recomputed for this goal. The learner runs no code of the
-environment: reward and end must be functions of the achieved and the desired goal alone, and the user names these functions.
-Each row that arrives is checked against them.
+was achieved later in its episode, provided that its reward and its end are recomputed for this goal. The learner runs no
+code of the environment: reward and end must be functions of the achieved and the desired goal alone, and the user names
+these functions. Each row that arrives is checked against them.
 
 As in gymnasium-robotics, reward and end of a row depend on the achieved and the desired goal of its next observation. This
 file is pure.
@@ -179,7 +179,7 @@ class Hindsight:
     # ---------------------------------------------------------------- under another goal
 
     def outcome(self, achieved: Array, desired: Array, terminated: Bools, goal: Array) -> Outcome:
-        """The rewards and ends [K] of steps under other goals `goal` [K, *goal].
+        """The rewards and ends [K] of steps under replacement goals, `goal` [K, *goal].
 
         The steps led to the goals `achieved` while `desired` applied, and `terminated` [K] says which of them terminated
         their episode. A termination stays if reaching the desired goal did not cause it.
@@ -212,9 +212,9 @@ class Hindsight:
         """Raise `UsageError`, with a one-line message, unless rewards and ends of all valid rows agree with their goals.
 
         Goals may have been rounded after the reward was computed, and the reward was rounded to float32. So the reward is
-        computed for three pairs of goals: for the pair as it is, and for the pair as near together, and as far apart, as it
-        may have been before rounding. A row is right if its reward lies between the lowest and the highest of the three.
-        For a function of the goals' distance these bounds hold exactly.
+        computed for three pairs of goals: for the pair as it arrived, and for the two pairs that are as near together and as
+        far apart as the goals may have been before rounding. A row is right if its reward lies between the lowest and the
+        highest of the three. If the reward is a function of the distance between the goals, these bounds are exact.
         """
         valid = batch.valid
         achieved = _flat(batch.obs[self.achieved][1:][valid])
@@ -245,8 +245,8 @@ class Hindsight:
     def _check_ends(self, batch: Batch, terminated: Bools, achieved: Doubles, desired: Doubles, far: Doubles) -> None:
         """Raise `UsageError` unless episodes terminate at their goal if and only if `goal_ends` says so.
 
-        Episodes may terminate elsewhere, too. So they count as terminating at their goal only if every row terminates whose
-        reward says that the goal is reached.
+        Episodes may terminate elsewhere, too. So they count as terminating at their goal only if all rows terminate whose
+        rewards say that the goal is reached.
         """
         ends_within = -1.0 if self.ends_within is None else self.ends_within
         given = "goal_ends none" if self.ends_within is None else f"goal_ends {ends_within:g}"

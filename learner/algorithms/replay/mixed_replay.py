@@ -49,8 +49,8 @@ class MixedReplay(ReplayBuffer):
     def add_prior(self, batches: Iterable[Batch], slots: int, share: float) -> None:
         """Store prior transitions.
 
-        `slots` is the number of their observations, and `share` the fraction of each draw that is prior. Raises `UsageError`
-        if memory is too small, or, with hindsight, if the rewards don't agree with the goals.
+        `slots` is the number of their observations, and `share` the fraction of each sample that is prior. Raises
+        `UsageError` if memory is too small, or, with hindsight, if the rewards don't agree with the goals.
         """
         prior = PriorTransitions(
             self._content.observation,
@@ -70,7 +70,7 @@ class MixedReplay(ReplayBuffer):
         self._prior_share = share
 
     def sample(self, count: int, beta: float = 1.0) -> Sample:
-        """Draw transitions with replacement, only prior ones until the run has its own. For `beta`, see `ReplayBuffer`."""
+        """Draw transitions with replacement; all are prior until the run has its own. For `beta`, see `ReplayBuffer`."""
         if self.prior is None:
             return super().sample(count, beta)
         prior = round(self._prior_share * count) if len(self) else count
@@ -81,7 +81,7 @@ class MixedReplay(ReplayBuffer):
         return parts[0] if len(parts) == 1 else _joined(*parts)
 
     def samples(self, number: int, count: int, beta: float = 1.0) -> Iterator[Sample]:
-        """Yield `number` draws of `count` transitions each. For one draw, see `sample`."""
+        """Yield `number` samples of `count` transitions each. For one of them, see `sample`."""
         if self.prior is None:
             return super().samples(number, count, beta)
         return (self.sample(count, beta) for _ in range(number))
@@ -124,12 +124,12 @@ class MixedReplay(ReplayBuffer):
 
 
 def _joined(own: Sample, prior: Sample) -> Sample:
-    """Join two draws into one, field by field."""
+    """Join two samples into one, field by field."""
 
     def joined(one: Any, other: Any) -> Any:
         if isinstance(one, tuple):
             return tuple(map(joined, one, other))
-        return None if one is None else np.concatenate([one, other])  # None: a draw without action masks
+        return None if one is None else np.concatenate([one, other])  # None if there are no action masks
 
     return Sample(*map(joined, own, prior))
 

@@ -1,4 +1,4 @@
-"""The base of the algorithms with a replay buffer: an update, except for its gradient steps.
+"""The base of the algorithms with a replay buffer: everything about an update except its gradient steps.
 
 DQN derives from it directly; SAC, TD3 and their variants derive from it through `continuous.py`. They define `steps_due`,
 the number of gradient steps of an update, and `step`, which takes one gradient step, adds 1 to `gradient_steps` and moves
@@ -90,7 +90,10 @@ class OffPolicy(GradientDescent):
 
     @abstractmethod
     def steps_due(self) -> int:
-        """The number of gradient steps of this update, whose batch is already in the buffer and counted in `env_steps`."""
+        """The number of gradient steps to take in this update.
+
+        The batch of the update is already in the buffer and counted in `env_steps`.
+        """
 
     @abstractmethod
     def step(self, rows: Transitions) -> tuple[UpdateMetrics, Tensor]:
@@ -186,7 +189,7 @@ class OffPolicy(GradientDescent):
     # ---------------------------------------------------------------- prior data
 
     def add_prior(self, prior: PriorData) -> None:
-        """Store the rows of a dataset alongside the replay buffer, and count them in all running statistics.
+        """Store the rows of a dataset alongside the replay buffer, and add them to all running statistics.
 
         Raises `UsageError` if the policy has a recurrent core, because a dataset has no states of a core.
         """

@@ -1,18 +1,18 @@
 """The replay buffer: stores rows, and draws n-step transitions, uniformly or by priority.
 
-It is a ring of preallocated numpy arrays. A slot holds a raw observation. If a valid row began with it, the slot also holds
-that row: action, reward, whether it terminated, and the slot of the next observation. So each observation is stored once
-(or each frame of a frame stack, see `shared_channels.py`), and n-step returns follow the rows from slot to slot when they
-are drawn. A slot without a row holds the final observation of a truncated episode, or the newest observation of an env copy,
-whose row arrives with its next rollout.
+It is a ring of preallocated numpy arrays. A slot holds a raw observation. If a valid row begins with this observation, the
+slot also holds the rest of the row: action, reward, whether it terminated, and the slot of the next observation. So each
+observation is stored once (or each frame of a frame stack, see `shared_channels.py`). When a transition is drawn, its n-step
+return is computed by following the rows from slot to slot. A slot without a row holds the final observation of a truncated
+episode, or the newest observation of an env copy: its row arrives with the copy's next rollout.
 
-Rule: rows that are not valid are never stored. A row's next observation is newer than the row, and the ring overwrites
-the oldest slot first. So a row that is still stored always finds the rows that follow it. These are rows of the same seat,
-however long the seat waits between them: while it waits, its observation is the one that its last row led to, which is
-stored once.
+Rule: rows that are not valid are never stored. A row's next observation is newer than the row, and the ring overwrites the
+oldest slot first. So the rows that follow a stored row are always stored, too. They are rows of the same seat, however long
+the seat waits between them: while it waits, its observation stays the one to which its last row led, and this is stored only
+once.
 
-With hindsight (`hindsight.py`), a share of the rows get another goal when they are drawn. Then the final observation of a
-terminated episode has a slot too, because it holds the goal that was achieved last.
+With hindsight (`hindsight.py`), a share of the rows get another goal when they are drawn. In that case, the final
+observation of a terminated episode has a slot, too, because it holds the goal that was achieved last.
 
 This file uses no sockets and no files, and all randomness comes from the seed.
 """
@@ -45,13 +45,13 @@ DISCRETE = ActionSpec("discrete", (), "int64")
 
 
 def row_dtype(action: ActionSpec) -> np.dtype[Any]:
-    """The dtype of a row: a single record, so that drawing a row is a single copy."""
+    """The dtype of a row. It is a single record, so that a row is drawn with a single copy."""
     fields = [("follows", "i8"), ("reward", "f4"), ("terminated", "?"), ("is_row", "?")]
     return np.dtype([("action", action.stored_dtype, action.shape), *fields], align=True)
 
 
 class Sample(NamedTuple):
-    """B transitions of k steps, where k is n, or less if the episode or the stored rows end sooner."""
+    """B transitions of k steps. k is `n_step`, or less if the episode or the stored rows end sooner."""
 
     slots: Ints  # [B] the slots of their first rows
     leaves: tuple[Array, ...]  # [B, *leaf] each
@@ -77,7 +77,7 @@ class Sample(NamedTuple):
 
 
 class Content(NamedTuple):
-    """The properties of a replay buffer on which its memory depends."""
+    """The properties of a replay buffer that determine how much memory it needs."""
 
     observation: tuple[Leaf, ...]
     size: int
@@ -100,7 +100,7 @@ class Content(NamedTuple):
 
 
 def check_fits_memory(content: Content) -> None:
-    """Raise `UsageError`, which names a size that fits, if the memory is too small for the buffer and a copy of it.
+    """Raise `UsageError` if the memory is too small for the buffer and a copy of it. The error names a size that fits.
 
     Writing a checkpoint makes such a copy.
     """
@@ -185,7 +185,7 @@ class ReplayBuffer(Rewinding[Overwritten]):
         self._rows = 0
         self._remembered: Remembered | None = None
         self._overwritten: list[Overwritten] = []  # contents saved since `remember`, oldest first
-        self._newest: dict[int, Ints] = {}  # by lane, [columns] value of `_written` when the last observation was stored
+        self._newest: dict[int, Ints] = {}  # by lane, [columns] `_written` when each column's newest observation was stored
 
     def __len__(self) -> int:
         """The number of transitions that can be drawn."""
@@ -274,7 +274,7 @@ class ReplayBuffer(Rewinding[Overwritten]):
             self._mask = np.ones((self.size, choices), bool)
 
     def _share_channels(self, first: Sequence[Array]) -> None:
-        """Share equal channels of image leaves if the first images, from one copy's rollout, show that it saves memory."""
+        """Share equal channels of image leaves if the first images, from one copy's rollout, show that this saves memory."""
         self._obs = tuple(
             self._room(leaf, shared=leaf.is_image and SharedChannels.worthwhile(leaf, images))
             for leaf, images in zip(self._content.observation, first, strict=True)
@@ -340,7 +340,7 @@ class ReplayBuffer(Rewinding[Overwritten]):
     def samples(self, number: int, count: int, beta: float = 1.0) -> Iterator[Sample]:
         """Yield `number` samples of `count` transitions each. Between the samples, nothing but priorities may change.
 
-        Small uniform draws are made many at once, because that is faster.
+        Several small uniform samples are drawn at once, because that is faster.
         """
         at_once = 1 if self.prioritized else max(1, DRAWN_AT_ONCE // (count * self._transition_bytes))
         for first in range(0, number, at_once):
@@ -362,7 +362,7 @@ class ReplayBuffer(Rewinding[Overwritten]):
     def _follow(self, row: Array, goals: Goals | None) -> tuple[Doubles, Doubles, Ints]:
         """Follow each row for up to n steps. Returns the discounted reward, γᵏ (0 if terminated) and the last slot.
 
-        `row` is a copy, in which the rows with another goal are changed to their outcome under it.
+        `row` is a copy. The rows in it that have another goal are changed to their outcome under that goal.
         """
         self._set_outcome(row, goals)
         reward = row["reward"].astype(np.float64)
@@ -380,7 +380,7 @@ class ReplayBuffer(Rewinding[Overwritten]):
         return reward, discount, at
 
     def _set_outcome(self, row: Array, goals: Goals | None) -> None:
-        """Set reward and end of the rows with another goal. For a slot without a row, the result has no meaning."""
+        """Set the reward and the end of the rows with another goal. For a slot without a row, the result has no meaning."""
         if goals is None or self._hindsight is None:
             return
         led_to = row["follows"][goals.rows]
@@ -392,7 +392,7 @@ class ReplayBuffer(Rewinding[Overwritten]):
 
     @property
     def prioritized(self) -> bool:
-        """Whether priorities decide what is drawn."""
+        """Whether transitions are drawn by priority."""
         return self._tree is not None
 
     def update_priorities(self, slots: Ints, error: Floats) -> None:
@@ -419,7 +419,7 @@ class ReplayBuffer(Rewinding[Overwritten]):
             self._tree.set(old.slots, old.weights)
 
     def _find_paths(self) -> None:
-        """Recompute the paths of the stored rows, after these were changed by anything but `add`."""
+        """Recompute the paths of the stored rows. Called after anything but `add` has changed these rows."""
         if self._paths is not None:
             used = min(self._written, self.size)
             by_age = np.arange(self._written - used, self._written) % self.size

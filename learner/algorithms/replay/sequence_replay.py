@@ -5,10 +5,9 @@ core had on the worker before them. That state was computed with older weights. 
 the core first, from its own stored state and without a gradient, to compute a state with the current weights (stored state
 and burn-in, Kapturowski et al. 2019, R2D2).
 
-Rule: each row is in one sequence, and unless replay is prioritized each sequence is equally likely to be drawn. So all rows
-are learned from equally often, whatever the length of their episodes. Rows follow the row format
-(`millrace.protocol.rollout`): episodes may end inside a sequence, where the state is reset to zeros, and a row that is not
-valid passes the state on.
+Rule: each row is in exactly one sequence. Unless replay is prioritized, all sequences are equally likely to be drawn, so all
+rows are used equally often, however long their episodes are. Rows follow the row format (`millrace.protocol.rollout`):
+episodes may end inside a sequence, where the state is reset to zeros, and a row that is not valid passes the state on.
 
 This file uses no files, and all randomness comes from the seed.
 """
@@ -50,7 +49,7 @@ class SequenceSample(NamedTuple):
     rows: Ints  # [B] indices of the rows in [T, C], flattened
     next_rows: Ints  # [B] indices of the observations k steps later in [T + 1, C], flattened
     action: Array  # [B, *action] int64 or float32, as rows store them
-    reward: Floats  # [B] Σ γⁱ r over k steps: n, or fewer where the episode or the sequence ends
+    reward: Floats  # [B] Σ γⁱ r over k steps; k is `n_step`, or less where the episode or the sequence ends
     discount: Floats  # [B] γᵏ; 0 where the episode terminated
     weight: Floats  # [B] importance-sampling weight in the loss, at most 1
     next_mask: Bools | None  # [B, choices] actions allowed k steps later; None without action masks
@@ -78,7 +77,7 @@ class SequenceReplay(Rewinding[ReplacedSequences]):
         seed: int,
         alpha: float | None = None,
     ) -> None:
-        """Make room for this many `rows`, in sequences of T = `steps` rows. For `alpha`, see `ReplayBuffer`.
+        """Allocate memory for `rows` rows, in sequences of T = `steps` rows. For `alpha`, see `ReplayBuffer`.
 
         Raises `UsageError` if memory is too small.
         """
@@ -128,7 +127,7 @@ class SequenceReplay(Rewinding[ReplacedSequences]):
 
     @property
     def prioritized(self) -> bool:
-        """Whether priorities decide what is drawn."""
+        """Whether sequences are drawn by priority."""
         return self._tree is not None
 
     def _check_memory(self) -> None:
@@ -334,5 +333,5 @@ def _begins(batch: Batch) -> Bools:
 
 
 def _flat(array: Array) -> Array:
-    """An array [T, C, …] as a view [T · C, …] where possible."""
+    """An array [T, C, …] reshaped to [T · C, …], as a view where possible."""
     return array.reshape(-1, *array.shape[2:])

@@ -1,6 +1,6 @@
 """Images whose distinct channels are stored once each, because successive frame stacks repeat the same frames.
 
-Law: reading returns exactly the bytes that were written. For a replay buffer it works like an array of images:
+Law: reading returns exactly the bytes that were written. A replay buffer uses `SharedChannels` like an array of images:
 `images[slots]` copies, and `images[slots] = values` overwrites. A channel is kept as long as a slot refers to it. It is
 identified by its digest, so it is shared wherever it occurs: in any slot, and at any position in the stack.
 """
@@ -67,7 +67,7 @@ class SharedChannels:
         return np.ascontiguousarray(np.moveaxis(images, -3, -1)) if self._leaf.has_channels_last else images
 
     def __setitem__(self, slots: Ints, images: Bytes) -> None:
-        """Put images [K, *leaf] into these slots, which must differ."""
+        """Put images [K, *leaf] into these slots, which must all be different."""
         before = self._of_slot[slots].ravel().tolist()
         numbers = [self._stored(channel) for channel in _by_channel(self._leaf, images)]
         self._of_slot[slots] = np.reshape(numbers, (len(slots), -1))
@@ -97,7 +97,7 @@ class SharedChannels:
         end = first + self._per_chunk
         self._uses[first:] = [0] * self._per_chunk
         self._digest[first:] = [b""] * self._per_chunk
-        self._free += range(end - 1, first - 1, -1)  # last: if an exception prevents this, the new chunk just stays unused
+        self._free += range(end - 1, first - 1, -1)  # done last: if an exception prevents it, the chunk just stays unused
 
     def _release(self, number: int) -> None:
         self._uses[number] -= 1

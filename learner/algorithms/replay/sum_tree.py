@@ -68,7 +68,7 @@ class SumTree:
         return i - self._size
 
     def draw(self, generator: np.random.Generator, count: int) -> Ints:
-        """`count` indices in proportion to their weights, one from each of `count` equal segments of the sum."""
+        """Draw `count` indices in proportion to their weights, one from each of `count` equal segments of the sum."""
         return self.find((np.arange(count) + generator.random(count)) * (self.total / count))
 
     def draw_weighted(self, generator: np.random.Generator, count: int, entries: int, beta: float) -> tuple[Ints, Floats]:

@@ -40,7 +40,7 @@ class Sequences(NamedTuple):
 
 
 class Transitions(NamedTuple):
-    """The input of a loss: B transitions of k steps, k being n or less where an episode ends.
+    """The input of a loss: B transitions of k steps; k is `n_step`, or less where an episode ends.
 
     With a recurrent core, x and images hold all rows of the `sequences` until they are encoded.
     """
