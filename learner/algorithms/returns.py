@@ -27,7 +27,7 @@ class EpisodeEnds(NamedTuple):
     truncated: Bools
     valid: Bools
     with_seats: bool = False
-    """Whether a row that is not valid may stand between two rows of an episode. If not, it follows an episode's end."""
+    """Whether a row that is not valid may stand between two rows of an episode. If not, it follows the end of one."""
 
     @classmethod
     def of(cls, batch: Batch) -> EpisodeEnds:

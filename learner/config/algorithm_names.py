@@ -75,7 +75,7 @@ def own_class(name: str) -> Any:
 
 
 def name_of(algorithm: type) -> str:
-    """The name of a class, for `Config.algo`. It leads to the class in this process, and in others that can import it.
+    """The name of a class, for `Config.algo`. Finds the class in this process, and in others that can import it.
 
     Raises `UsageError` if the class lacks something.
     """
@@ -133,7 +133,7 @@ def _found(name: str) -> object:
 
 
 def _checked(name: str, named: object) -> Any:
-    """The class `named`, if the learner can use it. Otherwise raises `UsageError` that names what is missing or wrong."""
+    """The class `named`, if the learner can use it. Otherwise raises `UsageError`, which names what is missing or wrong."""
     if not isinstance(named, type):
         raise UsageError(f"algo {name}: expected a class, got {type(named).__name__}")
     if why := _what_is_wrong(named):

@@ -1,4 +1,4 @@
-"""The command line of `millrace train` and `millrace learner`: flags for all settings, and for the source of defaults."""
+"""The command line of `millrace train` and `millrace learner`: flags for all settings, and for where defaults come from."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Warnings, before a run starts, about settings that will take much time. Pure functions of settings and shapes.
+"""Warnings, before a run starts, about settings that will make it slow. Pure functions of settings and shapes.
 
-Rule: a warning is one line that gives the cost and how to reduce it. It is empty if the cost is not unusual.
+Rule: a warning is one line that gives the cost and how to reduce it. It is empty unless the cost is unusual.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def large_observations(config: Config, policy: PolicySpec) -> str:
 
 
 def endless_evaluations(config: Config, evaluation: DescribedEnv) -> str:
-    """A warning about how long an evaluation may take, if nothing limits the episodes of its environment."""
+    """A warning about how long an evaluation may take, if nothing limits the length of its episodes; otherwise empty."""
     limited = evaluation.max_episode_steps is not None or class_name(TimeLimit) in evaluation.wrappers
     if limited or not (config.eval_every or config.eval_episodes):
         return ""

@@ -38,7 +38,7 @@ class SettingsLayer(NamedTuple):
     """The settings from one source. The run's and the algorithm's settings are in one mapping."""
 
     where: str
-    """how an error begins: with a file, `preset NAME` or `train`; empty for flags, whose names say enough"""
+    """the beginning of errors: a file, `preset NAME` or `train`; empty for flags, whose names say enough"""
     settings: Mapping[str, Any]
 
     def origin(self, field: FlagField) -> str:
@@ -122,7 +122,7 @@ def config_from_toml(text: str, where: str = "config.toml") -> Config:
 def config_of_run(run: Path, algo: str | None = None) -> Config:
     """The settings of a run folder, from its config.toml. Raises `UsageError` if they are not valid.
 
-    `algo` is the current name of its algorithm, if it may have changed (`algorithm_names.moved`).
+    `algo` is the current name of its algorithm, if the name may have changed (`algorithm_names.moved`).
     """
     table = with_algorithm(read_config(run), algo)
     return settings_of_run(_file_alone(table, str(run / CONFIG_FILE)), NOTHING)
@@ -154,7 +154,7 @@ def read_lower_layers(algo: str | None, *, file: Path | None, resume: Path | Non
 
 
 def _file_alone(table: dict[str, Any], where: str) -> LowerLayers:
-    """The layers of a file on top of the defaults, without a preset."""
+    """The lower layers that consist of a file alone, without a preset."""
     algo = _algorithm_of_file(table, where)
     return LowerLayers(algo, "none", NOTHING, _layer_of_file(table, algo, where), None)
 

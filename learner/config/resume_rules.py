@@ -31,7 +31,7 @@ Fixed = Annotated[Setting, OnResume.FIXED]
 
 
 class Change(NamedTuple):
-    """A setting that was given another value than the run has."""
+    """A setting whose given value differs from the run's value."""
 
     name: str
     on_resume: OnResume
@@ -45,8 +45,8 @@ def declared(record: type[msgspec.Struct], *, by_type: bool = False) -> dict[str
     """For each setting of a record, in the order of the fields, what a resumed run does if the setting changes.
 
     With `by_type`, for user-defined records, a field need not be declared. An undeclared float is free, because it is
-    usually a coefficient; any other field is fixed, because the shape of the weights or of the saved state may depend on
-    it. A field that overrides a field of a base class keeps that field's declaration.
+    usually a coefficient; any other field is fixed, because the shape of the weights or of the saved state may depend on it.
+    But if an undeclared field overrides a field of a base class, it keeps the declaration of that field.
 
     Raises TypeError for a field with no declaration or with several, and NameError for a type that cannot be found.
     """

@@ -192,5 +192,5 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
         return max(STALL_TIMEOUT_S, self.call_timeouts().longest_s())
 
     def heartbeat_s(self) -> float:
-        """Seconds between two heartbeats of a worker: so few that it doesn't count as silent even if some arrive late."""
+        """Seconds between a worker's heartbeats: so few that the worker doesn't count as silent even if some arrive late."""
         return min(HEARTBEAT_S, self.worker_timeout_s / 5)

@@ -86,10 +86,10 @@ def check_numbers(record: msgspec.Struct, origins: Mapping[str, str]) -> None:
 def check_copies(config: Config, limit: str, most: int) -> None:
     """Raise `UsageError` if the run needs more than `most` env copies (0 for any number).
 
-    `limit` names the setting or the variable that gives the number.
+    `limit` names the setting or the variable that gives this number.
     """
     # Each worker that evaluates keeps its env copies. Without eval_workers, one worker evaluates. With them, one more worker
-    # must be able to, in case they are lost.
+    # must be able to evaluate, in case they are lost.
     evaluate = min(config.eval_copies, evaluation_size(config).episodes) * (config.eval_workers + 1)
     if 0 < most < config.envs + evaluate:
         raise UsageError(
@@ -125,7 +125,7 @@ def unused_setting(config: Config) -> str:
 
 
 def convert_rollout_settings(settings: dict[str, Any], where: str) -> RolloutConfig:
-    """The record of these settings. Raises `UsageError`, whose message begins with `where`, if they are not valid."""
+    """The record of these settings. Raises `UsageError` if they are not valid; its message begins with `where`."""
     origins = {name: f"{where}: {name}" for name in settings}
     for name, value in settings.items():
         check_text(name, value, origins[name])

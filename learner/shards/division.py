@@ -1,8 +1,8 @@
 """How a batch is divided into shards, and the shards among learner processes. Pure.
 
-Law: shard s of S has the lanes whose number modulo S is s. Each shard passes the network alone, so the shapes of its passes
-don't depend on the number R of processes. Sums over shards are computed in a fixed order, as a tree of pairs. Therefore
-every R that divides S gives the same bits.
+Law: shard s of S has the lanes whose number modulo S is s. Each shard passes through the network on its own, so the shapes
+of the passes don't depend on the number R of processes. Sums over shards are computed in a fixed order, as a tree of pairs.
+Therefore every R that divides S gives the same bits.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy.typing as npt
 from millrace.protocol.rollout import Batch
 
 Columns = npt.NDArray[np.int64]
-"""[columns] a number for each column, such as its own number or that of its lane"""
+"""[columns] an integer for each column, such as the column's number or its lane's number"""
 
 
 class Addend(Protocol):
@@ -85,7 +85,7 @@ def part_of(batch: Batch, columns: Columns) -> Batch:
 
 
 def pairwise_sum(terms: Sequence[Term]) -> Term:
-    """The sum of one or more terms: adds neighbors, then neighboring sums, until one is left."""
+    """The sum of one or more terms. Adds neighbors, then neighboring sums, until only one sum is left."""
     while len(terms) > 1:
         pairs = [one + other for one, other in zip(terms[::2], terms[1::2], strict=False)]
         terms = [*pairs, *terms[2 * len(pairs) :]]

@@ -1,8 +1,9 @@
 """The learner processes of a run, connected by torch.distributed: gloo between CPUs, NCCL between GPUs. A thin shell.
 
-Rules: the number of collectives follows from the messages of rank 0, and each collective is one tensor of a fixed size. If a
-process is gone, or takes longer than the timeout, all processes end with `LearnerLost`, so that the program that started
-them can restart them. torch.distributed authenticates nobody, so it listens on loopback unless the settings say otherwise.
+Rules: the messages of rank 0 determine the number of collective operations, and each of these transfers one tensor of a
+fixed size. If a process is gone, or takes longer than the timeout, all processes end with `LearnerLost`, so that the program
+that started them can restart them. torch.distributed authenticates nobody, so it listens on loopback unless the settings say
+otherwise.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ log = logging.getLogger("millrace.learner")
 
 POLL_S = 0.1
 TELL_EVERY_S = 30.0
-TELL_BEFORE = 0.1  # others wait for a message for some time; a sign of life is sent after this share of it
+TELL_BEFORE = 0.1  # a sign of life is sent after this fraction of the time for which others wait for a message
 PATIENCE_S = 3.0  # timeout of one attempt to connect
 JOINED = "millrace/rank/"
 
@@ -52,7 +53,7 @@ class Timeouts(NamedTuple):
     join_s: float
     """until all processes have connected"""
     reply_s: float
-    """in a collective, or for the next message of rank 0"""
+    """in a collective operation, or for the next message of rank 0"""
 
 
 class Header(msgspec.Struct, frozen=True):
@@ -69,10 +70,10 @@ class Learners:
     """The learner processes of a run, as one of them sees them. A single process needs no process group."""
 
     def __init__(self, division: Division, *, reply_s: float = math.inf) -> None:
-        """`reply_s` is how many seconds the others wait for a message."""
+        """`reply_s` is the number of seconds for which the others wait for a message."""
         self.division = division
         self.others_wait = True
-        """Whether the others wait for a message. False during an update or a message, and after an interrupted one."""
+        """Whether the others wait for a message. False during an update or a message, and after either was interrupted."""
         self._tell_every_s = reply_s * TELL_BEFORE
         self._told_s = time.monotonic()
 
@@ -87,7 +88,7 @@ class Learners:
         return range(1, self.division.processes)
 
     def gather(self, own: Tensor) -> Tensor:
-        """Gather tensors [own shards, ...] of all processes to one [S, ...] of all shards.
+        """Gather the tensors [own shards, ...] of all processes into one tensor [S, ...] of all shards.
 
         Every process must call this, with the same shape. Different shapes would end processes with SIGABRT, because gloo
         checks sizes in a thread of its own.
@@ -227,12 +228,12 @@ def _store(place: Place, timeouts: Timeouts, poll: Callable[[], None]) -> Store:
         found.append(store)
     else:
         _wait(missing, place, timeouts.join_s, poll)
-    # torchrun's store still holds the keys of the processes before a restart, so each restart gets its own prefix.
+    # After a restart, torchrun's store still holds the keys of the earlier processes, so each restart gets its own prefix.
     return PrefixStore(os.environ.get("TORCHELASTIC_RESTART_COUNT", "0"), found[0])
 
 
 def listening(place: Place) -> socket.socket:
-    """A listening socket for the store. PyTorch's own would listen at all addresses of the machine, even for localhost."""
+    """A listening socket for the store. PyTorch's own socket would listen at all addresses, even for localhost."""
     try:
         if place.is_local:
             family = socket.getaddrinfo(place.host, place.port, type=socket.SOCK_STREAM)[0][0]

@@ -17,7 +17,7 @@ from millrace.protocol.rollout import Batch
 from millrace.protocol.specs import PolicySpec
 
 SMALL = ("action", "log_prob", "reward", "terminated", "truncated", "valid", "state", "lane", "fresh")
-"""The arrays of a `Batch` of which every process gets all columns."""
+"""The arrays of a `Batch` that every process gets with all their columns."""
 
 
 class Begin(msgspec.Struct, frozen=True, tag=True):
@@ -46,7 +46,7 @@ class Learn(msgspec.Struct, frozen=True, tag=True):
     state: bool
     """whether the whole state of rank 0's algorithm follows, because the receiver does not have it"""
     digest: str
-    """the digest of rank 0's state, for the receiver to compare with its own; empty if it need not"""
+    """the digest of rank 0's state, for the receiver to compare with that of its own state; empty if it need not compare"""
 
 
 class StillThere(msgspec.Struct, frozen=True, tag=True):
@@ -65,7 +65,7 @@ FromRankZero = Begin | Learn | StillThere | End
 
 
 def arrays_of(batch: Batch, columns: Array) -> list[Array]:
-    """The arrays of a batch that are sent to a process. Observations have only `columns`, the others all columns."""
+    """The arrays of a batch that are sent to a process. Observations have only `columns`; the others have all columns."""
     optional = [array for array in (batch.mask, batch.resets) if array is not None]
     return [
         *(getattr(batch, name) for name in SMALL),

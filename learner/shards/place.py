@@ -83,7 +83,7 @@ def check_loopback(place: Place, *, insecure: bool) -> None:
         names = {name for _, name in socket.if_nameindex()}
         for name in names.intersection(LOOPBACK):
             for variable in INTERFACES:
-                # Clusters often set these variables for all jobs, to a network interface.
+                # Clusters often set these variables to a network interface, for all jobs.
                 os.environ[variable] = os.environ.get(variable, name) if insecure else name
     elif not insecure:
         raise UsageError(

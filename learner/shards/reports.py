@@ -1,7 +1,7 @@
 """Reports of the shards on their parts of a minibatch. They have a fixed size, so gathering them needs no negotiation.
 
-Law: the numbers of a minibatch are means over its rows, so the numbers of its parts are averaged, weighted by their rows. If
-one process fails, all processes learn why, and none takes the step.
+Law: the numbers of a minibatch are means over its rows. So they are averages of its parts' numbers, each weighted by the
+part's number of rows. If one process fails, all processes learn why, and none takes the step.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class Report(msgspec.Struct, frozen=True, array_like=True):
 
 
 def averaged(reports: Sequence[Report]) -> dict[str, float]:
-    """The numbers of a whole minibatch: each is averaged over the parts that have it, weighted by their rows."""
+    """The numbers of a whole minibatch. Each is averaged over the parts that have it, weighted by their numbers of rows."""
     sums: dict[str, float] = {}
     rows: dict[str, int] = {}
     for report in reports:

@@ -1,8 +1,8 @@
 """The roles of the learner processes of a run with shards: rank 0 leads, and the others follow.
 
 Law: rank 0 is the learner, just as in a run without shards: it has the workers, the run folder and the callbacks. The others
-know the run only from its messages: their own settings don't count, they accept no workers, and they write no file of the
-run.
+know the run only from rank 0's messages: their own settings don't count, they accept no workers, and they write no file of
+the run.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def timeouts(config: Config) -> Timeouts:
 
 
 def lead(learners: Learners, config: Config, policy: PolicySpec, run: Path) -> None:
-    """Send the run to the others. Returns once they have made its algorithm.
+    """Start the run in the other processes. Returns once they have made its algorithm.
 
     Raises `UsageError` if one of them can't take part.
     """

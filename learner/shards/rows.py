@@ -1,4 +1,4 @@
-"""The rows of a batch whose shards are divided among learner processes. Each process has only the observations of its own.
+"""The rows of a batch whose shards are divided among learner processes. Each process has only its shards' observations.
 
 Law: every minibatch consists of one part per shard. All processes know the small arrays of the whole batch, so they draw the
 same parts for all shards, and standardize advantages over the whole minibatch. A shard without rows in a minibatch has an
@@ -29,7 +29,7 @@ from millrace.protocol.arrays import Bools, Floats
 from millrace.protocol.rollout import Batch
 
 Gather = Callable[[Tensor], Tensor]
-"""Gathers the tensors [own shards, ...] of all processes to one [S, ...] of all shards, in order."""
+"""Gathers the tensors [own shards, ...] of all processes into one tensor [S, ...] of all shards, in order."""
 
 
 class ShardObservations(NamedTuple):

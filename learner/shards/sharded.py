@@ -1,11 +1,11 @@
 """An actor-critic whose updates are divided among learner processes. Its state is identical in all of them, bit for bit.
 
 Law of an update: rank 0 sends the batch to the others. Every process passes its own shards through the network, one shard at
-a time, and gathers the numbers and the gradients of all shards. From then on, all processes compute the same. The gradient
-is that of a mean over the rows of a minibatch, so the loss must be a mean over the rows that it gets.
+a time, and gathers the numbers and the gradients of all shards. From then on, all processes make the same computations. The
+gradient is that of a mean over the rows of a minibatch, so the loss must be a mean over the rows that it gets.
 
-If rank 0 changes the state other than by an update (by a resume, `--from`, cloning, or undoing an update), it sends the
-whole state along with the next batch.
+If rank 0 changes the state in any other way than by an update (by a resume, `--from`, cloning, or undoing an update), it
+sends the whole state along with the next batch.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class Sharded(ActorCritic):
     # ---------------------------------------------------------------- how the processes make the same update
 
     def update(self, batch: Batch, pulse: Callable[[], None]) -> UpdateMetrics:
-        """See `ActorCritic`. If `pulse` raises, all processes end the update at its next gradient step, or at its end."""
+        """See `ActorCritic`. If `pulse` raises, all processes stop the update at its next gradient step, or at its end."""
         self._stopped = None
         self.learners.others_wait = False
         if self.learners.leads:
@@ -129,7 +129,7 @@ class Sharded(ActorCritic):
         return super().estimate(replace(batch, obs=(), episodes=()), observations, reward, pulse)
 
     def gradient(self, minibatch: Sequence[Minibatch]) -> UpdateMetrics:
-        """See `ActorCritic`. Adds the gradients of all shards, each weighted by its rows, in a fixed order."""
+        """See `ActorCritic`. Adds the gradients of all shards, each weighted by its number of rows, in a fixed order."""
         flat = self.net.flat
         assert flat.grad is not None
         own = torch.zeros(len(minibatch), len(flat), device=flat.device)

@@ -2,7 +2,7 @@
 
 Rule: where a gradient is recorded (`torch.is_grad_enabled`), the actor is being trained, so it normalizes by the statistics
 of its minibatch. Under `torch.no_grad`, and wherever critics stay constant, running statistics are used. So SAC's losses can
-use this network without a change.
+use this network unchanged.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class ActorWithCritics:
         parts = [initial(actor, generator), initial_fields(fields, generator), initial(critics, generator)]
         sizes = [len(part) for part in parts]
         self.flat = torch.cat(parts).to(device)
-        """[A + E + C] float32: all parameters, those of the actor first, then the encoder's"""
+        """[A + E + C] float32, all parameters: A of the actor, then E of the encoder, then C of the critics"""
         self.flat_grad = torch.zeros_like(self.flat)
         self.acting_size = sizes[0] + sizes[1]
         """A + E, the number of parameters that compute actions"""
@@ -107,7 +107,7 @@ class ActorWithCritics:
 
 
 def layer_sizes(policy: PolicySpec, critic_net: tuple[int, ...], outputs: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """The sizes of the layers of the policy's actor, and of each critic with these hidden layers and outputs."""
+    """The layer sizes of the policy's actor, and of a critic with these hidden layers and this number of outputs."""
     _, features = encoder_layout(policy)
     size = math.prod(policy.action.shape)
     return (features, *policy.net, 2 * size), (features + size, *critic_net, outputs)

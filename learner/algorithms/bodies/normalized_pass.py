@@ -1,7 +1,7 @@
 """A pass of a whole minibatch through MLPs with batch normalization, as one node of autograd's graph.
 
-Rule: a layer's mean and variance are those of the whole minibatch, so all rows pass one layer before any row passes the
-next. That is why this pass isn't cut into chunks of rows, unlike the pass of `kernels/mlp.py`.
+Rule: a layer's mean and variance are those of the whole minibatch, so all rows pass through one layer before any row enters
+the next. That is why this pass isn't cut into chunks of rows, unlike the pass of `kernels/mlp.py`.
 
 Arrays are [K, n, B]: K networks, n features, B rows. So a sum over the minibatch reads contiguous memory, and one call
 normalizes the features of all networks. With x̂ = (h − μ) / σ, where σ² = variance + ε, and g = ∂L/∂(γ x̂ + β): ∂L/∂β = Σ g,
@@ -125,7 +125,7 @@ class _Normalization(NamedTuple):
     d: Tensor | None
 
     def backward(self, g: Tensor, layer: Layer, by_layer: Layer) -> Tensor:
-        """The gradient [K, n, B] with respect to the input, from the gradient `g` of the result, which is overwritten."""
+        """The gradient [K, n, B] with respect to the input, from `g`, that of the result. Overwrites `g`."""
         total = g.sum(-1, keepdim=True)
         product = _row_products(g, self.x_hat.expand_as(g))
         by_layer.shift.copy_(total)
@@ -140,8 +140,8 @@ def _normalized(
 ) -> tuple[Tensor, _Normalization]:
     """γ x̂ + β [K, n, B] for h [K or 1, n, B], and the intermediate results that the backward pass needs.
 
-    With batch renormalization (Ioffe 2017), the result is γ (r x̂ + d) + β, which normalizes by the running statistics as
-    long as r and d are within their bounds. The backward pass treats r and d as constants.
+    With batch renormalization (Ioffe 2017), the result is γ (r x̂ + d) + β, which equals a normalization by the running
+    statistics as long as r and d are within their bounds. The backward pass treats r and d as constants.
     """
     mean = h.mean(-1, keepdim=True)
     x_hat = h.sub_(mean) if in_place else h - mean

@@ -1,8 +1,8 @@
-"""The base of CrossQ and XQC: SAC with batch normalization in actor and critics. The actor learns at every k-th step.
+"""The base of CrossQ and XQC: SAC with batch normalization in actor and critics, and fewer steps of the actor.
 
-Rule: observations and next observations, with their actions, pass the critics in one minibatch. They come from different
-distributions. In separate minibatches they would be normalized by different means, and values and targets would not be
-comparable (Bhatt et al. 2024).
+Rule: observations and next observations, with their actions, pass through the critics in one minibatch. They come from
+different distributions. In separate minibatches they would be normalized by different means, and values and targets would
+not be comparable (Bhatt et al. 2024).
 """
 
 from __future__ import annotations
@@ -59,13 +59,13 @@ class NormalizedSAC(SAC):
         return self.net.actor_body.shape.normalized.value
 
     def joint(self, rows: Transitions) -> Joint:
-        """The observations and actions of these rows, and the next observations with ã′ ~ π(s′) (without gradient)."""
+        """The observations and actions of these rows, then the next observations with ã′ ~ π(s′), without a gradient."""
         with torch.no_grad():
             action, log_prob = self.sample(rows.next_x)
         return Joint(torch.cat((rows.x, rows.next_x)), torch.cat((rows.action, action)), log_prob)
 
     def after_step(self, name: str) -> None:
-        """See `Continuous`. Scales weights that must have norm 1 back to norm 1."""
+        """See `Continuous`. Weights that must have norm 1 are scaled back to it."""
         match name:
             case "actor":
                 self.net.actor_body.project()

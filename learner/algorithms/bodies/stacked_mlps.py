@@ -29,9 +29,9 @@ class Normalized(Enum):
 
     NOWHERE = "none"
     BEFORE = "before activations"
-    """the input, and before each activation; hidden layers have no biases, because subtracting the mean would cancel them"""
+    """the input, and again before each activation; hidden layers have no biases, because subtracting means cancels them"""
     AFTER = "after activations"
-    """the input, and after each activation"""
+    """the input, and again after each activation"""
 
 
 class MLPShape(NamedTuple):
@@ -180,6 +180,6 @@ class StackedMLPs:
 
 
 def _linear(layer: Layer, running: RunningStatistics) -> tuple[Tensor, Tensor]:
-    """The scale and the shift, [K, n, 1] each, that have the effect of a normalization by running statistics."""
+    """The scale and the shift, [K, n, 1] each, that are equivalent to a normalization by running statistics."""
     scale = layer.gain * (running.variance + EPS).rsqrt()
     return scale, layer.shift - running.mean * scale

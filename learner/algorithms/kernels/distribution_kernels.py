@@ -1,8 +1,9 @@
 """Action distributions of small networks, in numpy: log-probabilities, entropies and samples from an actor's outputs.
 
 Rule: results and gradients equal those of `millrace.protocol.policy.torch_distributions` and autograd, except for rounding.
-The kernels save 0.1 ms per minibatch of 64 rows, for which autograd would need a dozen nodes. Arrays are [P, B], with a
-column for each of B rows. `forward` stores the intermediate results that `backward` needs.
+The kernels save 0.1 ms per minibatch of 64 rows, for which autograd would need a dozen nodes. The P parameters of a
+distribution are arrays [P, B], with a column for each of B rows. `forward` stores the intermediate results that `backward`
+needs.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ class EvaluatedActions:
     def forward(self, outputs: Sequence[Array], action: Array, mask: Bools | None) -> tuple[Array, ...]:
         """See `Top`. `action` is [B, *action]; `mask` [B, choices] is True for the choices that are allowed.
 
-        A choice that the mask forbids has probability p = 0, and this factor p makes its gradient 0 in `backward`.
+        A forbidden choice has probability p = 0. Its gradient in `backward` has the factor p, so it is 0, too.
         """
         params, value = outputs
         if mask is not None:

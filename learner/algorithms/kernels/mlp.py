@@ -4,8 +4,9 @@ Rule: outputs and gradients are those of the formulas below, except for rounding
 only on the number of rows, so the same minibatch gives the same bits.
 
 With a small network, torch spends most of the time of a minibatch on its graph, its dispatcher and its allocator, not on
-arithmetic. Here a pass is a few dozen calls on arrays that are reused. A call owns its arrays until its backward pass, so
-one loss may contain several calls. A second backward pass, and derivatives of the gradient, are not supported.
+arithmetic. Here a pass is a few dozen calls on arrays that are reused. A call of `SmallMLP` owns its arrays until its
+backward pass, so one loss may call it several times. A second backward pass, and derivatives of the gradient, are not
+supported.
 
 Arrays are [S, n, B]: S networks, n units, and one column for each of B rows, so that inner loops are long. Each chunk of
 rows passes through all layers, forward or backward, while it is in the cache. With g = ∂L/∂(pre-activation): ∂L/∂W = g hᵀ,
@@ -31,7 +32,7 @@ MLPPass = Callable[[], object]
 
 CHUNK_ROWS = 512  # the largest number of rows in a chunk
 THREADED_PRODUCT_SIZE = 64 * 64 * 128  # torch's threads speed up matrix products of at least this many multiplications
-MAX_PLANS = 256  # how many minibatch sizes have plans; the size varies with the number of valid rows
+MAX_PLANS = 256  # limit on the minibatch sizes with plans; sizes vary with the number of valid rows
 
 
 class Linear(NamedTuple):
@@ -196,7 +197,7 @@ def taken_once(ctx: Any) -> Any:
 
 
 class _Workspace:
-    """The arrays of one call at a time, and the plans for all minibatch sizes so far.
+    """The arrays, which only one call at a time uses, and the plans for all minibatch sizes so far.
 
     All plans share these arrays: each plan takes the same arrays in the same order.
     """
@@ -417,7 +418,7 @@ def _product(a: Array, b: Array, out: Array) -> MLPPass:
 
 
 def _stacked_view(arrays: Sequence[Array]) -> Array:
-    """Combine one or two views of one array, which have the same shape, into a single view [S, *shape]."""
+    """Combine one or two views of one array, both of the same shape, into a single view [S, *shape]."""
     first = arrays[0]
     last = arrays[-1]
     distance = last.__array_interface__["data"][0] - first.__array_interface__["data"][0]

@@ -3,15 +3,16 @@
 Rule: it uses the same kernels on the same state, so it gives the same bits as `Optimizer.step`, with one exception: denormal
 numbers count as zero during the step. The state belongs to the optimizer, which saves and loads it.
 
-For a small network, the overhead of `Optimizer.step` takes longer than the kernel. In addition, making an optimizer and
-calling its first `step` import torch's compiler, only to exclude these methods from compilation. The import takes 0.8 s and
-70 MB, which a learner that compiles nothing can save.
+For a small network, the overhead of `Optimizer.step` takes longer than the kernel. In addition, torch imports its compiler
+when an optimizer is made and when its first `step` is called, only to exclude the optimizer's methods from compilation. The
+import takes 0.8 s and 70 MB, which a learner that compiles nothing can save.
 
 Denormal numbers are set to zero because they are slow: if parameters no longer get a gradient, for example behind a dead
 ReLU, their moments decay to denormal numbers within 800 steps and stay there. Then a step takes a CPU twelve times as long.
 
-This file uses private parts of torch: `torch._fused_adam_`, `torch._fused_adamw_`, `__dynamo_disable`. If this version of
-torch lacks such a function, or its function takes other arguments or does something else, `Optimizer.step` is called.
+This file uses private parts of torch: `torch._fused_adam_`, `torch._fused_adamw_`, `__dynamo_disable`. If the installed
+version of torch lacks such a function, or if the function accepts other arguments or does something else, `Optimizer.step`
+is called instead.
 """
 
 from __future__ import annotations
@@ -117,14 +118,14 @@ def _step_of(optimizer: Optimizer) -> Callable[[Tensor, dict[str, Any], Optimize
 
 
 def _adam_step(name: str, decayed_parameter: float) -> Callable[[Tensor, dict[str, Any], OptimizerState], None] | None:
-    """The Adam step with this private function of torch, or None unless torch has it and it works as this file expects."""
+    """The Adam step that uses this private function of torch; None if torch lacks it, or if it works in another way."""
     kernel = getattr(torch, name, None)
     return partial(_adam, kernel) if kernel is not None and _is_adam(kernel, decayed_parameter) else None
 
 
 @cache
 def _is_adam(kernel: Kernel, decayed_parameter: float) -> bool:
-    """Whether a first step leads from 1 to `decayed_parameter`, with learning rate 0.1, gradient 1, weight decay 0.5.
+    """Whether a first step with learning rate 0.1, gradient 1 and weight decay 0.5 changes 1 to `decayed_parameter`.
 
     Adam adds the decay to the gradient, whose size does not matter in a first step, so the result is 1 - 0.1. AdamW reduces
     the parameter itself, so the result is (1 - 0.1 · 0.5) - 0.1.

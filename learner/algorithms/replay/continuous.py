@@ -118,7 +118,7 @@ class Continuous(OffPolicy):
         self.optimizers = {name: make_optimizer("adam", part, **self.ADAM) for name, part in trained.items()}
 
     def networks(self, device: str) -> Networks:
-        """Make new networks, equal each time. Called for the networks that are trained, and again for their targets."""
+        """Make new networks, the same at each call. Called once for the trained networks, and once for their targets."""
         return actor_and_critics(self.policy, device, self.seed)
 
     def after_step(self, name: str) -> None:

@@ -63,7 +63,7 @@ class EpisodePaths:
         self._number[slots] = NO_PATH
 
     def append(self, slots: Ints, after: Ints) -> None:
-        """Append each of the slots [K] to the path whose newest slot is in `after` [K], or to a new one for NO_SLOT."""
+        """Append each of the slots [K] to the path whose newest slot is `after` [K]; NO_SLOT stands for a new path."""
         for slot, before in zip(slots.tolist(), after.tolist(), strict=True):
             if before == NO_SLOT:
                 number = self._next

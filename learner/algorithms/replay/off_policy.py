@@ -233,7 +233,7 @@ class OffPolicy(GradientDescent):
         self.replay.load_state_dict(state["replay"])
 
     def remember(self) -> None:
-        """Remember the current state, for `roll_back`. The replay buffer only copies slots before it changes them."""
+        """Remember the current state, for `roll_back`. The replay buffer copies a slot only when it is about to write it."""
         self._remembered = super().state_dict()
         self.replay.remember()
 

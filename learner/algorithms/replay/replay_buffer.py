@@ -156,7 +156,7 @@ class ReplayBuffer(Rewinding[Overwritten]):
         action: ActionSpec = DISCRETE,
         hindsight: Hindsight | None = None,
     ) -> None:
-        """`size` is the number of slots. Draws are in proportion to |error|^alpha, or uniform if `alpha` is None.
+        """`size` counts slots. Transitions are drawn in proportion to |error|^alpha, or uniformly if `alpha` is None.
 
         Raises `UsageError` if memory is too small.
         """
