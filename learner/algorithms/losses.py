@@ -36,7 +36,7 @@ def policy_gradient(log_prob: Tensor, advantage: Tensor) -> Tensor:
 
 
 def value_loss(value: Tensor, target: Tensor) -> Tensor:
-    """The mean squared error, without the factor ½ of other libraries, as in Stable-Baselines3."""
+    """The mean squared error. As in Stable-Baselines3, it lacks the factor ½ that other libraries use."""
     return (value - target).square().mean()
 
 

@@ -23,7 +23,7 @@ from millrace.protocol.rollout import Batch
 
 Index = Tensor | slice
 
-CHUNK_ROWS = 1024  # how many observations are evaluated together where no gradient is needed, to bound memory
+CHUNK_ROWS = 1024  # number of observations evaluated together if no gradient is needed; it limits the memory
 
 
 class NetworkInput(NamedTuple):

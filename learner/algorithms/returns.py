@@ -27,7 +27,7 @@ class EpisodeEnds(NamedTuple):
     truncated: Bools
     valid: Bools
     with_seats: bool = False
-    """Whether a row that is not valid may stand between two rows of an episode. If not, it follows the end of one."""
+    """Whether an invalid row may stand between two rows of an episode. If not, it always follows the end of an episode."""
 
     @classmethod
     def of(cls, batch: Batch) -> EpisodeEnds:

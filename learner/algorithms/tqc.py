@@ -23,7 +23,7 @@ from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
 
 
 class TQC(SAC):
-    """An actor, critics of quantiles with their targets, and the temperature."""
+    """An actor, quantile critics with their targets, and the temperature."""
 
     Config = TQCConfig
     net: ActorWithCritics

@@ -75,7 +75,7 @@ def own_class(name: str) -> Any:
 
 
 def name_of(algorithm: type) -> str:
-    """The name of a class, for `Config.algo`. Finds the class in this process, and in others that can import it.
+    """The name of a class, for `Config.algo`. It identifies the class here, and in processes that can import it.
 
     Raises `UsageError` if the class lacks something.
     """

@@ -1,6 +1,6 @@
 """All settings of a run, in one record. The texts under the fields are the help of the command line. Pure.
 
-This file has the settings of learning. The base, `RolloutConfig` (learner/config/rollout_config.py), has the settings of
+This file has the settings for learning. The base, `RolloutConfig` (learner/config/rollout_config.py), has the settings for
 collecting rollouts: the environment, workers, env copies, lanes, timeouts and the transport. learner/config/layers.py merges
 the settings of a run from presets, files and flags. `GROUPS` in learner/config/command_line.py lists the groups that
 `--help` shows.

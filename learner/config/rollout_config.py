@@ -1,4 +1,4 @@
-"""The settings of collecting rollouts, such as the environment, the env copies, the workers and the timeouts. Pure.
+"""The settings for collecting rollouts, such as the environment, the env copies, the workers and the timeouts. Pure.
 
 A training run has these settings and those of `Config`. A `RolloutService` for your own training loop has only these.
 """
@@ -28,7 +28,7 @@ STALL_TIMEOUT_S = 600.0
 
 
 class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The settings of collecting rollouts."""
+    """The settings for collecting rollouts."""
 
     # ------------------------------------------------------------------------------------------------------------ basics
 

@@ -60,7 +60,7 @@ class Division(NamedTuple):
 
 
 def part_of(batch: Batch, columns: Columns) -> Batch:
-    """Some columns of a batch, without the list of its episodes. With seats, they must be columns of whole env copies."""
+    """Some columns of a batch, without the list of its episodes. With seats, `columns` must cover whole env copies."""
     resets = batch.resets
     if resets is not None:
         seats = batch.valid.shape[1] // resets.shape[1]

@@ -16,7 +16,7 @@ from torch import Tensor
 from millrace.protocol.errors import UsageError
 
 MOST_BYTES = 4096
-MOST_ERROR = 1000  # limit on the characters of an error
+MOST_ERROR = 1000  # the largest number of characters in an error
 NOTHING = b"\xc1"  # the padding after a report: a report ends with text, and this byte never occurs in UTF-8
 
 

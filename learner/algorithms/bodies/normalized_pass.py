@@ -125,7 +125,7 @@ class _Normalization(NamedTuple):
     d: Tensor | None
 
     def backward(self, g: Tensor, layer: Layer, by_layer: Layer) -> Tensor:
-        """The gradient [K, n, B] with respect to the input, from `g`, that of the result. Overwrites `g`."""
+        """The gradient [K, n, B] with respect to the input, from `g`, that with respect to the result. Overwrites `g`."""
         total = g.sum(-1, keepdim=True)
         product = _row_products(g, self.x_hat.expand_as(g))
         by_layer.shift.copy_(total)

@@ -30,7 +30,7 @@ class QuantileQNetwork:
     """N quantiles of the return of each of n actions."""
 
     def __init__(self, policy: PolicySpec, quantiles: int, normalized: Normalized, device: str, seed: int) -> None:
-        """`policy` is the one with which workers act. The initial parameters depend on `seed`."""
+        """`policy` is the policy with which workers act. The initial parameters depend on `seed`."""
         keep_freed_memory()  # each loss allocates and frees arrays of half a megabyte
         actions = policy.action.sizes[0]
         self._quantiles = quantiles

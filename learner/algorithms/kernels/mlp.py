@@ -3,7 +3,7 @@
 Rule: outputs and gradients are those of the formulas below, except for rounding. The division of rows into chunks depends
 only on the number of rows, so the same minibatch gives the same bits.
 
-With a small network, torch spends most of the time of a minibatch on its graph, its dispatcher and its allocator, not on
+With a small network, torch spends most of a minibatch's time on its graph, its dispatcher and its allocator, not on
 arithmetic. Here a pass is a few dozen calls on arrays that are reused. A call of `SmallMLP` owns its arrays until its
 backward pass, so one loss may call it several times. A second backward pass, and derivatives of the gradient, are not
 supported.

@@ -8,7 +8,8 @@ when an optimizer is made and when its first `step` is called, only to exclude t
 import takes 0.8 s and 70 MB, which a learner that compiles nothing can save.
 
 Denormal numbers are set to zero because they are slow: if parameters no longer get a gradient, for example behind a dead
-ReLU, their moments decay to denormal numbers within 800 steps and stay there. Then a step takes a CPU twelve times as long.
+ReLU, their moments decay to denormal numbers within 800 steps and stay there. A step on a CPU then takes twelve times as
+long.
 
 This file uses private parts of torch: `torch._fused_adam_`, `torch._fused_adamw_`, `__dynamo_disable`. If the installed
 version of torch lacks such a function, or if the function accepts other arguments or does something else, `Optimizer.step`

@@ -2,7 +2,7 @@
 
 Rule: after each update, ⌊updates_per_step × (env steps used − learning_starts)⌋ gradient steps have been taken in all,
 whatever the size of the rollouts and the number and speed of the workers. If a resumed run changes `updates_per_step` or
-`learning_starts`, both counts restart when it resumes.
+`learning_starts`, the counts of env steps and gradient steps restart when it resumes.
 """
 
 from __future__ import annotations
@@ -125,7 +125,7 @@ class Continuous(OffPolicy):
         """Enforce the algorithm's constraints on weights. Called after each step of NAME_optimizer, including in cloning."""
 
     def begin_with_actor(self) -> None:
-        """Act with the actor from the first env step, because it was trained before. Copies it to its target."""
+        """Act with the actor from the first env step, because it is already trained. Copies it to its target."""
         self.target.actor.copy_(self.net.actor)
         self._acts_at_once = True
 

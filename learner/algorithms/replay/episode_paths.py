@@ -17,7 +17,7 @@ from millrace.protocol.arrays import Bools, Doubles, Ints
 NO_SLOT = -1
 NO_PATH = -1
 FEW = 64
-"""The number of overwritten slots that may stay at the beginning of a path, because removing each at once is slower."""
+"""The number of overwritten slots that may stay at a path's beginning, because removing each one immediately is slower."""
 
 
 @dataclass

@@ -66,13 +66,13 @@ def distance(achieved: Doubles, desired: Doubles) -> Doubles:
 
 
 def minus_distance(achieved: Doubles, desired: Doubles) -> Doubles:
-    """The reward that `dense` names."""
+    """The reward function for which the name `dense` stands."""
     return -distance(achieved, desired)
 
 
 @dataclass(frozen=True)
 class WithinDistance:
-    """The reward that `sparse:0.05` and `success:0.45` name: one value within a distance of the goal, another beyond it."""
+    """A reward such as `sparse:0.05` or `success:0.45`: one value within a distance of the goal, another beyond it."""
 
     within: float
     reward: float
@@ -104,7 +104,7 @@ def goal_reward(name: str) -> GoalReward:
 
 
 def goals_of(observation: Sequence[Leaf]) -> tuple[int, int] | None:
-    """The indices of the leaves with the achieved and the desired goal; None unless both exist and have the same form."""
+    """The indices of the leaves with the achieved and desired goals; None unless both exist, with equal shape and dtype."""
     paths = [leaf.path for leaf in observation]
     if ACHIEVED not in paths or DESIRED not in paths:
         return None
@@ -245,8 +245,8 @@ class Hindsight:
     def _check_ends(self, batch: Batch, terminated: Bools, achieved: Doubles, desired: Doubles, far: Doubles) -> None:
         """Raise `UsageError` unless episodes terminate at their goal if and only if `goal_ends` says so.
 
-        Episodes may terminate elsewhere, too. So they count as terminating at their goal only if all rows terminate whose
-        rewards say that the goal is reached.
+        Episodes may terminate elsewhere, too. So they count as terminating at their goal only if this is true of all rows
+        whose rewards say that the goal is reached.
         """
         ends_within = -1.0 if self.ends_within is None else self.ends_within
         given = "goal_ends none" if self.ends_within is None else f"goal_ends {ends_within:g}"

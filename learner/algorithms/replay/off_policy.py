@@ -1,8 +1,8 @@
 """The base of the algorithms with a replay buffer: everything about an update except its gradient steps.
 
-DQN derives from it directly; SAC, TD3 and their variants derive from it through `continuous.py`. They define `steps_due`,
-the number of gradient steps of an update, and `step`, which takes one gradient step, adds 1 to `gradient_steps` and moves
-the target networks.
+DQN derives from it directly; SAC, TD3 and their variants derive from it through `continuous.py`. These algorithms define
+`steps_due`, the number of gradient steps of an update, and `step`, which takes one gradient step, adds 1 to `gradient_steps`
+and moves the target networks.
 
 The buffer holds raw observations and rewards. They are normalized when they are drawn, with the current statistics. With one
 torch thread on a CPU, the same batches give the same bits, even after `load_state_dict`. This file uses no sockets, no files

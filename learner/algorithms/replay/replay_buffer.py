@@ -156,7 +156,7 @@ class ReplayBuffer(Rewinding[Overwritten]):
         action: ActionSpec = DISCRETE,
         hindsight: Hindsight | None = None,
     ) -> None:
-        """`size` counts slots. Transitions are drawn in proportion to |error|^alpha, or uniformly if `alpha` is None.
+        """`size` is in slots. Transitions are drawn in proportion to |error|^alpha, or uniformly if `alpha` is None.
 
         Raises `UsageError` if memory is too small.
         """
@@ -426,7 +426,7 @@ class ReplayBuffer(Rewinding[Overwritten]):
             self._paths = EpisodePaths.rebuilt(self.size, by_age, self._is_row, self._follows)
 
     def _keep(self, slots: Ints, leaves: Sequence[Array | SharedChannels]) -> None:
-        """Save the contents of these slots, which are about to be written, if `remember` was called."""
+        """If `remember` was called, save the contents of these slots, which are about to be overwritten."""
         if self._remembered is not None and len(slots):
             weights = None if self._tree is None else self._tree.weights[slots]
             self._overwritten.append(Overwritten(slots, self._row[slots], weights, tuple(leaf[slots] for leaf in leaves)))

@@ -277,7 +277,7 @@ class SequenceReplay(Rewinding[ReplacedSequences]):
             self._tree.set(old.slots, old.weights)
 
     def _keep(self, slots: Ints, *, all_arrays: bool = False) -> None:
-        """Save the contents of these slots, which are about to be written, if `remember` was called."""
+        """If `remember` was called, save the contents of these slots, which are about to be overwritten."""
         if self._remembered is not None and len(slots):
             weights = None if self._tree is None else self._tree.weights[slots]
             arrays = {name: array[slots] for name, array in self.arrays.items()} if all_arrays else {}
