@@ -37,7 +37,7 @@ class Start(NamedTuple):
     """Whether to take over the moments of the optimizers, too."""
 
     def into(self, fresh: dict[str, Any], weights: Iterable[str], optimizers: Iterable[str]) -> dict[str, Any]:
-        """The state `fresh` of a new algorithm, in which the parts taken over from the earlier run replace the new ones.
+        """The state `fresh` of a new algorithm, with some parts replaced by those taken over from the earlier run.
 
         `weights` and `optimizers` are the names of the tensors and the optimizers in the state. The first P of `parameters`
         and `target` compute actions; if the new algorithm has no other parameters, the earlier one must have none either.

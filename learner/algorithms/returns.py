@@ -4,9 +4,9 @@ The replay buffer of single rows has its own n-step returns, because it follows 
 (`replay/replay_buffer.py`).
 
 Every function follows the row format (`millrace.protocol.rollout`): row t bootstraps from `values[t+1]`, the value of
-`obs[t+1]`. Where an episode was truncated, this is its true final observation. No function adds rewards or values across the
-end of an episode. A row that is not valid gives zero and does not affect other rows, whatever it contains: a value that a
-computation carries from row to row, in either direction, passes through it unchanged.
+`obs[t+1]`. Where an episode was truncated, `obs[t+1]` is its true final observation. No function adds rewards or values
+across the end of an episode. A row that is not valid gives zero and does not affect other rows, whatever it contains: a
+value that a computation carries from row to row, in either direction, passes through it unchanged.
 """
 
 from __future__ import annotations

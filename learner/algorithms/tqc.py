@@ -1,7 +1,7 @@
 """TQC (Kuznetsov et al. 2020): SAC whose critics learn quantiles of the return, and whose targets leave out the highest.
 
 SAC takes the lower of two critics' values, so that the actor doesn't exploit their errors. TQC pools the quantiles of all
-critics and drops the highest ones, so you can set in finer steps how pessimistic the targets are.
+critics and drops the highest ones, so you can adjust in finer steps how pessimistic the targets are.
 """
 
 from __future__ import annotations

@@ -29,8 +29,8 @@ def final_evaluation_size(
 ) -> EvaluationSize:
     """The size of the evaluation after training.
 
-    `env_steps` is the number of env steps in training. `episode_length` is the mean length of its last episodes, in env
-    steps, or None if none has ended. `time_limit` is the number of env steps after which the environment truncates an
+    `env_steps` is the number of env steps in training. `episode_length` is the mean length of the last training episodes, in
+    env steps, or None if none has ended. `time_limit` is the number of env steps after which the environment truncates an
     evaluation episode, or None if it doesn't. The size depends on these counts, and not on seconds, so that a repeated run
     gives the same result.
     """

@@ -422,6 +422,6 @@ HYPERPARAMETERS: dict[str, type[AlgorithmConfig]] = {
 
 
 def algorithms_with(name: str) -> str:
-    """The end of an error that names the algorithms with a setting of this name; empty if there are none."""
+    """The end of an error: which algorithms have a setting of this name; empty if none of them has one."""
     owners = [algo for algo, record in HYPERPARAMETERS.items() if name in record.__struct_fields__]
     return f"; it is one of {', '.join(owners)} alone" if owners else ""

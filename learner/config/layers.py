@@ -63,7 +63,7 @@ class LowerLayers(NamedTuple):
     resume: Path | None
 
     def below(self, given: SettingsLayer) -> list[SettingsLayer]:
-        """The layers below `given`, the flags or keyword arguments, which may name the environment.
+        """The layers below `given`, which holds the flags or keyword arguments, and may name the environment.
 
         Raises `UsageError` if a resumed run has another environment, or if there is no such preset.
         """

@@ -24,7 +24,7 @@ OUR_NAME = {
 
 
 def in_place_of(name: str, known: Collection[str], *, flag: bool = False) -> str:
-    """The end of an error about an unknown setting `name`: which name to use instead; empty if that isn't known.
+    """The end of an error about an unknown setting `name`. It says which name to use instead; empty if that isn't known.
 
     `known` are the settings of this run. `flag` says that the name was given as a flag, not as a keyword argument.
     """

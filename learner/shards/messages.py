@@ -58,7 +58,7 @@ class End(msgspec.Struct, frozen=True, tag=True):
 
     reason: str
     failed: bool
-    """whether it ended with an error; then a launcher should restart all processes, not only rank 0"""
+    """whether it ended with an error; in that case a launcher should restart all processes, not only rank 0"""
 
 
 FromRankZero = Begin | Learn | StillThere | End

@@ -36,7 +36,7 @@ class ShardObservations(NamedTuple):
     """The observations of a process's own shards."""
 
     batch: Batch
-    """its small arrays have all columns; its observations have at least the columns of this process's shards"""
+    """the batch: small arrays have all columns, and observations at least the columns of this process's shards"""
     columns: Sequence[Columns]
     """the columns of each of the S shards"""
     own: range

@@ -45,8 +45,8 @@ class Categories:
     def shifted(self, probabilities: Tensor, reward: Tensor, discount: Tensor) -> Tensor:
         """The distribution [B, O] of reward + discount · Z on the same atoms, where Z has these probabilities [B, O].
 
-        The probability of a return between two atoms is divided between them in proportion; a return beyond a bound counts
-        as the bound (Bellemare et al. 2017).
+        The probability of a return between two atoms is divided between them by linear interpolation; a return beyond a
+        bound counts as the bound (Bellemare et al. 2017).
         """
         returns = reward[:, None] + discount[:, None] * self.atoms.to(reward.dtype)
         position = (returns.clamp(-self.bound, self.bound) + self.bound) / self.step

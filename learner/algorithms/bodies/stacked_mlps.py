@@ -64,7 +64,7 @@ class MLPShape(NamedTuple):
         return fields
 
     def folded(self) -> MLPShape:
-        """The shape of the plain MLPs with the same outputs."""
+        """The shape of the plain MLPs that give the same outputs."""
         return self._replace(normalized=Normalized.NOWHERE, unit_rows=False)
 
     def statistics(self) -> list[Field]:

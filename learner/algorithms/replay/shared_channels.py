@@ -39,7 +39,7 @@ class SharedChannels:
         self._chunks: list[Bytes] = []  # [channels per chunk, bytes per channel] each
         self._number: dict[bytes, int] = {}  # the number of a channel, by its digest
         self._digest: list[bytes] = []  # the digest of a channel, by its number
-        self._uses: list[int] = []  # how many places in slots refer to a channel, by its number
+        self._uses: list[int] = []  # number of places in slots that refer to a channel, by its number
         self._free: list[int] = []
 
     @property
