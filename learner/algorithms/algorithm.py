@@ -77,7 +77,7 @@ class Algorithm(ABC):
 
     @staticmethod
     def policy_spec(config: Any, observation: tuple[Leaf, ...], action: ActionSpec) -> PolicySpec:
-        """The policy to train. By default, an actor and a critic with the layers that the settings give, for any space.
+        """The policy to train. By default, an actor and a critic for any space, with the layers that the settings give.
 
         Raises `UsageError`, with a one-line message, if the algorithm cannot use these spaces.
         """

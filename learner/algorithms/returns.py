@@ -107,7 +107,7 @@ def vtrace(
 class NStepReturns(NamedTuple):
     """The returns of the next k steps of each row, as arrays [T, N].
 
-    k is n, or less if the episode or the rollout ends sooner. Rows that are not valid hold meaningless numbers.
+    k is `n_step`, or less if the episode or the rollout ends sooner. Rows that are not valid hold meaningless numbers.
     """
 
     reward: Doubles
@@ -120,7 +120,7 @@ class NStepReturns(NamedTuple):
 
 
 def n_step_returns(reward: Floats, ends: EpisodeEnds, gamma: float, n_step: int) -> NStepReturns:
-    """For each row, the discounted sum of up to n rewards: its own, and those of the next valid rows of its episode.
+    """For each row, the discounted sum of up to `n_step` rewards: its own, and those of its episode's next valid rows.
 
     `reward` is [T, N].
     """

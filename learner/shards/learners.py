@@ -73,7 +73,7 @@ class Learners:
         """`reply_s` is the number of seconds for which the others wait for a message."""
         self.division = division
         self.others_wait = True
-        """Whether the others wait for a message. False during an update or a message, and after either was interrupted."""
+        """Whether the others wait for a message. False in an update or while sending, and after either is interrupted."""
         self._tell_every_s = reply_s * TELL_BEFORE
         self._told_s = time.monotonic()
 

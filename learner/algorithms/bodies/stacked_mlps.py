@@ -133,7 +133,7 @@ class StackedMLPs:
 
     @torch.no_grad()
     def folded(self) -> Tensor:
-        """The parameters [P′] of plain MLPs with the outputs of `evaluated`: each layer's weight and bias, [K, …] each."""
+        """Parameters [P′] of plain MLPs with the same outputs as `evaluated`: weights and biases by layer, [K, …] each."""
         if not self._normalizes:
             return self._constant
         flat = self._constant.new_zeros(total_size(self._folded_fields))

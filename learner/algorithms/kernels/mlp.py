@@ -236,7 +236,7 @@ class _Workspace:
     def backward(
         self, by_results: Sequence[Tensor], wants_x: bool, wants_parameters: bool
     ) -> tuple[Tensor | None, Tensor | None]:
-        """The gradients of x and of all parameters, from those of the results; None for a gradient that isn't wanted."""
+        """The gradients with respect to x and all parameters, from those with respect to the results; None if not wanted."""
         by_heads = self._top.backward([by_result.numpy() for by_result in by_results])
         by_x = self.by_input(by_heads) if wants_x else None
         return by_x, self.by_parameters(by_heads) if wants_parameters else None

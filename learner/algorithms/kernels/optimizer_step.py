@@ -61,7 +61,7 @@ def avoid_compiler_import() -> None:
 
 
 def take_step(optimizer: Optimizer) -> None:
-    """`optimizer.step()` for fused Adam, fused AdamW and plain RMSprop of one flat parameter tensor that has a gradient."""
+    """Like `optimizer.step()`, for Adam, AdamW (both fused) or plain RMSprop of one flat tensor that has a gradient."""
     (group,) = optimizer.param_groups
     (flat,) = group["params"]
     step = _step_of(optimizer)

@@ -225,7 +225,7 @@ class ReplayBuffer(Rewinding[Overwritten]):
         if most > self.size:
             raise UsageError(f"replay_size {self.size}: a rollout takes up to {most}; take --replay-size {most} or more")
         fresh = batch.fresh[columns]
-        known = NO_SLOT if fresh.all() else self._newest.get(lane, NO_SLOT)  # a fresh lane may have a new size
+        known = NO_SLOT if fresh.all() else self._newest.get(lane, NO_SLOT)  # a fresh lane may have another number of copies
         newest = np.where(fresh, NO_SLOT, known)
         continues = self._continues([leaf[0] for leaf in obs], newest, most)
         goes_on = _goes_on(EpisodeEnds.of(batch).columns(columns), continues)  # [T+1, N]
@@ -360,7 +360,7 @@ class ReplayBuffer(Rewinding[Overwritten]):
         return slots, self._row[slots], weight
 
     def _follow(self, row: Array, goals: Goals | None) -> tuple[Doubles, Doubles, Ints]:
-        """Follow each row for up to n steps. Returns the discounted reward, γᵏ (0 if terminated) and the last slot.
+        """Follow each row for up to `n_step` steps. Returns the discounted reward, γᵏ (0 if terminated) and the last slot.
 
         `row` is a copy. The rows in it that have another goal are changed to their outcome under that goal.
         """

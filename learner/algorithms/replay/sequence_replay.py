@@ -210,7 +210,7 @@ class SequenceReplay(Rewinding[ReplacedSequences]):
         return (self.sample(count, beta) for _ in range(number))
 
     def sample(self, count: int, beta: float = 1.0) -> SequenceSample:
-        """Draw sequences with replacement: as many as hold `count` rows if all rows are valid, but at least `FEWEST`.
+        """Draw sequences with replacement: as many as hold `count` rows when all of these are valid, but at least `FEWEST`.
 
         For `beta`, see `ReplayBuffer`.
         """
