@@ -99,7 +99,7 @@ class Normalizer:
         return features(self._policy, [obs[path] for path in paths] if paths[0] else [obs])
 
     def state(self) -> dict[str, Any]:
-        """The state for `restore`, as plain data. Without running returns, because a restored service has new env copies."""
+        """The state for `restore`, as plain data. It omits running returns because a restored service has new env copies."""
         kept: dict[str, Any] = {"observations": _plain(self._observations.state_dict())}
         if self._rewards is not None:
             gamma, scaler = self._rewards
