@@ -3,5 +3,5 @@
 This package never imports millrace.workers.
 """
 
-if __name__ != "millrace.learner":  # under a second name, each module and class would exist twice
+if __name__ != "millrace.learner":  # imported under another name, each module and class would exist twice
     raise ImportError(f"import millrace.learner instead of {__name__}", name=__name__)

@@ -34,7 +34,7 @@ class Resumption(NamedTuple):
 
 
 def unless_finished(config: Config, resume: Path | None, train: Callable[[Resumption | None], Path]) -> Path:
-    """Check the run to `resume`, if there is one, then call `train`. Returns the run folder.
+    """If `resume` is given, check that run. Then call `train`. Returns the run folder.
 
     For a run that is finished, returns at once, so that no worker is started. Raises `UsageError` if there is no such run or
     it cannot be resumed with these settings, and whatever `train` raises.
@@ -108,7 +108,7 @@ def _with_present_names(before: Config, now: Config) -> Config:
 
 
 def _is_finished(config: Config, folder: RunFolder) -> bool:
-    """Whether the run has nothing left to do, because the reason why it ended also holds with this configuration."""
+    """Whether the run has nothing left to do, because the reason why it ended still holds with these settings."""
     summary = folder.summary()
     if summary is None or summary.evaluation is None:
         return False

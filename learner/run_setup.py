@@ -108,10 +108,10 @@ class RunSetup:
 
 @contextmanager
 def run_folder(config: Config, resume: Resumption | None) -> Iterator[RunFolder]:
-    """Make a new run folder, or open that of the run to `resume`, and lock it. If the body raises, a new one is removed.
+    """Make a new run folder, or open the folder of the run that `resume` names. Lock it inside the context.
 
-    Inside the context, a page shows the run if `config` says so. A new folder is not removed once the run has begun. Raises
-    `UsageError` if the folder can't be used, or if another process trains the run.
+    If the body raises before the run has begun, a new folder is removed. Inside the context, a page shows the run if
+    `config` says so. Raises `UsageError` if the folder can't be used, or if another process trains the run.
     """
     folder = RunFolder.create(config) if resume is None else RunFolder.open(resume.run)
     folder.stay()

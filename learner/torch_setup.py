@@ -96,7 +96,7 @@ def threads(policy: PolicySpec, rows: int, max_lag: int, workers: int) -> Thread
     layers get one thread, because numpy computes most of their passes.
 
     If workers collect during updates, one core for each of them is left out, but only if this leaves more than half of the
-    cores. Otherwise updates would take longer than collecting, and workers, with their cores, would wait most of the time.
+    cores. Otherwise, updates would take longer than collecting, and the workers and their cores would mostly sit idle.
     """
     largest = max(math.prod(field.shape) for fields in parameter_layout(policy) for field in fields)
     if not policy.needs_torch and largest < MANY_WEIGHTS:
@@ -116,7 +116,7 @@ def updates_use_all_cores(config: Config) -> bool:
     """Whether updates use all cores while workers collect, so that local workers should have a lower priority.
 
     Each operation of an update ends when its slowest thread has finished, so if a worker occupies the core of one thread,
-    all threads wait. Updates with one thread leave cores to the workers, whose speed then limits that of the run, so a lower
-    priority would slow it down. Updates on a GPU leave all cores to the workers.
+    all threads wait. Updates with one thread leave cores to the workers. Then the workers limit the speed of the run, so
+    giving them a lower priority would slow the run down. Updates on a GPU leave all cores to the workers.
     """
     return config.max_lag > 0 and 1 < usable_cores() <= (config.torch_threads or 1) and torch_device(config) == "cpu"

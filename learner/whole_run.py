@@ -52,7 +52,7 @@ def train_to_the_end(run: OpenRun, workers: int) -> None:
 
 
 def _watched_cores(run: OpenRun) -> CrowdedCores:
-    """A watch over the cores that updates need, with the number of PyTorch's threads if these compute the updates."""
+    """The `CrowdedCores` of the run. It watches PyTorch's threads, unless a GPU computes the updates."""
     config = run.setup.config
     return CrowdedCores((config.torch_threads or 1) if torch_device(config) == "cpu" else 0)
 
@@ -78,7 +78,7 @@ def _learn_from_prior(run: OpenRun, prior: PriorData) -> None:
 
 
 def _tell_of_error(end: Callable[[], None]) -> None:
-    """Call `end`, which tells the callbacks. If it raises, only log that, because the error of the run is what counts."""
+    """Call `end`, which tells the callbacks. If it raises, only log its error: the error that ended the run matters."""
     try:
         end()
     except Exception as later:

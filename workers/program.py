@@ -88,7 +88,7 @@ def work(flags: WorkerFlags, token: Token | None, signals: list[int]) -> int:
 
 
 def _exit_code(code: int, reason: str) -> int:
-    """The exit code of this process. It tells the supervisor more than the conversation's exit code would."""
+    """The exit code of this process. It tells the supervisor more than `code`, the exit code of the conversation."""
     return EXIT_NO_LEARNER if reason.startswith(NO_LEARNER) else code
 
 

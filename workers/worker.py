@@ -302,7 +302,7 @@ class Worker:
     def _cannot_take_part(self, error: Exception, work: Work) -> TypeGuard[UsageError]:
         """Whether the error means that this worker lacks the environment, or has another version of it.
 
-        If the environment's own code raised (`detail` is its traceback), the worker has it.
+        If the environment's own code raised (`detail` is its traceback), the worker has the environment.
         """
         if not isinstance(error, UsageError) or error.detail:
             return False
@@ -360,8 +360,8 @@ class Worker:
             self._link.send(frames)
 
     def _begin(self, run: WaitSpec | RunSpec | StepSpec) -> None:
-        """Make the actors or the stepper for this run, unless the run has yet to begin. The previous session's were closed
-        before.
+        """Make the actors or the stepper for this run, unless the run has yet to begin. Those of the previous session
+        have been closed before.
         """
         activity().begin(WAITING)
         activity().limit(run.call_timeouts)

@@ -45,7 +45,7 @@ from millrace.protocol.rollout import Batch
 from millrace.protocol.specs import PolicySpec
 
 MOST_STEPS = 64  # rollouts in this check have at most this many steps
-MOST_WARM_UP = 24  # the most updates before the first gradient step, because an algorithm may fill a replay buffer first
+MOST_WARM_UP = 24  # limit on updates before the first gradient step; an algorithm may have to fill a replay buffer first
 MORE_UPDATES = 3  # number of updates that follow the first gradient step
 TOTAL_STEPS = 20_000  # env steps of the toy run, for schedules
 LEARNING_STEPS = 40_000  # env steps within which the identity environment must be learned
@@ -57,7 +57,7 @@ Pulse = Callable[[], None]
 
 
 class StoppedByPulse(Exception):
-    """The exception that `_stopping` pulses raise."""
+    """Raised by the pulses that `_stopping` makes."""
 
 
 class Subject(NamedTuple):
@@ -159,7 +159,7 @@ def _with_batches(subject: Subject, made: list[str]) -> Subject:
 
 
 def weights_have_the_policy_s_shape(subject: Subject) -> Iterator[str]:
-    """Check that weights are float32 and finite, and that there are as many as the policy has."""
+    """Check that weights are float32, are finite, and have the size that the policy needs."""
     weights: Any = subject.new().weights()
     if wrong := [*wrong_weights(weights, subject.policy)]:
         yield from wrong
@@ -233,9 +233,9 @@ def rows_that_are_not_valid_change_nothing(subject: Subject) -> Iterator[str]:
 
 
 def what_is_carried_passes_through_rows_that_are_not_valid(subject: Subject) -> Iterator[str]:
-    """Check that rows in which a seat waits, between two of its own rows, change no metric of an actor-critic.
+    """Check that an actor-critic's metrics don't change if seats wait for some rows between two of their actions.
 
-    Algorithms with a replay buffer are not checked, because they may then draw other rows.
+    Algorithms with a replay buffer are not checked, because with more rows they may sample other ones.
     """
     if not issubclass(subject.algorithm, ActorCritic):
         return
@@ -251,7 +251,7 @@ def what_is_carried_passes_through_rows_that_are_not_valid(subject: Subject) -> 
 
 
 def the_same_seed_and_batches_give_the_same_bits(subject: Subject) -> Iterator[str]:
-    """Check that results are reproducible, whatever the global random generators of torch, numpy and Python give."""
+    """Check that results are reproducible, whatever the state of the global random generators of torch, numpy and Python."""
     results = [_learned(subject, global_seed) for global_seed in (0, 0, 1)]
     if first_difference(results[0], results[1]) is not None:
         yield "update: the same seed and batches give other weights or metrics each time; all random numbers must be seeded"
@@ -360,7 +360,7 @@ def numbers_that_are_not_finite_are_raised(subject: Subject) -> Iterator[str]:
 
 
 def learns_the_identity_environment(subject: Subject) -> Iterator[str]:
-    """Check that the algorithm learns the identity environment, in which the right action is the one that is observed.
+    """Check that the algorithm learns the identity environment, in which the right action equals the observation.
 
     Random choices get a quarter of the reward of right ones.
     """
@@ -455,7 +455,7 @@ def _undisturbed() -> Iterator[None]:
 
 
 def _not_plain(state: object, where: str = "") -> str:
-    """The place of the first object in a state that a checkpoint can't hold; empty if there is none."""
+    """The path to the first object in this state that can't be stored in a checkpoint; empty if there is none."""
     match state:
         case dict():
             return next((why for key, value in state.items() if (why := _not_plain(value, f"{where}[{key!r}]"))), "")

@@ -57,9 +57,9 @@ def noise_batch(acting: ToyActor, steps: int, generator: np.random.Generator, fr
 def identity_batch(acting: ToyActor, steps: int, generator: np.random.Generator) -> tuple[Batch, float]:
     """A batch of the identity environment, and its mean reward.
 
-    In this environment, the right action is the one that is observed. Each episode has one step. A discrete action gets 1 if
-    it is the right one. A Box action gets minus its squared distance from the observation. For a Dict or Tuple, the two
-    rewards are added.
+    In this environment, the right action equals the observation. Each episode has one step. The reward of a discrete action
+    is 1 if it is right. The reward of a Box action is minus its squared distance from the observation. For a Dict or Tuple,
+    the two rewards are added.
     """
     columns = LANES * COPIES
     choice = generator.integers(0, CHOICES, (steps + 1, columns))

@@ -74,7 +74,7 @@ class Audience:
             self._callbacks.meanwhile(progress)
 
     def gathered(self, rollouts: Sequence[AcceptedRollout]) -> bool:
-        """Report that these rollouts have arrived. Returns False if a callback ended the run, so that they aren't used."""
+        """Report that these rollouts have arrived. Returns False if a callback ended the run; then no update uses them."""
         began_s = time.monotonic()
         if self._callbacks.wants("on_rollouts"):
             progress = msgspec.structs.replace(
@@ -122,8 +122,8 @@ class Audience:
     def finish(self, reason: str, *, cut_short: bool = False) -> None:
         """Report the end of the run, and write its summary. Does nothing when called again.
 
-        `cut_short` says that an error or an interrupt ended the run. Otherwise, raises `RunError` if the summary cannot be
-        written.
+        `cut_short` says that an error or an interrupt ended the run. If it is False, this raises `RunError` if the summary
+        cannot be written.
         """
         if not self._finished:
             self._files.write_summary(reason, cut_short=cut_short)
@@ -191,7 +191,7 @@ class Audience:
             self._files.write_row(self.progress(), logged)
 
     def _say_missing_facts(self) -> None:
-        """Warn once about facts that no episode had, because the user may have named them wrongly."""
+        """Warn once about facts that no episode reported, because the user may have misspelled their names."""
         window = self._tally.window
         if window.full and not self._said_missing:
             self._said_missing = True

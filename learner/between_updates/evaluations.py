@@ -1,12 +1,12 @@
 """The evaluations of one run. Each version is evaluated at most once, and the best policy again at the end.
 
-A return by which a policy was selected is a biased measurement of that policy: the highest of several evaluations is biased
-upwards, and so is an evaluation that ended the run, because it reached the target or because a callback saw it. So for the
+A return that was used to select a policy is a biased estimate of that policy's return. The highest of several evaluations
+is biased upwards. So is an evaluation that ended the run, by reaching the target or through a callback. Therefore, for the
 best policy, and for the final policy of such a run, the summary reports a second evaluation, on other episodes.
 
-Rule: without `eval_workers`, training waits for each evaluation. With them, evaluations run alongside training: the result
-of an evaluation counts when the next one is due, or at the end of the run, and the run then waits for it. So the course of a
-run doesn't depend on speed. The evaluated policy is kept until its result counts.
+Rule: without `eval_workers`, training waits for each evaluation. With them, evaluations run alongside training. The result
+of an evaluation is used when the next one is due, or at the end of the run; if it isn't ready by then, the run waits for it.
+So the course of a run doesn't depend on speed. The evaluated policy is kept until its result is used.
 """
 
 from __future__ import annotations
@@ -37,19 +37,19 @@ class Evaluations:
         self.final: Evaluation | None = None
         """The evaluation of the final policy that is reported. Set by `conclude`."""
         self.ended_by: Evaluation | None = None
-        """The evaluation of the final policy that ended the run, if one did. `final` is then another, on other episodes."""
+        """The evaluation that ended the run, if one did. `final` then evaluates the same policy again, on other episodes."""
         self._run = run
         self._config = run.config
         self._time_limit = time_limit
         self._tally = run.tally
         self._state = run.tally.state
-        self.write_best()  # the folder may have the best policy of a later update, which a resumed run has lost
+        self.write_best()  # the file may be from a later update, which a resumed run has lost
 
     def begin_again(self, env_attributes: Array | None, watch: Callable[[], None]) -> Row | None:
         """Restart the evaluation that was running alongside training when the run was interrupted. Publishes its weights.
 
         If the run was resumed without `eval_workers`, this also waits for the evaluation and returns its metrics.
-        `env_attributes` are those of the newest weights; if these weights are the ones to evaluate, they are sent only once.
+        `env_attributes` are those of the newest weights. They are sent along if these weights are the ones to evaluate.
         """
         if (pending := self._state.pending) is None:
             return None
@@ -96,7 +96,7 @@ class Evaluations:
     def conclude(self, watch: Callable[[], None]) -> bool:
         """Evaluate the final policy and, if the run kept a best policy, evaluate that again on other episodes.
 
-        Sets `final` and `confirmed`. Returns whether the final policy had not been evaluated with as many episodes before.
+        Sets `final` and `confirmed`. Returns True if the final policy had not yet been evaluated with as many episodes.
         """
         state = self._state
         before = self.of_newest()
@@ -118,7 +118,7 @@ class Evaluations:
         return evaluation is not before
 
     def write_best(self) -> None:
-        """Write the best policy into the run folder, if it is known."""
+        """Write the best policy into the run folder, if there is one."""
         if self._state.best_policy is None:
             return
         policy = self._state.best_policy
@@ -127,7 +127,7 @@ class Evaluations:
         folder.writes.write("best policy", lambda: folder.write_policy(spec, policy[0], policy[1], "best"))
 
     def to_report(self) -> Evaluation | None:
-        """The evaluation to report, even for a run that was cut short; None if it may be the one that ended the run."""
+        """The evaluation to report, even for a run that was cut short; None if the newest one may have ended the run."""
         if self.final is not None:
             return self.final
         return self.of_newest() if self._tally.stop_reason() in (None, ALL_STEPS_DONE) else None

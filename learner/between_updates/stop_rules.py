@@ -19,8 +19,8 @@ def reason_to_stop(
     """Why the run should end now; None if it should continue.
 
     `evaluation_return` is the mean return of the newest greedy evaluation, and `training_return` that of the last training
-    episodes; each is None if there is none yet. `evaluated_before` are the env steps of the evaluated policy, if training
-    has continued since then.
+    episodes; each is None if there is none yet. If training has continued since that evaluation, `evaluated_before` is the
+    number of env steps with which the evaluated policy was trained.
     """
     target = config.target_return
     if target is not None and evaluation_return is not None and evaluation_return >= target:

@@ -1,7 +1,7 @@
 """Counts the env steps, updates and episodes of one run. The counts decide when it ends, and when an evaluation is due.
 
-Rule: decisions depend on counts alone, so every run with these settings makes the same decisions. The seconds of evaluations
-are a stage of their own and do not count as training. `run_folder/checkpoint.py` says when a checkpoint is due. This file
+Rule: decisions depend on counts alone, so every run with these settings makes the same decisions. The time of evaluations
+is a stage of its own and does not count as training. `run_folder/checkpoint.py` says when a checkpoint is due. This file
 uses no files and no sockets.
 """
 

@@ -33,7 +33,7 @@ class Callback:
         return None
 
     def on_rollouts(self, progress: Progress) -> object:
-        """Called when rollouts have arrived that the next update will use: `progress.rollouts`.
+        """Called when the rollouts for the next update have arrived: `progress.rollouts`.
 
         Their arrays are read-only. Not called if an earlier callback has ended the run.
         """

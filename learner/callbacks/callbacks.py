@@ -76,7 +76,7 @@ class Callbacks:
         self._call("on_evaluation", progress)
 
     def meanwhile(self, progress: Progress) -> None:
-        """Show the progress of an evaluation or a long wait. `progress.waiting` says how far it is or what is awaited."""
+        """Show the progress of an evaluation or a long wait. `progress.waiting` says how far it is, or what is awaited."""
         self._show(progress)
 
     def on_checkpoint(self, progress: Progress) -> None:
@@ -133,7 +133,7 @@ def _call(callback: object, moment: str, progress: Progress) -> object:
 
 
 def _method(callback: object, moment: str) -> Callable[[Progress], object] | None:
-    """The method of a callback, unless it is the empty one of `Callback`. For `__call__`, a function itself."""
+    """The callback's method, or None if it is the empty one of `Callback`. For `__call__`, the function itself."""
     if moment == "__call__":
         return None if not callable(callback) or any(hasattr(callback, each) for each in MOMENTS) else callback
     found: Any = getattr(callback, moment, None)

@@ -106,10 +106,10 @@ class Coordinator(ABC, Generic[M]):
         """The answer to a message that a member sent in its session."""
 
     def _not_of_member(self, message: ToLearner, answered: Answered) -> None:
-        """Called with each message that the membership, and not this object, has answered."""
+        """Called with each message that the membership has answered instead of this object."""
 
     def _deal(self) -> list[Outgoing]:
-        """Give workers the work that no worker has. Called after each event that may have made a worker available."""
+        """Deal the work that no worker holds. Called after each event that may have made a worker available."""
         return []
 
     def _again(self, member: M, heartbeat: Heartbeat, lost: Sequence[int]) -> list[Outgoing]:

@@ -45,8 +45,8 @@ class FailureCount:
     def failed(self, lanes: Collection[int | str], worked_s: float | None, now: float) -> str:
         """Count one failure, which stopped these lanes. Returns why the run ends, or an empty string.
 
-        `worked_s` is for how many seconds the worker had made env steps; None if its process is not known to have made an
-        env step.
+        `worked_s` is the number of seconds for which the worker had been making env steps; None if its process is not known
+        to have made one.
         """
         stepped = worked_s is not None
         for lane in lanes:

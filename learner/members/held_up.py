@@ -34,7 +34,7 @@ def in_words(doing: str, seconds: float) -> str:
 
 
 def held_up(member: Member, now: float) -> tuple[float, float, str]:
-    """How many seconds a member has been held up, its env steps per second negated, and a line about it.
+    """For how many seconds a member has been held up, minus its env steps per second, and a line about it.
 
     The line says which worker it is, on which host, and what it is doing. Tuples can be compared: the largest belongs to the
     member that has been held up longest or, if none is held up, to the slowest one.
@@ -59,7 +59,7 @@ def what_they_do(
 ) -> tuple[str, list[str]]:
     """What the workers are doing, in one line, and a line for each worker that wrote something.
 
-    Members come first, in the order of how long they have been held up. The worker processes that have not joined follow.
+    Members come first, those held up longest at the top. The worker processes that have not joined follow.
     `said` are the last lines of the workers' logs, by name.
     """
     members = list(members)

@@ -84,7 +84,7 @@ class ServerSettings:
     """The settings in which the servers of different hubs differ."""
 
     grace_s: float = AWAY_S
-    """For how many seconds, after the learner was away, no worker is removed as silent."""
+    """How long after the learner was away no worker is removed as silent, in seconds."""
     log_tracebacks: bool = True
     """Whether to log the traceback of an environment. False if the hub raises it."""
     log_joins: bool = True

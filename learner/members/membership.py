@@ -67,7 +67,7 @@ Outgoing = tuple[bytes, ToWorker]
 
 @dataclass(frozen=True)
 class Answered:
-    """The answer to a message that no member sent in its session, or to a member's Failure."""
+    """The answer to a member's Failure, or to a message that isn't from a member's current session."""
 
     out: list[Outgoing]
     """The messages of the answer."""
@@ -143,7 +143,7 @@ class Membership(Generic[M]):
         return events
 
     def hear(self, peer: bytes, message: ToLearner, now: float) -> M | Answered:
-        """The member that sent this message in its session, which the caller must answer; otherwise the answer."""
+        """The member from whose session this message is, if the caller must answer it; otherwise, the answer itself."""
         match message:
             case Hello():
                 out, joined = self.join(peer, message, now)

@@ -119,11 +119,11 @@ class EvaluationDealer:
         self.second: dict[int, Member] = {}
         """the second worker of each ticket in `held` that has one, by number"""
         self.most_copies: int | None = None
-        """the most env copies that play, summed over all workers, though one worker may always play; None for no limit"""
+        """limit on the env copies that play, of all workers together (one worker may always play); None for no limit"""
         self._run = run
         self.beside = False
         """whether the pending evaluation runs alongside training"""
-        self._most_workers = 0  # if copies are limited, the most workers that play; 0 for as many as the limit allows
+        self._most_workers = 0  # if copies are limited, how many workers may play; 0 for as many as the limit allows
         self._plan: EvaluationPlan | None = None
         self.version = -1
         """the version of the weights that are evaluated"""
@@ -197,7 +197,7 @@ class EvaluationDealer:
         return [PlayedEpisode(*both) for answer in answers for both in zip(answer.episodes, answer.cut, strict=True)]
 
     def deal(self, active: Sequence[Member]) -> list[Outgoing]:
-        """Give each of these workers that plays a ticket, and then a second one if there are more tickets than workers.
+        """Give a ticket to each of these workers that may play; then a second one if there are more tickets than workers.
 
         Workers that only evaluate come first, then the others, each in the order of joining. If copies are limited, only the
         first workers play, because a worker keeps its copies.
@@ -237,7 +237,7 @@ class EvaluationDealer:
     def take_in(self, member: Member, answer: Evaluated) -> str:
         """Accept an answer.
 
-        Returns what is wrong with it, or an empty string; a wrong answer's ticket goes to another worker.
+        Returns what is wrong with it, or an empty string. The ticket of a wrong answer goes to another worker.
         """
         if not self._plays(member, answer.ticket):
             return ""  # the answer is a repetition, or came after the end or after another worker's answer

@@ -301,7 +301,7 @@ class Hub:
     # ---------------------------------------------------------------- progress and state
 
     def report_progress(self, progress: Progress) -> None:
-        """Store the progress of the run, with which status requests are answered."""
+        """Store the progress of the run, for the answers to status requests."""
         self._progress = progress
 
     def progress(self) -> RunProgress:

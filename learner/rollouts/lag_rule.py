@@ -45,7 +45,7 @@ class Rounds:
 
     @property
     def versions(self) -> Mapping[int, int]:
-        """The version that acts in each round that is open, or that a resumed run is about to open again, by round."""
+        """By round, the version that acts in it: for open rounds, and for those that a resumed run will open again."""
         return self._saved | self._versions
 
     def acting(self) -> set[int]:

@@ -85,10 +85,10 @@ class LaneHistory:
     def start_anew(self, attempts: int, *, from_past: bool = True) -> None:
         """Let all copies start afresh after this many failed attempts to continue. No start number is used twice.
 
-        `from_past` says whether the first attempt began from this history. Then only some of the copies started afresh in
-        it.
+        `from_past` says whether the first attempt began from this history. If so, only some of the copies started afresh in
+        that attempt.
         """
-        tried = [last.start + (from_past and not last.goes_on) for last in self.copies]  # the starts of the first attempt
+        tried = [last.start + (from_past and not last.goes_on) for last in self.copies]  # the first attempt's start numbers
         self.copies = [LastEpisode(number + attempts - 1, None, self.count, False) for number in tried]
         self.rows.clear()
 

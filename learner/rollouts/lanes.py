@@ -43,9 +43,9 @@ class TicketedLane(PlacedLane):
     failures: int = 0
     """How many times its environment has failed since its last rollout arrived."""
     failed_at_once: bool = True
-    """Whether the first of these failures and losses happened before any rollout of the incarnation arrived."""
+    """Whether the first of the `failures` and `losses` happened before any rollout of the incarnation arrived."""
     losses: int = 0
-    """How many times, since its last rollout arrived, its worker was lost while it collected."""
+    """How many times its worker was lost while collecting, since its last rollout arrived."""
 
     @property
     def busy(self) -> int:
@@ -74,8 +74,8 @@ class TicketedLane(PlacedLane):
     def past(self, histories: LaneHistories, waiting: Iterable[tuple[int, Rollout, bytes]]) -> LanePast | None:
         """The past that a new owner continues; None if the lane has not begun.
 
-        `waiting` are the rollouts that follow the history, in order. For each, it has the incarnation, the rollout, and the
-        attributes of the env copies.
+        `waiting` are the rollouts that follow the history, in order. Each entry consists of the incarnation, the rollout,
+        and the attributes of the env copies.
         """
         history = None if self.history is None else self.history.copy()
         newest = self.newest_taken
@@ -109,7 +109,7 @@ class TicketedLane(PlacedLane):
         return anew if (continues or sequence == 0) and not begins else np.ones_like(anew)
 
     def lost(self, *, failed: bool) -> None:
-        """Record that the lane's worker was lost while it collected or, if `failed`, because its environment failed."""
+        """Record that the lane's worker was lost while collecting or, if `failed`, because its environment failed."""
         if not self.failures and not self.losses:
             self.failed_at_once = not self.next_sequence
         self.losses += not failed

@@ -3,8 +3,8 @@
     tickets       issued   = used + outstanding + lost
     transitions   received = used + waiting + duplicate + late + invalid
 
-Both equations hold at every moment. A worker holds each `outstanding` ticket, or the ticket's rollout waits to be used; the
-transitions of that rollout are `waiting`.
+Both equations hold at every moment. An `outstanding` ticket is either held by a worker, or its rollout waits to be used. The
+transitions of such a rollout are `waiting`.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from msgspec import Meta
 from millrace.protocol.bounds import LARGEST
 
 Past = Annotated[int, Meta(ge=0, le=LARGEST >> 2)]
-"""A count that a run continues from a file. It is limited, so that it still fits into messages after it has grown."""
+"""A count that a resumed run reads from a file and continues. It is limited, so that it fits into messages even later."""
 
 
 class Ledger(msgspec.Struct, kw_only=True):

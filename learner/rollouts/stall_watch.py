@@ -1,10 +1,11 @@
 """Decides whether a run has stalled, and which workers cause it. Pure.
 
-Rule: env steps, constructions, resets and rollouts are progress, but while rollouts are awaited, those of workers that only
-evaluate don't count. While a call of the environment runs within its timeout, the run has not stalled, because either the
-call ends or its worker is ended. If nothing happens for `stall_timeout_s`, the workers that hold tickets are refused, and
-others get the tickets. The run ends only if no worker would remain. A worker that holds its tickets, for rollouts or for an
-evaluation, longer than all their calls of the environment may take together is refused, whatever it claims.
+Rule: env steps, constructions, resets and rollouts are progress. While the learner waits for rollouts, the progress of
+workers that only evaluate doesn't count. While a call of the environment runs within its timeout, the run has not stalled,
+because either the call ends or its worker is ended. If nothing happens for `stall_timeout_s`, the workers that hold tickets
+are refused, and others get the tickets. The run ends only if no worker would remain. A worker that holds its tickets, for
+rollouts or for an evaluation, longer than all their calls of the environment may take together is refused, whatever it
+claims.
 
 That limit may be days for an evaluation. So if none of its episodes has arrived for `stall_timeout_s` while the learner
 waits for it, a second worker plays the oldest ticket as well, whatever the first worker claims.

@@ -152,7 +152,7 @@ class TicketCoordinator(Coordinator[CollectingMember]):
         return self._deal()
 
     def share_evaluation(self) -> list[Outgoing]:
-        """Let an idle worker, if there is one, also play the oldest ticket, because no answer has arrived for long."""
+        """Let an idle worker, if there is one, also play the oldest ticket: no answer has arrived for a long time."""
         return self.weights.after(self.evaluation.share(self.membership.active()), self.members)
 
     def collected(self) -> int:

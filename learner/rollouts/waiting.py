@@ -128,7 +128,7 @@ class LearnerTime:
         return f"{done} (at most {plan.most_steps:,} env steps each); {who}"
 
     def _held_up_longest(self, members: list[Member], now: float) -> str:
-        """The worker that has been held up longest, among these members or, if other workers step for them, among those."""
+        """The worker held up longest: one of these members or, if other workers step for them, one of the other workers."""
         return max((held_up(member, now) for member in self._processes.stepping() or members), default=("nobody plays",))[-1]
 
 

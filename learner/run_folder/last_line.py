@@ -43,7 +43,7 @@ def last_line(program: str, error: BaseException, hints: Sequence[str] = (), *, 
 
 
 def users_code(error: BaseException) -> str:
-    """The FILE:LINE at which user code that the learner calls, such as an algorithm's loss, raised this; else empty.
+    """The FILE:LINE where user code called by the learner, such as an algorithm's loss, raised this; else empty.
 
     An error in a library counts as raised by the code that called the library.
     """

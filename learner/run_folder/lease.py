@@ -84,7 +84,7 @@ class Owner(msgspec.Struct, frozen=True, kw_only=True):
 def decoded(content: bytes) -> Owner | None:
     """The owner that this content describes; None if the content is cut off, or is just being written.
 
-    Its addresses are kept only if they are valid, because commands connect to them, and pages show them as words to type.
+    Its addresses are kept only if they are valid, because commands connect to them, and pages show them for people to type.
     """
     try:
         owner = msgspec.json.decode(content.strip(), type=Owner)

@@ -88,11 +88,11 @@ class Progress(RunProgress, frozen=True, kw_only=True):
         self.requests.log(name, value)
 
     def set_env_attr(self, name: str, value: Any) -> None:
-        """Set an attribute of every training env copy from the next version of the weights on, as for a curriculum.
+        """Set an attribute of every training env copy, for example for a curriculum, from the next weights on.
 
         `value` is plain data: numbers, text, lists, dicts or numpy arrays. Each rollout is collected with the attributes of
         its version, so the result is the same for any number of workers. Checkpoints save the attributes. Evaluations use
-        env copies without them. Raises `UsageError` if the value cannot be sent, and in `on_checkpoint` and `on_end`.
+        env copies without them. Raises `UsageError` if the value cannot be sent, and always in `on_checkpoint` and `on_end`.
         """
         if self.requests is None:
             raise UsageError(f"set_env_attr {name}: this is not the progress of a run")

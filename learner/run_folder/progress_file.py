@@ -1,8 +1,8 @@
 """progress.json: the progress of a run, written once a second while it trains. It shows when a killed run was last alive.
 
 Rule: nothing depends on this file. It is replaced atomically, but not flushed to the disk, because that would slow the
-training loop; a power failure may destroy it. Failed writes are not retried. Once the run has a summary, that is used
-instead.
+training loop; a power failure may destroy it. Failed writes are not retried. Once the run has a summary, the summary is
+used instead.
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ MOST_WAITING = 100_000  # limit on the records that wait to be written; that man
 
 
 class RecordFile:
-    """A file to which whole records are appended. A record that was written only in part is removed, and waits.
+    """A file to which whole records are appended. A record that was written only in part is removed and written again.
 
     If the file is no longer at its path, it is recreated there, with its folder.
     """

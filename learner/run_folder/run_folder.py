@@ -113,7 +113,7 @@ class PolicyDescription(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class StoredPolicy(NamedTuple):
-    """A policy read from its files. Reading imports none of the modules that they name; acting imports the encoder's."""
+    """A policy read from its files. Reading imports none of the modules they name; acting imports the encoder's module."""
 
     card: PolicyDescription
     parameters: Floats
@@ -158,7 +158,7 @@ class RunFolder:
         self.path = path
         self._made = made
         self._is_relative = False
-        self._workers_elsewhere = False  # the argument of this name that `write_config` last got
+        self._workers_elsewhere = False  # the value of this argument in the last call of `write_config`
         self.started_from = ""
         """See `RunFormat`."""
         self.writes = Writes()

@@ -68,7 +68,7 @@ class OrderCoordinator(Coordinator[Member]):
         self.shared_orders: dict[int, int] = {}
         """By lane, the number of its step through shared memory that is under way."""
         self.infos: dict[int, bytes] = {}
-        """By lane, the packed infos of that step, if they arrived as a message."""
+        """By lane, the packed infos of its step through shared memory, if they arrived as a message."""
         self.lost: dict[int, str] = {}
         """Lanes whose env copies are gone, with the reason, until the vector environment has handled them."""
         self._placement = LanePlacement(self.lanes, _by_name)
@@ -97,7 +97,7 @@ class OrderCoordinator(Coordinator[Member]):
         self.infos.pop(lane, None)
 
     def place(self, lane: int, patient: bool) -> bool:
-        """Assign the lane to a worker. Returns False if there is no worker, or if `patient` and each has a lane."""
+        """Assign the lane to a worker; if `patient`, only to one without a lane. Returns False if there is none."""
         if self.lanes[lane].owner is not None:
             return True
         candidates = [member for member in self.membership.active() if not (patient and member.lanes)]

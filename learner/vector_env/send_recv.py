@@ -263,7 +263,7 @@ class SendRecv:
             self._all_were_reset = bool(parts.ever_reset.all())
         if parts.autoreset == "Disabled":
             over = parts.batch.over
-            # Lanes with an unreported loss are left out, because the result of this step reports it.
+            # Lanes with an unreported loss are left out, because the result of this step reports the loss.
             if ended := [
                 n for n in parts.layout.copies_of(lane for lane in lanes if lane not in lost_lanes.unreported) if over[n]
             ]:
@@ -284,7 +284,7 @@ class SendRecv:
         return AskedReset(tuple(chosen), tuple(seeds[n] for n in copies), packed(of_lane))
 
     def _reset_instead(self, lane: int, reset: AskedReset, last_observations: Mapping[int, Any]) -> None:
-        """Reset the new copies of a lane that was lost, before it comes back."""
+        """Reset the new copies of a lost lane before the lane comes back."""
         self._sent.reset_instead(lane, reset, self._watched.look(self._parts.hub.now()), last_observations)
         self._parts.hub.send_order(lane, reset.order())
 

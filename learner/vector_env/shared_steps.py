@@ -1,8 +1,8 @@
 """Steps through shared memory: which lanes are under way, and how this program and its workers wake each other.
 
 Rule: a lane's step is done when the number of its answer equals the number of its order. Until then, this program neither
-reads nor writes the lane's memory. It also wakes a worker that it has sent a message, because the worker may be asleep until
-its next step.
+reads nor writes the lane's memory. It also wakes each worker to which it has sent a message, because the worker may be
+asleep until its next step.
 """
 
 from __future__ import annotations

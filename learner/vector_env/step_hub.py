@@ -75,7 +75,7 @@ class StepHub:
         self._listen_due_s = 0.0
         self._failure: Failed | None = None  # the first failure since the last `raise_failure`
         # Losing a worker costs the user episodes. So after this process was away, each worker gets its whole timeout to be
-        # heard again, instead of the server's short grace. After a long suspension, it must even reconnect.
+        # heard again, instead of the server's short grace. After a long suspension, a worker must even reconnect.
         settings = ServerSettings(grace_s=worker_timeout_s, log_tracebacks=False)
         self._server = MemberServer(link, self.coordinator, self, processes, settings, clock)
 

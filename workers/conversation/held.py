@@ -95,7 +95,7 @@ class HeldEvaluations(Held[Evaluate, Evaluated]):
 
 
 class HeldDescriptions(Held[Describe, Described]):
-    """Orders to describe an environment. Only the newest counts: tickets rise with every order."""
+    """Orders to describe an environment. Only the newest order counts. Each order has a higher ticket than the last."""
 
     def take(self, ticket: int, asked: Describe) -> Described | None:
         """Accept an order, and drop older ones; see `Held.take`."""
@@ -173,7 +173,7 @@ class Assignment:
     opponent: int | None = None
     """The opponent that plays the other teams in the episodes that begin in this rollout."""
     past: LanePast | None = None
-    """The past from which the lane continues if it isn't open in this incarnation; None: it begins its first episodes."""
+    """The past from which the lane continues if it isn't open in this incarnation. If None, it begins its first episodes."""
 
 
 class Permitted(NamedTuple):
@@ -185,7 +185,7 @@ class Permitted(NamedTuple):
     round: int
     opponent: int | None
     past: LanePast | None
-    """`round`, `opponent` and `past`: as in the `Permit`"""
+    """`round`, `opponent` and `past` mean the same as in a `Permit`"""
 
     def assignment(self, ticket: int, lane: int, incarnation: int) -> Assignment:
         """The `Assignment` of this rollout to a lane."""
@@ -218,7 +218,7 @@ class HeldRollouts(_HeldLanes[RolloutLane]):
     def take(self, permit: Permit, version: int) -> Rollout | None:  # rule RECEIVED
         """Accept a ticket to collect a rollout with this version of the weights.
 
-        If the rollout was collected already, but may have been lost on the way, returns it, to be sent again.
+        If the rollout was collected already, returns it to be sent again, because it may have been lost on the way.
         """
         lane = self._opened(permit.lane, permit.incarnation)
         if lane is None or (permit.sequence < lane.sequence and permit.ticket not in lane.answered):
@@ -258,7 +258,7 @@ class HeldRollouts(_HeldLanes[RolloutLane]):
 
 @dataclass
 class OrderLane(_HeldLane[Order, Answer]):
-    """The order of a lane, or the answer to it. Only the newest order counts: tickets rise with every order of a lane."""
+    """The order of a lane, or the answer to it. Only the newest order counts, which has the highest ticket."""
 
     newest: int = -1  # ticket
 

@@ -387,7 +387,7 @@ class Session:
         return self._leave(WorkerFailed(), 1, error, failure)
 
     def decline(self, reason: str, exit_code: int = EXIT_UNSUITABLE) -> list[WorkerEffect]:  # rule DECLINED
-        """Leave a run in which this worker can't take part. Pass another `exit_code` if it only can't take part now."""
+        """Leave a run in which this worker can't take part. Pass another `exit_code` if it may be able to later."""
         return self._leave(WorkerFailed(), exit_code, reason, Goodbye(self.session, one_line(reason), ()))
 
     def refused(self, reason: str) -> list[WorkerEffect]:  # rules REFUSE, AFTER_REFUSE

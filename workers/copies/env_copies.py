@@ -160,7 +160,7 @@ def check_spaces(run: RunSpec, copies: EnvCopies) -> None:  # rule OTHER_AGENTS
 
 
 def copy_seed(seed: int, lane: int, start: int, copy: int) -> int:  # rule INDEPENDENT
-    """The seed with which a copy of a lane is reset at its start with this number."""
+    """The seed for the reset of a lane's copy at its start number `start`."""
     return env_seed(seed, Purpose.COPIES, lane, start, copy)
 
 
@@ -250,7 +250,7 @@ class LoopedCopies:
         return env
 
     def _never_anew(self) -> str:
-        """Why copies are never recreated although the run asks for that; empty if they are, or if the run doesn't ask."""
+        """Why copies are never recreated although the run asks for it; empty if they are, or if it doesn't ask."""
         if not self._restart_episodes or self._loop.random_state(0) is not None:
             return ""
         return CANNOT_RESTART

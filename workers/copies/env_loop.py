@@ -46,7 +46,7 @@ CopyInfos = list[tuple[int, dict[str, Any]]]
 Pulse = Callable[[], None]
 """Called regularly during long work, so that the worker can answer the learner. It may raise to end the work."""
 
-CHECKED_STEPS = 2  # number of first steps in which the returned numbers are checked; two, because one may be a reset
+CHECKED_STEPS = 2  # in how many of the first steps numbers are checked; two, because one may be a reset
 PULSE_S = 0.05  # a loop over slow copies calls `pulse` at this interval
 
 
@@ -229,7 +229,7 @@ class EnvLoop:
         return reset_answer(self.envs[n].reset(seed=seed, **further))
 
     def _make_anew(self, n: int, seed: int | None) -> None:
-        """Close copy n, and recreate it. If `seed` is None, its next reset does what the old copy's would have done."""
+        """Close copy n, and recreate it. If `seed` is None, its next reset gives what the old one's would have given."""
         state = state_of(self._inner[n])
         if seed is None and state is None:
             return  # without a seed and a random state, a new environment couldn't continue like this one

@@ -15,8 +15,8 @@ from millrace.protocol.envs.seats import SeatedEnv
 from millrace.workers.copies.reset_ahead import ResetAhead
 
 BYTES = 16 + 16 + 4 + 1
-"""size of a packed state: PCG64's state, its increment, the half of a drawn number that is left over, and whether there is
-one
+"""size of a packed state: PCG64's state, its increment, the unused half of a number that was drawn, and whether there is
+such a half
 """
 ATTRIBUTES = ("_np_random", "np_random")
 """The attributes in which environments keep their generator: the first in gymnasium, the second in PettingZoo by convention.

@@ -94,7 +94,7 @@ class ResetAhead(gymnasium.Wrapper[Any, Any, Any, Any]):
         threading.Thread(target=prepare, name="reset-ahead", daemon=True).start()
 
     def instances(self) -> tuple[gymnasium.Env[Any, Any], gymnasium.Env[Any, Any]]:
-        """The instance that plays, and the other one, whose reset, if any, is waited for."""
+        """The instance that plays, and the other one. Waits for a reset of the other one to end."""
         if self._prepared is not None:
             with suppress(BaseException):  # the next call of `reset` raises it
                 self._prepared.result()

@@ -1,8 +1,8 @@
 """Environments that can save their state, with methods `save_state() -> bytes` and `load_state(bytes)`.
 
-Rule: the environment or one of its wrappers may have these methods. Wrappers outside of the object that has them must be
-stateless, or have a state that is known here: `TimeLimit` counts steps. With any other wrapper outside, the environment
-counts as one that cannot save. The state of `np_random` is kept in addition to the saved state. Nothing is unpickled here;
+Rule: the environment or one of its wrappers may have these methods. Wrappers around the object with the methods must be
+stateless, or have a state that is known here: `TimeLimit` counts steps. With any other wrapper around it, the environment
+counts as unable to save. The state of `np_random` is kept in addition to the saved state. Nothing is unpickled here;
 what `load_state` does with its bytes is up to the environment.
 """
 
@@ -37,7 +37,7 @@ class SavedCopy(msgspec.Struct, frozen=True, array_like=True):
     random: bytes | None
     """state of the environment's `np_random`; None if it cannot be read"""
     elapsed: tuple[int, ...]
-    """number of steps that each `TimeLimit` outside has counted, the outermost first"""
+    """number of steps that each `TimeLimit` around the object that saves has counted, the outermost first"""
 
 
 class CannotSave(Exception):
@@ -97,7 +97,7 @@ def _saver(env: gymnasium.Env[Any, Any]) -> Any:
 
 
 def _limits(env: gymnasium.Env[Any, Any], outermost: Any) -> list[Any]:
-    """The `TimeLimit` wrappers outside of the object that saves, the outermost first."""
+    """The `TimeLimit` wrappers around the object that saves, the outermost first."""
     limits = []
     inner: Any = env
     while inner is not outermost:

@@ -87,7 +87,7 @@ class SplitVectorEnv:
         self._missing: set[tuple[int, str]] = set()  # attributes that replacements of lost copies may lack
 
     def open_lane(self, run: RunSpec, lane: int, pulse: Pulse) -> EnvCopies:
-        """The copies of this lane. A `Collector` takes this method as its `open_copies`."""
+        """The copies of this lane. Pass this method to a `Collector` as its `open_copies`."""
         self._count = run.copies
         return SplitLane(self, lane * run.copies, run.copies)
 
@@ -96,7 +96,7 @@ class SplitVectorEnv:
         return SplitLane(self, self.env.num_envs - count, count)
 
     def parts(self, lanes: int) -> Sequence[slice]:
-        """Parts of consecutive lanes, as equal as possible, and none without a lane."""
+        """Divide the lanes into parts of consecutive lanes, as equal as possible. No part is empty."""
         ends = [lanes * (i + 1) // self.in_parts for i in range(self.in_parts)]
         return [slice(begin, end) for begin, end in zip([0, *ends[:-1]], ends, strict=True) if end > begin]
 
@@ -125,7 +125,7 @@ class SplitVectorEnv:
                 self._result = self._ended(lanes, self._copies_of(lanes), pulse)
 
     def step_evaluation(self, first: int, copies: Sequence[int], actions: Array, pulse: Pulse) -> None:
-        """Step copies that are used for evaluation; `copies` are counted from the first of these, which is copy `first`."""
+        """Step evaluation copies. `copies` are counted from the first evaluation copy, which is copy `first`."""
         lanes = [self._lanes + n for n in copies]
         chosen = [first + n for n in copies]
         self._order(lanes, chosen, actions, pulse)
@@ -240,7 +240,7 @@ class SplitVectorEnv:
             return False
 
     def _assign_again(self, stepped: set[int], pulse: Pulse) -> None:
-        """Set the attributes that these copies may lack, before they are stepped. Copies that may be stepping come later.
+        """Before these copies are stepped, set the attributes that they may lack. Those that may be stepping are left for later.
 
         If a worker is lost meanwhile, the next step tries again.
         """

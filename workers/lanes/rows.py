@@ -142,7 +142,7 @@ class RowsOfLane:
         self.lane.state = self.state.copy()
 
     def resets_in(self, rows: int) -> int:
-        """How many steps of copies in this many rows belong to no episode."""
+        """How many steps of copies in the first `rows` rows belong to no episode."""
         if self.lane.seats is not None or not self.lane.autoresets:
             return int(np.count_nonzero(self.resets[:rows]))
         if not rows:

@@ -44,7 +44,7 @@ POLL_S = 0.1
 ENFORCE_EVERY_S = 0.2
 STOP_WITHIN_S = 3.0  # how long local workers may take to end after SIGTERM at the end of a run, before they are killed
 FINISH_ROLLOUT_WITHIN_S = 30.0  # time for the rollout in progress after a request to leave, if environment calls return
-HANGS_AFTER_S = 8.0  # once workers were asked to leave, or the run is over: a longer call of the environment hangs
+HANGS_AFTER_S = 8.0  # a longer call of the environment hangs, once workers were asked to leave or the run is over
 
 
 class Running(Protocol):

@@ -38,7 +38,7 @@ popen = subprocess.Popen  # tests replace this to start workers in another way
 
 NONCE_VARIABLE = "MILLRACE_WORKER_NONCE"
 WRITE_STACKS_S = 0.3  # time for writing stacks, from the signal until the worker is killed
-CLOSE_ENVS_WITHIN_S = 5.0  # once a worker has announced that it leaves: time for closing its environments and ending
+CLOSE_ENVS_WITHIN_S = 5.0  # how long a worker may close its environments after it has announced that it leaves
 KILLED_WITHIN_S = 5.0  # how long to wait for processes to end after SIGKILL
 POLL_S = 0.02
 LONGEST_OUTPUT = 1 << 20  # at most this many bytes are read, from the end of a log
@@ -283,7 +283,7 @@ class WorkerProcess:
                 self._log_from = keep_short(self._log, self._log_from)
 
     def _write(self, stacks: str) -> None:
-        """Write why the worker is ended, and its stacks, where the worker's output goes."""
+        """Append to the worker's output the reason for ending the worker, and its stacks."""
         text = f"worker {self.name} {self._because}\n{stacks}"
         with suppress(OSError):
             if self._log is None:
