@@ -1,6 +1,6 @@
 """The objects in extras that settings and public functions start. The core imports an extra only when it is needed.
 
-Rule: each entry is `module:name`, and the caller declares the type of the object, which the core defines. The core has
+Rule: each entry is `module:name`. The core defines the type of each object, and the caller declares it. The core has
 similar tables for the other contributions of extras: commands (`millrace/cli/commands.py`), kinds of env copies
 (`protocol/envs/kinds_of_copies.py`) and environments (`protocol/env_spec.py`). It names extras nowhere else.
 """

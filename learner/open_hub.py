@@ -37,7 +37,7 @@ def open_hub(
 
     An update uses one rollout of each lane. `check_interrupt` is called while the hub waits, and an exception that it raises
     ends the wait. `observer` is called each time the hub has listened. `past` is from the checkpoint of a resumed run.
-    `opponents` are those of a run with teams.
+    `opponents` is the pool of a run with teams.
     """
     past = past or PastRollouts(Ledger(), ())
     rounds = Rounds(config.max_lag, past.rounds.next, past.rounds.versions)

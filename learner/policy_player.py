@@ -1,7 +1,7 @@
 """A learner that doesn't train, but has workers play episodes with the policy of a run folder.
 
 Rule: the policy is published once, as version 1; a policy that plays against it is published as version 0. The learner's
-process runs no environment code. Timeouts and the number of allowed failures are those of a training run.
+process runs no environment code. Timeouts and the number of allowed failures are the same as in training.
 """
 
 from __future__ import annotations

@@ -31,7 +31,7 @@ def rollout_spec(
     """The specification that `Welcome` sends to workers.
 
     `rollout_steps` is T, the number of steps of a rollout. `extras` are additional arrays of a rollout, which the user's own
-    policy returns. `spaces` are those of the environment. `teams` and `scripted` are those of a run with opponents. Raises
+    policy returns. `spaces` are those of the environment. `teams` and `scripted` are for a run with opponents. Raises
     `UsageError` if the specification cannot be sent, or if settings, environment and policy do not fit together.
     """
     masked, seats = spaces.masked, spaces.seats

@@ -32,7 +32,7 @@ WORTH_A_THREAD = 1 << 25
 
 _lock = Lock()
 _inside: list[list[ExitStack]] = []
-"""For each `one_thread` that was entered and not left, in order: the stack that restores the previous numbers of threads."""
+"""Each `one_thread` context that was entered and not left, in order, as a stack that restores the earlier thread numbers."""
 
 
 @contextmanager

@@ -112,8 +112,8 @@ class Slots:
 
 
 _of_processes: dict[int, Slots] = {}
-"""The keys are process ids: a fork needs its own `Slots`, because it shares the open file of its parent, and so
-the locks.
+"""The keys are process ids: a fork needs its own `Slots`, because it shares the open file of its parent, and
+with it the locks.
 """
 
 

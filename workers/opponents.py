@@ -100,7 +100,7 @@ class OtherTeams:
         self._state = zero_state(run.opponent or run.policy, len(self.mine))  # [N · A, S]
 
     def act(self, obs: Sequence[Array], acts: Bools, taken: Array) -> None:
-        """In `taken` [N · A, *action], replace the actions of acting seats of other teams by those of their opponents.
+        """In `taken` [N · A, *action], replace the actions of the other teams' acting seats with the opponents' actions.
 
         `obs` are [N · A, *leaf] each, and `acts` [N · A] says which seats act.
         """

@@ -39,7 +39,7 @@ LEAVE_AT_ONCE = 2  # number of requests to leave after which the rollout in prog
 LOOK_FOR_PARENT_S = 0.5
 LEAVE_ORPHANED_WITHIN_S = 2.0  # time for leaving after the supervisor has died
 CLOSED_WITHIN_S = 1.0  # seconds within which the sockets of a killed process are closed
-AFTER_SUPERVISOR_S = 60.0  # a worker that hangs is ended by the watchdog this long after the supervisor should have done so
+AFTER_SUPERVISOR_S = 60.0  # how long after the supervisor should have ended a hung worker the watchdog ends it
 
 
 def work(flags: WorkerFlags, token: Token | None, signals: list[int]) -> int:

@@ -260,7 +260,7 @@ def the_same_seed_and_batches_give_the_same_bits(subject: Subject) -> Iterator[s
 
 
 def a_saved_state_goes_on_as_if_nothing_had_happened(subject: Subject) -> Iterator[str]:
-    """Check that a new object that loads a saved state goes on learning as the saved one does, bit for bit."""
+    """Check that a new object that loads a saved state learns on exactly as the saved object does, bit for bit."""
     *first, second, third = subject.copies()
     saved = subject.new()
     restored = subject.new()

@@ -104,8 +104,8 @@ def with_other_invalid_rows(batch: Batch, generator: np.random.Generator) -> Bat
 def with_waiting_seats(batch: Batch) -> Batch:
     """The same rows, as if seats had to wait for one step before the outcome of each action is known.
 
-    Each row becomes two rows, and in the first of these the seat waits. Where a row only resets, the reset is the first of
-    the two.
+    Each row becomes two rows. In the first of these, the seat waits. If the row only resets a copy, the first of its two
+    rows is the reset.
     """
     T, columns = batch.valid.shape
     waits = np.zeros_like(batch.valid)

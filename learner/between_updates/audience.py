@@ -136,7 +136,7 @@ class Audience:
         self._callbacks.on_end(msgspec.structs.replace(self.progress(), stop_reason=reason, cut_short=cut_short))
 
     def env_attributes(self) -> Array | None:
-        """The attributes of env copies that callbacks have set, for the weights of the newest version."""
+        """The attributes that callbacks have set on env copies, to be sent with the newest weights."""
         return self._requests.attributes.table(self._state.version)
 
     def progress(self) -> Progress:
@@ -146,7 +146,7 @@ class Audience:
     # ---------------------------------------------------------------- inside
 
     def _progress(self, snapshot: HubSnapshot, collected: int = 0) -> Progress:
-        """The progress at this snapshot. `collected` are the env steps already made for the next update."""
+        """The progress at this snapshot. `collected` is the number of env steps already made for the next update."""
         state = self._state
         tally = self._tally
         wall_s = self._tally.wall_s(snapshot)

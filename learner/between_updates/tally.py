@@ -102,7 +102,7 @@ class Tally:
     def updated(self, seconds: float) -> None:
         """Count the time of an update: the `seconds` from the arrival of its rollouts until its weights were published.
 
-        These seconds include the time that callbacks and the dataset took for the rollouts, which is subtracted.
+        They include the time that callbacks and the dataset took for the rollouts. That time is subtracted here.
         """
         self._update_s += seconds - self.gathered_s
 

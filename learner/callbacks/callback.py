@@ -1,7 +1,7 @@
 """The base of a user's callbacks. Its methods are the moments of a run at which callbacks are called.
 
-Rule: a callback runs in the learner's process and thread, between two steps of the run, so the run waits for it. Workers
-may already be collecting the next rollouts meanwhile.
+Rule: a callback runs in the learner's process and thread, between two steps of the run, so the run waits for it.
+Meanwhile, workers may already be collecting the next rollouts.
 """
 
 from __future__ import annotations

@@ -26,7 +26,7 @@ from millrace.protocol.messages import TOLD_TO_STOP, Describe, Described, Goodby
 from millrace.protocol.progress import RunProgress
 from millrace.protocol.specs import WaitSpec
 
-# Far from a run's tickets, because a worker may still be describing the environment when the run begins.
+# Far above a run's ticket numbers, because a worker may still be describing the environment when the run begins.
 FIRST_TICKET = 1 << 51
 
 Accept = Callable[[DescribedEnv], None]

@@ -45,7 +45,7 @@ L = TypeVar("L", bound=PlacedLane)
 
 
 def is_spare(member: Member, lanes: Iterable[PlacedLane]) -> bool:
-    """Whether the run doesn't need this worker: it may have lanes but has none, and every lane has a worker."""
+    """Whether the run doesn't need this worker: it could have lanes but has none, and every lane has a worker."""
     return not (member.hello.evaluates or member.lanes) and all(lane.owner is not None for lane in lanes)
 
 

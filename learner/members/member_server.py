@@ -123,7 +123,7 @@ class MemberServer:
         self._encoded: tuple[ToWorker, Sequence[Buffer]] | None = None
         self._joins = JoinLimiter()
         self._read_since_empty = 0  # number of messages read since the inbox was last empty
-        self._status: tuple[float, Sequence[Buffer]] = (-math.inf, ())  # until when the status is fresh, and its frames
+        self._status: tuple[float, Sequence[Buffer]] = (-math.inf, ())  # time until which it is fresh, and its frames
         self.unexpected_errors = 0
         """number of errors of this program that a peer's message caused; each cost only that peer its membership"""
 

@@ -74,7 +74,7 @@ class EvaluationPlan:
         return EvaluationPlan(episode_seeds(seed, episodes, purpose), copies, most_steps, of_best=of_best)
 
     def how_far(self, played: int, env_steps: int, bound: str = "at most", before: tuple[int, int] = (0, 0)) -> str:
-        """The evaluation's progress in words. `env_steps` are those of the `played` episodes and of the running ones.
+        """The evaluation's progress in words. `env_steps` includes the steps of running episodes.
 
         `bound` introduces the largest number of steps, for example with the name of a flag. `before` are the episodes and
         env steps of earlier plans.
@@ -240,7 +240,7 @@ class EvaluationDealer:
         Returns what is wrong with it, or an empty string. The ticket of a wrong answer goes to another worker.
         """
         if not self._plays(member, answer.ticket):
-            return ""  # the answer is a repetition, or came after the end or after another worker's answer
+            return ""  # the answer is a repeat, or arrived after the end or after another worker's answer
         index = answer.ticket - self._first
         if why := self._wrong(answer, len(self._seeds[index])):
             self.lose(member, answer.ticket)
@@ -299,7 +299,7 @@ class EvaluationDealer:
         return Counter(member.peer for member in [*self.held.values(), *self.second.values()])
 
     def _who_may_play(self, members: Sequence[Member], plan: EvaluationPlan) -> list[Member]:
-        """The workers among these that may play. A worker that was late may play only if all were.
+        """The workers among these that may play. A worker that was late may play only if all were late.
 
         Workers that only evaluate come first. If copies are limited, only the first workers play, because a worker keeps its
         copies.

@@ -1,4 +1,4 @@
-"""The hub: it joins link, ticket coordinator and clock, and lets a training loop gather rollouts and publish weights.
+"""The hub: it connects link, ticket coordinator and clock, and lets a training loop gather rollouts and publish weights.
 
 `millrace.learner.train` deals with workers only through the hub, and so does `millrace.RolloutService` for your own loop. A
 loop waits only in `wait_for`, `gather`, `end_evaluation` and `drain`. Rule: every wait has a deadline, and the log says what

@@ -33,7 +33,7 @@ class _OfRound:
 
 @dataclass
 class LaneHistory:
-    """The past of one lane of N env copies with A seats each, which grows with each rollout."""
+    """The past of one lane, which grows with each rollout. The lane has N env copies with A seats each."""
 
     copies: list[LastEpisode]
     """[N] the newest episode of each copy; rows are counted since the history began"""
@@ -172,7 +172,7 @@ class LaneHistory:
 
 
 def _needed_from(last: LastEpisode) -> int:
-    """The first row needed to replay an episode: the one that reset the copy, because the attributes at that time matter."""
+    """The first row needed to replay an episode. It is the row of the reset, because the attributes at that time matter."""
     return last.first - 1 if last.random and last.is_repeated else last.first
 
 

@@ -252,7 +252,7 @@ class RolloutDealer:
         return lane.past(self.histories, waiting)
 
     def _drop_after(self, lane: TicketedLane, first: int) -> None:
-        """Drop the lane's rollouts after round `first`, which was lost: they don't continue the rollout that replaces it."""
+        """Drop the lane's rollouts after round `first`. It was lost, and they don't continue the one that replaces it."""
         for number in [number for number in self.ready if number > first and lane.number in self.ready[number]]:
             dropped = self.ready[number].pop(lane.number)
             self.ledger.lost += 1

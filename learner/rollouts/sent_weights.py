@@ -164,7 +164,7 @@ class SentWeights:
         return out + weights
 
     def again(self, member: CollectingMember, heartbeat: Heartbeat) -> list[Outgoing]:
-        """The weights to send again: those that unfinished tickets name and that, according to this heartbeat, were lost."""
+        """The weights to send again, because this heartbeat shows that they were lost and unfinished tickets need them."""
         self.held.hear(member, heartbeat)
         lost = sorted(self.held.needs(member, heartbeat.tickets) - self.held.versions(member.peer))
         return [message for version in lost for message in self._send(member, version, None)]

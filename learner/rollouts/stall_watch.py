@@ -21,7 +21,7 @@ from millrace.learner.rollouts.collecting_member import CollectingMember
 from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
 from millrace.protocol.call_timeouts import CallTimeouts
 
-ENDED_WITHIN_S = 5.0  # how long after the timeout of a call the learner may hear that the worker was ended
+ENDED_WITHIN_S = 5.0  # how long after a call's timeout the learner may hear that the worker was ended
 CHECK_BUDGETS_EVERY_S = 1.0
 
 

@@ -1,10 +1,10 @@
 """A line that says who waits for whom in a run, and for what share of the time. Pure: the state and `now` in, a line out.
 
-Rule: waits shorter than `LONG_S` aren't mentioned. Between two long waits for rollouts, the line mentions the last one, so
+Rule: waits shorter than `LONG_S` aren't mentioned. Between two long waits for rollouts, the line mentions the last wait, so
 that the text does not appear and disappear all the time. While the learner waits, the line names the lanes whose rollouts
 are missing for the next update, and says how many of that update's env steps have been made, because with a slow simulator
 the first update may be far away. While the learner learns, the line says how many workers wait for weights. The shares are
-those of training time since the learner started, without evaluations.
+fractions of the training time since the learner started, without evaluations.
 """
 
 from __future__ import annotations

@@ -32,7 +32,7 @@ class EpisodeWindow:
 
     @staticmethod
     def from_state(episodes: list[Episode], had: Sequence[str] = (), facts: Sequence[str] = ()) -> EpisodeWindow:
-        """The window with these episodes. `had` are the names of their facts, and `facts` those of new episodes."""
+        """The window with these episodes. `had` are the names of their facts; new episodes have `facts`."""
         if tuple(had) != tuple(facts):
             by_name = (dict(zip(had, one.facts, strict=False)) for one in episodes)
             renamed = (tuple(of_one.get(name, math.nan) for name in facts) for of_one in by_name)

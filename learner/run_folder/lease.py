@@ -1,4 +1,4 @@
-"""The lease behind a run's lock, which lapses unless the lock's owner renews it, and the content of the lock file. Pure.
+"""The lease behind a run's lock, and the content of the lock file. The lease lapses unless the owner renews it. Pure.
 
 Rule: a living owner rewrites the lock file every few seconds, with a new count. An observer doesn't compare the clocks of
 two machines; it measures with its own clock how long the content stays the same.

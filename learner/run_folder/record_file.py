@@ -28,7 +28,7 @@ class RecordFile:
         self._path = run / name
         self._waiting: deque[bytes] = deque(maxlen=MOST_WAITING)
         self._bytes = 0
-        self._cut = 0  # how many bytes at the end of the file the first waiting record replaces
+        self._cut = 0  # number of bytes at the end of the file that the first waiting record replaces
         self._open()
 
     @property

@@ -4,7 +4,7 @@
       config.toml           all settings of the run
       run.json              the format of the folder (run_format.py)
       metrics.jsonl         a row per update (metrics_log.py)
-      tensorboard/    the same for TensorBoard, if requested
+      tensorboard/          the same for TensorBoard, if requested
       checkpoints/          from which the run can be resumed (checkpoint.py)
       policy.safetensors    the arrays of the acting policy, by name
       best.safetensors      the same for the best policy in the run's own evaluations

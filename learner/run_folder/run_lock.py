@@ -43,7 +43,7 @@ class Pace(NamedTuple):
     dead_after: float = 30.0
     look_every: float = 0.5
     confirm_after: float = 1.0
-    """How long after taking over a lock from another machine to check whether a third machine took it at the same time."""
+    """How long to wait, after taking over another machine's lock, before checking that no third machine took it too."""
 
 
 PACE = Pace()
@@ -53,7 +53,7 @@ WHY_UNREACHABLE = {
         "with --transport tcp and --keys, the keys of its local workers are not in any file; run it with --transport ipc"
     ),
 }
-JOIN_S = 5.0  # how long to wait for the thread at the end, which a file system that doesn't answer must not block
+JOIN_S = 5.0  # how long to wait for the thread at the end: a file system that doesn't answer must not block it
 
 
 class RunLock:
@@ -339,7 +339,7 @@ def _is_gone(owner: Owner) -> bool:
 
 
 def _has_our_numbers(owner: Owner) -> bool:
-    """Whether this process can look up the owner's process number: both are on one machine, in the same container."""
+    """Whether this process can look up the owner's process number, because both are in one container of one machine."""
     return owner.boot_id == _boot() and owner.pid_namespace == _namespace(NUMBERS)
 
 

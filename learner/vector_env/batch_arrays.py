@@ -27,7 +27,7 @@ class BatchArrays:
     def __init__(
         self, spec: StepSpec, layout: BatchLayout, observation_space: gymnasium.Space[Any], memory: SharedMemory | None
     ) -> None:
-        """`observation_space` is that of a single row. `memory` is shared with local workers."""
+        """`observation_space` is the space of a single row. `memory` is shared with local workers."""
         N = layout.rows[-1].stop
         self._layout = layout
         self._nest = make_unflatten(observation_space)

@@ -41,7 +41,7 @@ class CopyCalls:
         return _results(name, self._answers(call_orders(self._parts.layout, copies, name, args, kwargs)))
 
     def assign(self, copies: Sequence[int], name: str, values: Sequence[Any]) -> None:
-        """Set an attribute of these copies, which are in ascending order, to one value each."""
+        """Set an attribute of these copies, to one value each. `copies` are in ascending order."""
         _results(name, self._answers(assign_orders(self._parts.layout, copies, name, values)))
 
     def describe(self, copies: Sequence[int]) -> list[DescribedEnv | None]:
@@ -90,7 +90,7 @@ def call_orders(
 
 
 def assign_orders(layout: BatchLayout, copies: Sequence[int], name: str, values: Sequence[Any]) -> dict[int, MakeOrder]:
-    """Orders, by lane, that assign one value to each of these copies, which are in ascending order.
+    """Orders, by lane, that assign one value to each of these copies. `copies` are in ascending order.
 
     Raises `UsageError` for a name that no message can carry, and `TypeError` for a value that no message can carry.
     """

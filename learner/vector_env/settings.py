@@ -53,7 +53,7 @@ class VectorEnvSettings:
     wrappers: Sequence[WrapperLike] = ()
     """Wrappers of every env copy, the innermost first."""
     single_lanes: int = 0
-    """Number of additional copies for evaluations, which follow the others. Each is a lane of its own, which can be stepped
+    """Number of additional copies for evaluations, which follow the others. Each is a lane of its own, and can be stepped
     alone with `ZmqVectorEnv.step_async`.
     """
     evaluates: bool = False

@@ -59,7 +59,7 @@ class RequestedCopies:
 
     @property
     def to_describe(self) -> Unknown:
-        """The environment that a worker describes: that of the first copy. All copies must have the same spaces."""
+        """The environment of the first copy, for a worker to describe. All copies must have the same spaces."""
         return Unknown(self.envs[0], render_mode=self.render_mode)
 
     @property

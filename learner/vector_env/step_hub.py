@@ -102,7 +102,7 @@ class StepHub:
         self.shared.step(lanes, together=together)
 
     def can_share(self, lane: int) -> bool:
-        """Whether a step of this lane may go through shared memory: its worker has the memory, and the lane has no order.
+        """Whether a step of this lane may use shared memory: its worker must have the memory, and the lane no order.
 
         The lane still has an order if the wait for the answer was interrupted. The worker might execute that order after the
         step.
@@ -136,7 +136,7 @@ class StepHub:
         """The infos of a lane's step that are too long for the shared memory; None if they have not arrived yet."""
         infos = self.coordinator.infos.get(lane)
         if infos is None and not self.coordinator.lanes[lane].started:
-            return b""  # its worker is gone, and the lane is in `OrderCoordinator.take_lost`
+            return b""  # its worker is gone, and `OrderCoordinator.take_lost` returns the lane
         if infos is None:
             self._infos_to_come.add(lane)
         return infos

@@ -60,7 +60,7 @@ class Collector:
         open_copies: OpenEnvCopies = open_env_copies,
         together: TogetherSteps | None = None,
     ) -> None:
-        """`together`: steps the env copies of all lanes at once, if one vector environment holds them all."""
+        """`together` steps the env copies of all lanes at once, if one vector environment holds them all."""
         self.note = ""
         """what the user should know about the environment, once a lane has seen it"""
         self.env_attributes = b""
@@ -99,7 +99,7 @@ class Collector:
     ) -> list[Rollout]:
         """Collect one rollout for each assignment. Returns them in the order of the assignments.
 
-        Each assignment must name a different lane. `held`: the available weights, by version, including those of new
+        Each assignment must name a different lane. `held` has the available weights, by version, including those of new
         opponents. `pulse` is called at every step and may raise. If `pulse` raises, or an environment does
         (`EnvironmentFailed`), these lanes are closed and the unfinished rollouts are dropped.
         """
@@ -178,7 +178,7 @@ class Collector:
     def _rollout(
         self, rows: RowsOfLane, state: Floats, acted: ActedRows, assignment: Assignment, version: int, session: int
     ) -> Rollout:
-        """The rollout of a lane, made of views of its rows. `state`: the policy's state before the first row."""
+        """The rollout of a lane, made of views of its rows. `state` is the policy's state before the first row."""
         lane = rows.lane
         masked = self._run.masked
         axes = self._run.row_axes

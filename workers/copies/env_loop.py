@@ -42,7 +42,7 @@ from millrace.workers.copy_slots import Dress, as_made, close_copy, make_copy
 
 Autoreset = Literal["NextStep", "SameStep", "Disabled"]
 CopyInfos = list[tuple[int, dict[str, Any]]]
-"""Pairs of a copy's number and its info, for each info that isn't empty. Dicts and arrays in it are copied; see `_kept`."""
+"""Pairs of a copy's number and its info, for each info that isn't empty. Its dicts and arrays are copies (`_kept`)."""
 Pulse = Callable[[], None]
 """Called regularly during long work, so that the worker can answer the learner. It may raise to end the work."""
 

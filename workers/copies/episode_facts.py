@@ -47,7 +47,7 @@ def facts_of_copies(names: Sequence[str], infos: Mapping[str, Any], count: int) 
 
 
 def of_ended(table: Array, ended: Array) -> Facts:
-    """For each copy whose episode has ended, as `ended` [N] says: its row of the table [N, names]."""
+    """For each copy whose episode has ended (`ended` [N]), its row of the table [N, names]."""
     return {int(n): tuple(table[n].tolist()) for n in np.flatnonzero(ended)}
 
 

@@ -60,7 +60,7 @@ class OpenLanes(dict[int, L]):
         return lane
 
     def close(self, lanes: Iterable[int]) -> None:
-        """Close whichever of these lanes are open: immediately, or, within `in_use`, at its end."""
+        """Close these lanes if they are open: immediately or, inside `in_use`, at the end of that context."""
         for number in lanes:
             if number == self._opening:
                 self._opening = None

@@ -61,9 +61,9 @@ class SplitVectorEnv:
     ) -> None:
         """`before_wait` is called before each wait for the vector environment, with the `pulse` to call during the wait.
 
-        `some`: the same vector environment, if it can step some lanes while others wait; it may then have further lanes, for
-        evaluation. `facts`: names of the numbers in `info` that describe an episode. `masked`: read masks of the allowed
-        actions.
+        `some` is the same vector environment, if it can step some lanes while others wait; it may then have further lanes,
+        for evaluation. `facts` are the names of the numbers in `info` that describe an episode. If `masked`, read masks of
+        the allowed actions.
         """
         self.env = env
         self.in_parts = 1 if some is None else min(lanes, 2)
@@ -162,7 +162,7 @@ class SplitVectorEnv:
         return self._read_result(self._wait(lambda: end_step(lanes), pulse), copies)
 
     def _read_result(self, returned: Any, copies: slice | list[int]) -> StepResult:
-        """What a step of these copies returned. It has a row for each copy of the vector environment."""
+        """The result of a step of these copies. It has a row for each copy of the vector environment."""
         observation, reward, terminated, truncated, infos = returned
         if self._assigned and "worker_lost" in infos:
             self._missing.update(self._assigned)
@@ -240,7 +240,7 @@ class SplitVectorEnv:
             return False
 
     def _assign_again(self, stepped: set[int], pulse: Pulse) -> None:
-        """Before these copies are stepped, set the attributes that they may lack. Those that may be stepping are left for later.
+        """Before these copies are stepped, set the attributes that they may lack. Copies that may be stepping must wait.
 
         If a worker is lost meanwhile, the next step tries again.
         """

@@ -43,7 +43,7 @@ ROWS_AT_ONCE = 16
 """Number of rows that are played before a check: enough to amortize its cost, and few enough to find wrong values early."""
 
 OpenEvaluationCopies = Callable[[RunSpec, int, str | None, Pulse], EvaluationCopies]
-"""Makes this many copies of a run's environment, with this render mode (None: none)."""
+"""Makes this many copies of a run's environment, with this render mode if it isn't None."""
 
 
 def open_looped_copies(run: RunSpec, count: int, render_mode: str | None, pulse: Pulse) -> EvaluationCopies:
@@ -164,7 +164,7 @@ class Evaluator:
     def _opened(self, count: int, render_mode: str | None, pulse: Pulse) -> EvaluationCopies:
         """At least `count` copies with this render mode; opened if necessary.
 
-        Raises `UsageError` if their spaces are not those of the run.
+        Raises `UsageError` if their spaces differ from the run's spaces.
         """
         copies = self._copies.get(render_mode)
         if copies is not None and copies.count >= count:

@@ -67,7 +67,7 @@ class Rows:
 
     @property
     def are_over(self) -> bool:
-        """Whether no further step will be made: these rows are of an evaluation, and all its episodes have ended."""
+        """Whether no further step will be made, because these rows are of an evaluation whose episodes have all ended."""
         return not any(each.lane.autoresets or np.count_nonzero(each.lane.playing) for each in self.of_lanes)
 
     def begin_row(self) -> None:
@@ -151,9 +151,9 @@ class RowsOfLane:
         return int(np.count_nonzero(self.resets[0]) + np.count_nonzero(ended))
 
     def acted(self, t: int, written: Sequence[Array], before: Floats, taken: Array) -> None:
-        """With seats: keep what the policy wrote at step t only for seats that act, and let the opponents act.
+        """With seats, keep what the policy wrote at step t only for seats that act, and let the opponents act.
 
-        `before`: the policy's state before this step. `taken`: the actions [N · A, *action] for the environment.
+        `before` is the policy's state before this step. `taken` are the actions [N · A, *action] for the environment.
         """
         lane = self.lane
         assert lane.seats is not None
@@ -181,7 +181,7 @@ class RowsOfLane:
             self._show_playing(t)
 
     def _step_playing(self, actions: Array, pulse: Pulse) -> StepResult:
-        """Step the copies whose episodes continue. Returns the result of the lane's copies only: there may be others."""
+        """Step the copies whose episodes continue. Returns the result without copies that the lane doesn't use."""
         lane = self.lane
         copies: EvaluationCopies = lane.copies  # type: ignore[assignment]
         playing = lane.playing.nonzero()[0].tolist()
@@ -207,7 +207,7 @@ class RowsOfLane:
                 self.columns.complete[still] = False
 
     def _lose(self, t: int, lost: Bools) -> None:
-        """Truncate the episodes of these copies [N], which were lost in step `t`, at the last step that was made.
+        """Some copies were lost in step `t` (`lost` [N]). Truncate their episodes at the last step that was made.
 
         Rows `t` and `t + 1` are then not valid, because step `t` was not made. In an evaluation, raises `EpisodesLost`,
         because its episodes must be complete.

@@ -71,7 +71,7 @@ class LaneRunner:
     """Steps lanes with the actions of one policy."""
 
     def __init__(self, run: RunSpec, policy: Policy | CalledPolicy, together: TogetherSteps | None = None) -> None:
-        """`together`: steps the env copies of all lanes at once, if one vector environment holds them all."""
+        """`together` steps the env copies of all lanes at once, if one vector environment holds them all."""
         self.acting = acting_of(run, policy)
         self.stages: Stages = {"open": 0.0, "act": 0.0, "step": 0.0}
         """seconds spent opening lanes (making copies and their first reset), choosing actions and stepping copies"""

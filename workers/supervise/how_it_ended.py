@@ -16,8 +16,8 @@ class Ending:
     on_purpose: bool = False
     """Whether the worker announced that it would leave with this code."""
     failed: bool = False
-    """Whether the environment, the policy, or the worker is to blame: the worker did not end on purpose, and had begun to
-    run their code.
+    """Whether this counts as a failure of the environment, the policy or the worker: the worker did not end on purpose, and
+    had begun to run user code.
     """
     of_policy: bool = False
     """Whether the worker failed in a call of the policy."""

@@ -36,7 +36,7 @@ EVERY_S = 1.0  # interval between two reports
 EVERY_S_WHILE_SLOW = 0.4  # the interval while a call of an environment takes longer than `SLOW_S`
 SLOW_S = 0.3  # during a longer call, the worker can't send heartbeats, and the learner relies on these reports
 ENDED_AFTER_S = 0.2  # a worker that left on purpose is named this long after its end
-ENDED_FOR_S = 5.0  # a worker is named until this long after its end
+ENDED_FOR_S = 5.0  # for how long after its end a worker is named
 
 
 class AliveSender:

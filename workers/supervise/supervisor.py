@@ -43,8 +43,8 @@ GIVEN_UP = f"; after {MOST_FAILED_STARTS} such ends it is not started again"
 POLL_S = 0.1
 ENFORCE_EVERY_S = 0.2
 STOP_WITHIN_S = 3.0  # how long local workers may take to end after SIGTERM at the end of a run, before they are killed
-FINISH_ROLLOUT_WITHIN_S = 30.0  # time for the rollout in progress after a request to leave, if environment calls return
-HANGS_AFTER_S = 8.0  # a longer call of the environment hangs, once workers were asked to leave or the run is over
+FINISH_ROLLOUT_WITHIN_S = 30.0  # time to finish a rollout after a request to leave, while environment calls return
+HANGS_AFTER_S = 8.0  # once workers were asked to leave or the run is over, a longer call counts as hung
 
 
 class Running(Protocol):

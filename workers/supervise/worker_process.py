@@ -38,7 +38,7 @@ popen = subprocess.Popen  # tests replace this to start workers in another way
 
 NONCE_VARIABLE = "MILLRACE_WORKER_NONCE"
 WRITE_STACKS_S = 0.3  # time for writing stacks, from the signal until the worker is killed
-CLOSE_ENVS_WITHIN_S = 5.0  # how long a worker may close its environments after it has announced that it leaves
+CLOSE_ENVS_WITHIN_S = 5.0  # how long a worker may take to close its environments and end, once it has announced that
 KILLED_WITHIN_S = 5.0  # how long to wait for processes to end after SIGKILL
 POLL_S = 0.02
 LONGEST_OUTPUT = 1 << 20  # at most this many bytes are read, from the end of a log
@@ -55,7 +55,7 @@ class WorkerCommand:
     address: str
     name: str
     log: Path | None = None
-    """The file for the worker's output; None: it writes to the stdout and stderr of the supervisor."""
+    """The file for the worker's output. If None, the worker writes to the stdout and stderr of the supervisor."""
     token: Token | None = None
     flags: Sequence[str] = ()
     """Additional flags for `python -m millrace.workers`."""
@@ -299,7 +299,7 @@ def _end_of(output: str) -> str:
 
 
 def _signal_name(number: int) -> str:
-    """The name of a signal; its number if it has no name, which is true of most real-time signals."""
+    """The name of a signal, or its number if it has no name, like most real-time signals."""
     return signal.Signals(number).name if number in set(signal.Signals) else f"signal {number}"
 
 
