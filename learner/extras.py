@@ -32,7 +32,7 @@ class Packages(NamedTuple):
     """Packages that a setting needs and that `pip install .` doesn't install."""
 
     modules: tuple[str, ...]
-    """the modules to import"""
+    """the modules that must be importable"""
     install: str
     """the arguments of `pip install`"""
 

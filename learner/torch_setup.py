@@ -3,9 +3,9 @@ acts.
 
 Rules: a run has PyTorch's initial defaults: float32, the CPU, gradients on. So the calling program's own choices don't
 change the run's results. Nor do the numbers of threads depend on who imported PyTorch and numpy first: a script, a notebook
-or the command line. numpy's matrices are so small that more threads of its BLAS gain nothing, and alongside other busy
-processes they would wait for one another, so that an update takes up to thirty times as long. Afterwards, the calling
-program gets its threads and defaults back.
+or the command line. numpy's matrices are so small that more BLAS threads gain nothing. If other processes were busy,
+these threads would wait for one another, and an update could take thirty times as long. Afterwards, the calling program gets
+its threads and defaults back.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ Rule: a copy holds its slot from before it is made until after it was closed, so
 the constructor of a copy raises, it may have started a process; so the slot then becomes free only when this process and its
 children have ended.
 
-Rule: a copy that was only described is reused as the next copy that its thread makes, if the new one would be the same.
+Rule: a copy that was only described is reused as the next copy that its thread makes, if the new copy would be the same.
 Otherwise, it is closed before the new one is made. A worker also closes it if the worker has made no copy in the first
 `UNUSED_S` seconds of a run, because the run may not need this worker. So no worker keeps an unneeded copy for long.
 """
@@ -144,7 +144,7 @@ def env_copy() -> EnvCopy:
     """The env copy that is being made now. Call this in the constructor of an environment or a wrapper, and keep the result.
 
     In a program that makes an environment itself, it is copy 0, with a slot that the process holds until it ends. In a
-    worker, raises `UsageError` if the calling thread isn't making a copy, but was started by the constructor, for example.
+    worker, raises `UsageError` if the calling thread isn't making a copy, for example because the constructor started it.
 
     >>> import millrace
     >>> millrace.env_copy().number

@@ -1,4 +1,4 @@
-"""Decides when a run stops, by its settings and counts. Pure."""
+"""Decides when a run stops, based on its settings and counts. Pure."""
 
 from __future__ import annotations
 

@@ -81,7 +81,7 @@ class Tally:
         )
 
     def training_goes_on(self) -> bool:
-        """Whether the next rollouts may be collected now, because no evaluation is due and the run does not end."""
+        """Whether the next rollouts may be collected now, because no evaluation is due and the run does not end yet."""
         return not self.evaluation_is_due() and self.stop_reason() is None
 
     # ---------------------------------------------------------------- evaluations
@@ -114,5 +114,5 @@ class Tally:
         return stages | {f"worker_{name}": s for name, s in snapshot.worker_stages.items()}
 
     def wall_s(self, snapshot: HubSnapshot) -> float:
-        """Seconds of training so far, without evaluations, and including the time before a resume."""
+        """Seconds of training so far, without evaluations but including the time before a resume."""
         return self.wall_before_s + snapshot.taken_s - self._started_s - snapshot.evaluate_s

@@ -148,7 +148,7 @@ class EnvironmentNoted:
 
 @dataclass(frozen=True)
 class LaneContinued:
-    """A lane that another worker had continues on this worker."""
+    """The worker continues a lane that another worker had."""
 
     json_name: ClassVar[str] = "lane_continued"
     worker: str

@@ -189,7 +189,7 @@ class Member:
         return more if 0 <= more <= MAX_LATE_ACTIONS else 0
 
     def stages(self) -> Stages:
-        """Seconds in each stage during this session, according to the newest heartbeat, each at most as long as the session.
+        """Seconds in each stage during this session, from the newest heartbeat. None exceeds the length of the session.
 
         The waiting of a member that only evaluates is not counted, because it doesn't wait for training.
         """

@@ -84,7 +84,7 @@ class ServerSettings:
     """The settings in which the servers of different hubs differ."""
 
     grace_s: float = AWAY_S
-    """How long after the learner was away no worker is removed as silent, in seconds."""
+    """After the learner was away, no worker is removed as silent for this many seconds."""
     log_tracebacks: bool = True
     """Whether to log the traceback of an environment. False if the hub raises it."""
     log_joins: bool = True
@@ -125,7 +125,7 @@ class MemberServer:
         self._read_since_empty = 0  # number of messages read since the inbox was last empty
         self._status: tuple[float, Sequence[Buffer]] = (-math.inf, ())  # time until which it is fresh, and its frames
         self.unexpected_errors = 0
-        """number of errors of this program that a peer's message caused; each cost only that peer its membership"""
+        """number of errors in this program that peers' messages caused; each cost only the sender its membership"""
 
     def listen(self, timeout_s: float, short: bool = False) -> None:
         """Wait at most `timeout_s` for messages, answer them, and remove the members that are gone.

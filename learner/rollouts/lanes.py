@@ -1,7 +1,7 @@
 """The coordinator's records of lanes and tickets. Pure.
 
 Rule: a lane has one owner at a time. A new owner has new env copies for it, so the incarnation rises, and rollouts are
-counted from 0 again. The new owner continues the lane's past, unless the environment has failed there or every attempt to
+counted from 0 again. The new owner continues the lane's past, unless the lane's environment has failed or every attempt to
 continue it ended with the loss of a worker. In these cases the copies start afresh, so that they don't fail in the same way
 forever.
 """
@@ -129,7 +129,7 @@ class TicketedLane(PlacedLane):
 
 
 def _misses_one(newest: tuple[int, int] | None, incarnation: int, rollout: Rollout) -> bool:
-    """Whether the rollout between this one and the `newest`, as in `TicketedLane.newest_taken`, was rejected."""
+    """Whether the rollout between `newest` (`TicketedLane.newest_taken`) and this one was rejected."""
     return rollout.sequence > 0 and newest != (incarnation, rollout.sequence - 1)
 
 

@@ -152,7 +152,7 @@ def check_spaces(run: RunSpec, copies: EnvCopies) -> None:  # rule OTHER_AGENTS
             "install the version of the environment that the policy was made for"
         )
     seats, takes_turns = agents_of(copies.envs[0]) if isinstance(copies, LoopedCopies) else ((), False)
-    if seats != run.seats or (takes_turns and not run.takes_turns):  # takes_turns says only that seats may wait
+    if seats != run.seats or (takes_turns and not run.takes_turns):  # takes_turns means only that seats may wait
         raise UsageError(
             f"environment {run.env.id}: expected {agents_in_words(run.seats, run.takes_turns)}, got "
             f"{agents_in_words(seats, takes_turns)}; install the version of the environment that the run was started with"

@@ -29,7 +29,7 @@ class Seats:
         self._held_state = zero_state(policy, columns)  # [N · A, S] the policy's state before each seat last acted
 
     def memory(self) -> tuple[Array, ...]:
-        """The state that `recall` needs: which seats wait, the policy's state before each acted, and what the policy wrote."""
+        """The state that `recall` needs: which seats wait, the policy's state before each acted, and what it then wrote."""
         return (self._waits.copy(), self._held_state.copy(), *(held.copy() for held in self._held))
 
     def recall(self, memory: Sequence[Array], columns: Sequence[int]) -> None:

@@ -1,6 +1,7 @@
 """Ends a worker's session: the worker, and the processes that its environment has started.
 
-Rule: a process is gone when it no longer holds any port or file. So a zombie is gone, even if nobody ever reaps it.
+Rule: a process counts as gone when it no longer holds any port or file. So a zombie counts as gone, even if it is never
+reaped.
 Processes are found by session too, because the ranks of an MPI program have their own process groups but stay in the
 session.
 """

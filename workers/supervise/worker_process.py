@@ -38,7 +38,7 @@ popen = subprocess.Popen  # tests replace this to start workers in another way
 
 NONCE_VARIABLE = "MILLRACE_WORKER_NONCE"
 WRITE_STACKS_S = 0.3  # time for writing stacks, from the signal until the worker is killed
-CLOSE_ENVS_WITHIN_S = 5.0  # how long a worker may take to close its environments and end, once it has announced that
+CLOSE_ENVS_WITHIN_S = 5.0  # how long a worker may take to close its environments and end after announcing that it leaves
 KILLED_WITHIN_S = 5.0  # how long to wait for processes to end after SIGKILL
 POLL_S = 0.02
 LONGEST_OUTPUT = 1 << 20  # at most this many bytes are read, from the end of a log
