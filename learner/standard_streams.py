@@ -1,8 +1,8 @@
 """Standard output and standard error whose failed writes never end the program.
 
 Rule: before it opens any file, a program opens standard streams that were closed at its start (`prepare_streams`).
-Otherwise, a file that it opens could get number 1 or 2, and the output of libraries would go into that file. After that,
-`never_fails` can replace a stream. Output that cannot be written, because of a full disk, a closed pipe or a closed
+Otherwise, a file that it opens could get number 1 or 2, and the output of libraries would go into that file. Once they are
+open, `never_fails` can replace a stream. Output that cannot be written, because of a full disk, a closed pipe or a closed
 terminal, is dropped and counted; a character that the encoding lacks is escaped. Each write is attempted, so once a disk has
 space again, it gets the next line.
 """

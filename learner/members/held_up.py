@@ -34,7 +34,7 @@ def in_words(doing: str, seconds: float) -> str:
 
 
 def held_up(member: Member, now: float) -> tuple[float, float, str]:
-    """For how many seconds a member has been held up, minus its env steps per second, and a line about it.
+    """For how many seconds a member has been held up, its negated env steps per second, and a line about it.
 
     The line says which worker it is, on which host, and what it is doing. Tuples can be compared: the largest belongs to the
     member that has been held up longest or, if none is held up, to the slowest one.

@@ -100,7 +100,7 @@ class LanePlacement(Generic[L]):
             heapq.heapreplace(fewest_first, (count + 1, tie_break, n, member))
 
     def even_out(self, members: Sequence[Member]) -> list[Outgoing]:
-        """Move lanes from the workers with the most to those with the fewest, until a lane must wait for its tickets to end."""
+        """Move lanes from the workers with the most to those with the fewest, until a lane must wait for its tickets."""
         self._stop_waiting()
         out: list[Outgoing] = []
         while members:

@@ -51,7 +51,7 @@ class RolloutDealer:
         opponents: OpponentPool | None = None,
         histories: LaneHistories | None = None,
     ) -> None:
-        """`ledger` and `incarnations`, the first incarnation of each lane, are from a checkpoint.
+        """`ledger` and `incarnations` (the first incarnation of each lane) are from a checkpoint.
 
         There may be more or fewer incarnations than lanes. `opponents` is the pool of a run with teams. If `histories` is
         None, no lane continues.
