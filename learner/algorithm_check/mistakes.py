@@ -81,7 +81,7 @@ class Subject(NamedTuple):
 
 
 def mistakes(algorithm: type, settings: dict[str, Any], *, learns: bool) -> Iterator[str]:
-    """Yield all mistakes found, one line each. If `learns`, also check that the algorithm learns the identity environment."""
+    """Yield each mistake found, as one line. If `learns`, also check that the algorithm learns the identity environment."""
     with _undisturbed():
         try:
             subject = _subject(algorithm, settings)

@@ -1,4 +1,4 @@
-"""Events in the life of workers. The log shows them, and the hub decides by them whether the run continues. Plain data.
+"""Events in the life of workers. The log shows them, and the hub uses them to decide if the run continues. Plain data.
 
 `json_name` is the `event` field of a line of `--log-json`. Programs read these names, so they must not change. An event
 without such a name isn't logged as an event.

@@ -143,7 +143,7 @@ class Membership(Generic[M]):
         return events
 
     def hear(self, peer: bytes, message: ToLearner, now: float) -> M | Answered:
-        """The member from whose session this message is, if the caller must answer it; otherwise, the answer itself."""
+        """The member in whose session this message was sent, for the caller to answer it; otherwise, the answer."""
         match message:
             case Hello():
                 out, joined = self.join(peer, message, now)

@@ -39,7 +39,7 @@ class EnvAttributes:
         state = state or AttributesState()
         self._refusal = refusal
         self._next = _unpacked(state.sent)  # attributes of the next weights
-        self._after: dict[str, Any] | None = _unpacked(state.waiting)  # those of the weights after that; None if the same
+        self._after: dict[str, Any] | None = _unpacked(state.waiting)  # those of the version after that; None if unchanged
         self._sent = state.sent
         self._version = -1
         self.changes = 0

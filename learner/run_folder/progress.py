@@ -88,7 +88,7 @@ class Progress(RunProgress, frozen=True, kw_only=True):
         self.requests.log(name, value)
 
     def set_env_attr(self, name: str, value: Any) -> None:
-        """Set an attribute of every training env copy, for example for a curriculum, from the next weights on.
+        """Set an attribute of every training env copy from the next weights on, for example for a curriculum.
 
         `value` is plain data: numbers, text, lists, dicts or numpy arrays. Each rollout is collected with the attributes of
         its version, so the result is the same for any number of workers. Checkpoints save the attributes. Evaluations use

@@ -46,7 +46,7 @@ class RunFormat(msgspec.Struct, frozen=True, kw_only=True):
     workers_elsewhere: bool = False
     """whether the run's workers were started elsewhere, so that its setting `workers` has no meaning"""
     started_from: str = ""
-    """the line about the run whose policy this run started from, as it was printed; empty if it began with random weights"""
+    """the line about the run from which this run started, as it was printed; empty if it began with random weights"""
 
 
 DISTRIBUTIONS = {"millrace": "millrace-rl", "torch": "torch", "gymnasium": "gymnasium", "numpy": "numpy"}

@@ -14,7 +14,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-CHECK_EVERY_S = 0.25  # how often the second thread checks; no Heartbeat is later than this
+CHECK_EVERY_S = 0.25  # how often the second thread checks; a Heartbeat is late by at most this
 
 
 class HeartbeatThread:

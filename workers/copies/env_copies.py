@@ -160,7 +160,7 @@ def check_spaces(run: RunSpec, copies: EnvCopies) -> None:  # rule OTHER_AGENTS
 
 
 def copy_seed(seed: int, lane: int, start: int, copy: int) -> int:  # rule INDEPENDENT
-    """The seed for the reset of a lane's copy at its start number `start`."""
+    """The seed with which a lane's copy is reset at its start with the number `start`."""
     return env_seed(seed, Purpose.COPIES, lane, start, copy)
 
 

@@ -229,7 +229,7 @@ class EnvLoop:
         return reset_answer(self.envs[n].reset(seed=seed, **further))
 
     def _make_anew(self, n: int, seed: int | None) -> None:
-        """Close copy n, and recreate it. If `seed` is None, its next reset gives what the old one's would have given."""
+        """Close copy n, and recreate it. If `seed` is None, its next reset returns what the old copy's would have."""
         state = state_of(self._inner[n])
         if seed is None and state is None:
             return  # without a seed and a random state, a new environment couldn't continue like this one
