@@ -35,7 +35,7 @@ class CrowdedCores:
             log.warning("%s", line)
 
     def updated(self, took_s: float, computed_s: float) -> str:
-        """Check an update that took `took_s`, in which all threads of this process together computed for `computed_s`.
+        """Check an update that took `took_s` seconds, and for which all threads together used `computed_s` of CPU time.
 
         Returns a line for the log; empty if there is nothing to warn about.
         """

@@ -39,7 +39,7 @@ class MemberLog:
             self._write(logging.WARNING, [self._budget_of_key(peer)], one_line(line), suppressed_note(kept_back))
 
     def log_event(self, level: int, event: LoggedEvent, lines: str, cause: bytes | None) -> None:
-        """Log an event. Lines after the first are a traceback, which is left out if it is too long or equals the newest one.
+        """Log an event. Lines after the first are a traceback, which is left out if it is too long or equals the last one.
 
         `cause` is the peer whose message caused the event; None if no message did. Requests to join again are limited
         more strictly, because a restart of the learner causes a flood of them.

@@ -67,7 +67,7 @@ STATUS_SHARE = 20  # answers to Inquire take at most 1 / STATUS_SHARE of the tim
 
 
 class ServedHub(Protocol):
-    """The owner of a server, which the server calls with each event."""
+    """The owner of a server. The server calls it with each event."""
 
     def status(self, now: float) -> Status:
         """The answer to `millrace status`."""
@@ -221,8 +221,8 @@ class MemberServer:
             self._remove_ended_processes(0.0)
 
     def close(self) -> None:
-        """Forget the hub. The hub and this server refer to each other, so without this both, with their file descriptors,
-        would stay until the garbage collector runs.
+        """Forget the hub. The hub and this server refer to each other, so without this, both would
+        keep their memory and file descriptors until the garbage collector runs.
         """
         del self._hub, self._processes
 

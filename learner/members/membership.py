@@ -356,7 +356,7 @@ class Membership(Generic[M]):
         self.remove(member, Failure, "failed")
 
     def _failed(self, kind: type[Failed], member: M, error: str, traceback: str = "", lane: int | None = None) -> Failed:
-        """The event of a member's failure, in `lane` if this is one of the member's lanes, otherwise in all its lanes."""
+        """The event of a member's failure: in `lane` if the member has this lane, otherwise in all of its lanes."""
         return kind(
             worker=member.hello.worker,
             host=member.hello.host,

@@ -226,7 +226,7 @@ class Hub:
         return taken
 
     def not_used(self, taken: list[AcceptedRollout]) -> None:
-        """Count as lost the rollouts that `gather` last returned, because their update failed."""
+        """Count the rollouts that `gather` last returned as lost, because their update failed."""
         self.coordinator.rollouts.not_used(taken)
         self.lag_statistics.not_used(self._lags)
 

@@ -102,7 +102,7 @@ class RolloutDealer:
         return [self._marked(arrived) for arrived in taken]
 
     def not_used(self, taken: list[AcceptedRollout]) -> None:
-        """Count as lost the rollouts that `take` returned, because no update used them."""
+        """Count the rollouts that `take` returned as lost, because no update used them."""
         self.ledger.used -= len(taken)
         self.ledger.lost += len(taken)
         env_steps = sum(arrived.rollout.env_steps for arrived in taken)

@@ -122,7 +122,7 @@ class _Repeated:
         self._copies.end([n for n in self.continued if self._past.copies[n].over])
 
     def compare(self) -> None:
-        """Compare the copies with the past, and no longer continue those that differ from it."""
+        """Compare the copies with the past, and stop continuing those that differ."""
         past = self._past
         returns = past.memory[0][:, :-2]
         for n in list(self.continued):

@@ -51,8 +51,8 @@ class Seats:
     def acted(self, t: int, written: Sequence[Array], before: Floats, state: Floats) -> None:
         """Correct what the policy has written for all columns at step t, because only some seats act.
 
-        In row t of the arrays `written`, the entries of other seats are replaced by those of their last action, and `state`
-        is reset to `before` for these seats.
+        For a seat that doesn't act, row t of the arrays `written` gets the entries of the seat's last action, and `state` is
+        reset to `before`.
         """
         if not self._held:
             self._held = [np.zeros_like(array[0]) for array in written]
