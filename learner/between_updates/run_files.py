@@ -37,7 +37,7 @@ class RunFiles:
     """Writes the files of one run."""
 
     def __init__(self, run: RunParts, evaluations: Evaluations, attributes: EnvAttributes) -> None:
-        """For a resumed run, removes the metrics of updates after its checkpoint. Raises `RunError` if that is impossible."""
+        """For a resumed run, removes metrics of updates after its checkpoint. Raises `RunError` if that is impossible."""
         self._config, self._spec, self._folder, self._algorithm, self._hub, self._tally = run
         self._state = run.tally.state
         self._evaluations = evaluations
