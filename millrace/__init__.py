@@ -18,7 +18,7 @@ from millrace.oldest_versions import check_versions
 
 check_versions()
 
-import millrace.protocol.machine.waiting_threads  # noqa: E402, F401  # sets a variable that torch reads at its own import
+import millrace.protocol.machine.waiting_threads  # noqa: E402, F401  # sets a variable that torch reads when it is imported
 from millrace.protocol.errors import (  # noqa: E402
     CheckpointError,
     EnvironmentFailed,

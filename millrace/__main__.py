@@ -1,8 +1,8 @@
 """`python -m millrace` and the command `millrace`: run the command line and end the process.
 
 Rule: from the first line of `command` on, a signal that ends the process gives exit code 130 and no traceback. This is why
-`command` makes the slow imports. It blocks signals during these imports, because an extension module may crash if its import
-is interrupted.
+the slow imports are inside `command`. It blocks signals while it imports, because an extension module may crash if its
+import is interrupted.
 """
 
 from __future__ import annotations

@@ -27,8 +27,8 @@ The algorithm itself:
   critic (`PPO`, `A2C`, `IMPALA`, `REINFORCE`). `OffPolicy`: the base of algorithms with a replay buffer (`DQN`, `SAC`,
   `TD3`). `Continuous`: the base of `SAC` and `TD3`, for actions in a bounded Box and an exact replay ratio.
 - `AlgorithmConfig`, `ActorCriticConfig`, `OffPolicyConfig` and `ContinuousConfig`: base classes for an algorithm's `Config`.
-  `PPOConfig` and its like are the settings of the built-in algorithms. Every setting has a default value and a type, which
-  may have bounds: `Annotated[float, msgspec.Meta(gt=0)]`. The string under a setting is its help text.
+  `PPOConfig` and similar classes are the settings of the built-in algorithms. Every setting has a default value and a type,
+  which may have bounds: `Annotated[float, msgspec.Meta(gt=0)]`. The string under a setting is its help text.
 - `Free`, `Adaptable` and `Fixed`: mark whether a resumed run may change a setting, as in `n_steps: Free[int] = 3`. A setting
   without a mark is free if it is a float, and fixed otherwise.
 
@@ -38,20 +38,21 @@ What an algorithm learns from:
   `ActorCritic.loss` gets.
 - `Observations` and `Estimates`: argument and result of `ActorCritic.estimate`.
 - `PriorData`: the dataset that `Algorithm.add_prior` gets.
-- `Start`: what a run with `--from` takes over from the other run, which `Algorithm.start_from` gets.
+- `Start`: what a run with `--from` takes over from the other run; it is passed to `Algorithm.start_from`.
 - `PolicySpec`, `ActionSpec` and `Leaf`: the policy and the spaces, as plain data.
 
 Tools:
 
 - `gae` and `vtrace`: compute advantages and value targets from arrays [T, N] and their `EpisodeEnds`.
 - `ActorCriticNetwork`, `QNetwork` and `ActorAndCritics`: the networks that workers act with. `log_prob_and_entropy`,
-  `policy_log_prob` and `squashed_sample` take their outputs. `trainable`: makes a flat tensor a leaf of autograd's graph.
+  `policy_log_prob` and `squashed_sample` take the outputs of these networks. `trainable`: makes a flat tensor a leaf of
+  autograd's graph.
 - `ReplayBuffer`: returns a `Sample` of transitions. `MixedReplay` also samples prior data; `Hindsight` replaces the goals of
   transitions; `SequenceReplay` returns a `SequenceSample`, for a policy with memory. `Transitions`: the tensors of either
-  sample, with their `Sequences`. `CriticLoss`: the result of a loss on them.
+  kind of sample, with their `Sequences`. `CriticLoss`: the loss of the critics, or of the Q-network, on a minibatch.
 - `Encoder`: the layers before the hidden layers of a network. `RecurrentInput`: the input of its recurrent core.
 - `ObservationNormalizer` and `RewardScaler`: running statistics of observations and of returns.
-- `features` and `normalize`: turn observations into the input of these networks. `random_shift`: shifts images at random.
+- `features` and `normalize`: turn observations into the input of the networks. `random_shift`: shifts images at random.
 - `UsageError`: raise it, with a message of one line, for settings or spaces that cannot be used.
 - `torch_seed`: the seed of the random stream for a `Purpose`, which is independent of all other streams of the run.
 - `check_finite`: the check before a gradient step. `scheduled`: the current value of a setting that decreases over the run.

@@ -1,9 +1,10 @@
 """Converts the arguments of public functions to plain values, and checks those that aren't settings.
 
-Rule: numpy's scalars and members of enums become Python's numbers and text; a whole number has at most 64 bits, and text can
-be written to a file. A parameter in the signature must have the type of its annotation. Settings, which a function takes as
-`**settings: Unpack[ATypedDict]`, are checked later, when msgspec makes a record of them. Arguments annotated as `object` are
-the user's own objects, and stay unchanged. Errors are one line that begins with the function's name.
+Rule: numpy scalars and enum members become plain Python numbers and text. A whole number must fit into 64 bits, and it must
+be possible to write a text to a file. A parameter in the signature must have the type of its annotation. Settings, which a
+function takes as `**settings: Unpack[ATypedDict]`, are checked later, when msgspec makes a record of them. Arguments
+annotated as `object` are the user's own objects, and stay unchanged. Errors are one line that begins with the function's
+name.
 
 For `help` and notebooks, the signature shows each key of such a `TypedDict` as a keyword of its own.
 """
@@ -97,7 +98,7 @@ def _names_keys(annotation: object) -> bool:
 
 
 def plain(value: Any) -> Any:
-    """The value with scalars of numpy and of subclasses replaced by Python's own, even inside lists, tuples and dicts."""
+    """The value, with numpy scalars and subclasses of str, int and float made plain, even inside lists, tuples and dicts."""
     match value:
         case np.generic():
             return value.item()

@@ -150,7 +150,7 @@ class LoadedPolicy:
         return f"<{self._name} of {self.run}; {how}>"
 
     def _state_for(self, n: int, first: npt.ArrayLike | None) -> Floats:
-        """The recurrent state [1, n, S]; the policy updates it in place. Raises `UsageError` without a `reset(n)`."""
+        """The recurrent state [1, n, S]; the policy updates it in place. Raises `UsageError` if `reset(n)` wasn't called."""
         if not self.spec.state_size:
             return zero_state(self.spec, 1, n)
         if self._state is None:

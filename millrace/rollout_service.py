@@ -107,9 +107,9 @@ class RolloutService:
 
     `publish` sets the weights: the flat float32 vector [P] of the policy, or an array for each of its pieces. `gather`, or
     one iteration over the service, waits until one rollout of each lane has arrived, and returns them as a `RolloutBatch` of
-    T = `rollout_steps` rows of `envs` env copies. With `max_lag=0`, a batch was collected with the weights that
-    you published last. With `max_lag=n`, it was collected with those that were newest at the `gather` call n batches
-    before.
+    T = `rollout_steps` rows of `envs` env copies. With `max_lag=0`, a batch was collected with the weights that you
+    published last. With `max_lag=n`, it was collected with the weights that were the newest at the `gather` call n batches
+    earlier.
 
     `publish`, `gather`, `evaluate` and `save` raise `UsageError` after `close`, and if they are called from another thread.
     `gather` and `evaluate` raise a `RunError` if no further rollout can arrive: `NoWorkers`, `Stalled`, `EnvironmentFailed`
@@ -371,7 +371,7 @@ class RolloutService:
         write(Path(path), state, arrays)
 
     def ledger(self) -> dict[str, int]:
-        """Number of tickets and transitions by what became of them, such as `used` and `lost`.
+        """Number of tickets and transitions by their outcome, such as `used` and `lost`.
 
         >>> import millrace
         >>> with millrace.RolloutService("CartPole-v1", workers=1, envs=2, lanes=1, rollout_steps=8) as service:

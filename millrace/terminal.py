@@ -48,7 +48,7 @@ REDRAW_EVERY_S = 0.2
 NOTEBOOK_EVERY_S = 0.5
 LINE_EVERY_S = 5.0
 GAP = "   "  # separates the figures in a row
-MOST_REASON = 80  # characters of the reason why a run ended that are shown; an error also gets its own line below the block
+MOST_REASON = 80  # characters to show of the reason why a run ended; an error also gets its own line below the block
 
 
 class ProgressView:

@@ -136,5 +136,5 @@ def _is_name(host: str) -> bool:
 def _has_address(host: str, family: socket.AddressFamily) -> bool:
     try:
         return bool(socket.getaddrinfo(host, None, family))
-    except (OSError, UnicodeError):  # UnicodeError: not a host name, such as one with two dots in a row
+    except (OSError, UnicodeError):  # UnicodeError: not a valid host name, for example with two dots in a row
         return False

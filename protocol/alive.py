@@ -13,8 +13,8 @@ from millrace.protocol.call_timeouts import Doing
 from millrace.protocol.message_base import Message
 
 SHARED_VERSIONS = 4  # how many of the newest versions a supervisor keeps in shared memory for its workers
-# The reason of a worker that left because no slot was free begins with these words. The learner looks for them, because such
-# a worker comes back when there is a slot.
+# If a worker leaves because no slot is free, its reason begins with these words. The learner looks for them, because such a
+# worker comes back when there is a slot.
 NO_SLOT = "no slot is free"
 
 

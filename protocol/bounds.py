@@ -84,7 +84,7 @@ def indented(text: str) -> str:
 
 
 def last_text(text: str) -> str:
-    """The text as a `Text`: if it is too long, only its end, where a traceback names the exception."""
+    """The text, with its beginning cut off if it is too long for a `Text`: a traceback names the exception at its end."""
     return escaped(text)[-MAX_TEXT:]
 
 

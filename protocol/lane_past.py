@@ -1,9 +1,9 @@
 """The part of a lane's past that is needed to continue the lane on new env copies. Plain data.
 
 Law: an episode is determined by how it began and by its actions. A copy is seeded once, when it starts. Each later episode
-begins with a reset without a seed, from the environment's random state at that time. So if you seed a new copy like the old
-one, set the random state from before the old copy's last reset, reset it and repeat the actions, you get the old copy again,
-provided that the environment is deterministic. A worker reports with each rollout which episodes began in it
+begins with a reset without a seed, from the environment's random state at that time. So if the environment is deterministic,
+you get the old copy again as follows: seed a new copy like the old one, give it the random state that the old copy had
+before its last reset, reset it, and repeat the actions. A worker reports with each rollout which episodes began in it
 (`EpisodeBegin`). The learner accumulates the rollouts, and sends the result (`LanePast`) to the worker that continues the
 lane. The episodes of an environment that can save its state are not repeated: the state after the last row is in
 `LanePast.memory`.

@@ -368,7 +368,7 @@ it, else 0.
 def facts_of_all_seats(info_keys: tuple[str, ...], seats: tuple[str, ...]) -> tuple[str, ...]:
     """Names of the facts of an episode without opponents: those that the environment reports, then the seats' returns.
 
-    The latter are left out if that would be too many facts.
+    The returns are left out if that would be too many facts.
     """
     return info_keys + (seat_returns(seats) if len(seats) + len(info_keys) <= MAX_FACTS else ())
 

@@ -21,7 +21,7 @@ def run(argv: list[str]) -> int:
         if asks_for_help(argv):
             show_help("bench", f"{COMMANDS['bench'].about.capitalize()}.", {})
         raise UsageError("bench: not part of the installed package; run it in a clone of the repository (make bench)")
-    # -P keeps the current folder out of the path, because its modules aren't millrace's. Only the repository is added.
+    # -P keeps the current folder, whose modules aren't millrace's, out of the search path. Only the repository is added.
     path = os.pathsep.join(filter(None, [str(repository), os.environ.get("PYTHONPATH")]))
     flags = [flag for flag in argv if flag != "--debug"]  # a flag of `millrace` itself
     command = [sys.executable, "-P", "-m", "benchmarks.program", *flags]

@@ -2,7 +2,7 @@
 
 Rule: a command's module is imported only when the command runs, so that `--help` is fast, and so that a machine with only a
 worker's packages can run the commands that need no others. Other packages install commands as entry points of the group
-`millrace.commands`, which are read for `--help` and for a name that isn't built in.
+`millrace.commands`. These are read only for `--help`, or if the user types a name that isn't built in.
 """
 # ruff: noqa: E501
 

@@ -102,7 +102,7 @@ def worker_cores(config: RolloutConfig) -> list[int]:
     """The cores to which local workers are pinned, in turn; empty if they aren't pinned.
 
     New weights wake all workers at once, while the learner still runs. Linux then often puts two workers on one core and
-    leaves another core idle, for too short a time to move a worker there. Workers aren't pinned if they are fewer than the
+    leaves another core idle, too briefly for it to move a worker there. Workers aren't pinned if they are fewer than the
     cores: Linux finds a free core for each, and pinned workers might share a core with the workers of another run. They
     aren't pinned in a run with a lag either, because nothing would be gained.
     """

@@ -1,4 +1,4 @@
-"""A pool whose workers only step env copies: the policy acts in this process, for half of the copies while the others step.
+"""A pool whose workers only step env copies. The policy acts here, for one half of the copies while the other half steps.
 
 The learner collects from a single worker, which is a thread of this process. The env copies of this worker belong to a
 vector environment, whose workers are processes. So tickets, ledger, rows, checkpoints and errors work as in every run, and a
@@ -47,7 +47,7 @@ NEVER_S = 1e9  # the timeout of an order that may take any time
 
 @dataclass(frozen=True)
 class ActingSettings:
-    """Settings of acting in this process, and of its env copies."""
+    """Settings for acting in this process, and for the env copies."""
 
     copies: VectorEnvSettings
     lanes: int

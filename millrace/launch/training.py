@@ -108,7 +108,7 @@ def _train(
         lobby = pool.begin(known.described, masked=known.spaces.masked)
         interrupts = Interrupts(config.grace_s)
         stack.callback(lambda: pool.stop(interrupts.at_most(STOP_WITHIN_S)))
-        folder = folder or stack.enter_context(run_folder(config, None))  # with workers elsewhere, made once one has joined
+        folder = folder or stack.enter_context(run_folder(config, None))  # if workers are elsewhere, once one has joined
         from millrace.learner.open_run import (
             open_run,  # imports PyTorch, unless it was imported while a worker described the environment
         )

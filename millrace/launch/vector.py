@@ -83,7 +83,7 @@ def make_vec(
         workers: number of worker processes to start on this machine; by default one for each core that this process may
             use, at most `num_envs`. They end with the vector environment.
         lanes: number of groups of env copies; by default one for each worker. Each group is stepped by one worker.
-        bind: an address at which workers join that are started elsewhere with `millrace worker ADDRESS`. By default, local
+        bind: an address at which workers join; start them elsewhere with `millrace worker ADDRESS`. By default, local
             workers are started.
         keys: the folder of the keys. An address that other machines can reach needs keys; if there are none, they are made.
         insecure: use no keys.

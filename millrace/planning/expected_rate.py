@@ -18,7 +18,7 @@ from millrace.planning.measurements import Machine, Measurements, Overheads
 from millrace.protocol.arrays import Doubles
 
 ROUNDS = 60  # number of simulated rounds
-WARM_UP = 10  # number of first rounds that aren't counted
+WARM_UP = 10  # this many rounds at the beginning aren't counted
 SHARPNESS = 4.0  # the larger, the closer `_larger` is to the maximum of two times
 
 
@@ -140,7 +140,7 @@ def _round_with_lag_s(times_s: Doubles, learner_s: float, max_lag: int) -> float
     ready_s = np.zeros(workers)  # when each worker finished its newest round
     updated_s: list[float] = []  # when each update ended
     for number in range(rounds):
-        opened_s = updated_s[number - max_lag - 1] if number > max_lag else 0.0  # by the rule of the lag
+        opened_s = updated_s[number - max_lag - 1] if number > max_lag else 0.0  # when the lag lets it begin
         ready_s = np.maximum(ready_s, opened_s) + times_s[:, number]
         updated_s.append(max(updated_s[-1] if updated_s else 0.0, float(ready_s.max())) + learner_s)
     counted = rounds - 1 - WARM_UP

@@ -142,7 +142,9 @@ class Overheads(msgspec.Struct, frozen=True, kw_only=True):
     """additional memory that a worker needs to act with this policy"""
 
     def worker_s(self, lanes: int, copies: int, steps: int) -> float:
-        """The time that a worker with these lanes and copies needs for a round of `steps` steps, besides the copies' own."""
+        """The time that a worker with these lanes and copies needs for a round of `steps` steps, on top of the copies' own
+        time.
+        """
         return steps * (self.row_s + lanes * self.lane_row_s + copies * self.copy_row_s) + lanes * self.sent_s
 
     def gathering_s(self, lanes: int, steps: float) -> float:

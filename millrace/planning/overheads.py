@@ -3,7 +3,8 @@
 The environment that it collects from does nothing.
 
 Rule: nothing is assumed about the machine. Rounds of different sizes are timed, and the times of a row, a lane, a copy and a
-rollout are computed from the differences. CPU time is measured, so that other programs on this machine change little.
+rollout are computed from the differences. CPU time is measured, so that other programs on this machine hardly affect the
+result.
 """
 
 from __future__ import annotations

@@ -37,7 +37,7 @@ from millrace.protocol.policy.masks import MASK
 LEAST_STEPS = 8  # number of steps that each copy makes, even if they take longer than planned
 SCRIPT = 1009  # number of random actions, which all copies take in the same order, again and again
 SEED = 1
-WARM_UP = 2  # number of first steps of a copy that aren't counted
+WARM_UP = 2  # this many steps at the beginning of a copy aren't counted
 OF_ALONE = 0.15  # share of the time in which one copy steps alone
 OF_SIDE_BY_SIDE = 0.9  # share of the time after which no more copies are started
 EACH_S = 2.0  # how long each number of workers is measured
@@ -166,7 +166,7 @@ class _SteppedCopies(NamedTuple):
 
 
 def _session(env: ProbedEnv, workers: int, seconds: float, give_up_at_s: float, each: int = 1) -> _SteppedCopies:
-    """Step copies for this many seconds. Every worker has `each` of them.
+    """Step copies for this many seconds. `each`: the number of copies of each worker.
 
     Raises `UserFacingError` if there is only one copy and it can't be made.
     """

@@ -17,7 +17,7 @@ from millrace.planning.in_words import counted, number_in_words, time_in_words
 from millrace.planning.measurements import WORKER_BYTES, Machine, Measurements
 
 AS_GOOD = 0.95
-SLOW_S = 0.005  # if step time / copies that run at once is larger, an algorithm with a replay buffer finishes sooner
+SLOW_S = 0.005  # if step time / number of copies at once is larger, an algorithm with a replay buffer finishes sooner
 SLOW_WITH_IMAGES_S = 0.05  # the same limit for continuous actions and images
 MOST_ENVS = 64  # if steps compute, more env copies gain little
 UNEVEN = 3.0  # steps are uneven if the 95th percentile of the step time, divided by the median, is larger
@@ -160,7 +160,7 @@ def _numbers_of_envs(measured: Measurements, machine: Machine, learning: Learnin
         of_copy = max(1, measured.worker_bytes - WORKER_BYTES)
         of_workers = LEARNER_BYTES + at_once * (WORKER_BYTES + learning.acting_bytes)
         most = max(1, min(most, int((OF_MEMORY * machine.free_bytes - of_workers) / of_copy)))
-    least = -(-learning.envs // machine.cores) * machine.cores  # a multiple of the cores
+    least = -(-learning.envs // machine.cores) * machine.cores  # rounded up to a multiple of the number of cores
     return sorted({min(least * 2**n, most) for n in range(most.bit_length() + 1)})
 
 

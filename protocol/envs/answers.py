@@ -1,7 +1,7 @@
 """Reads what `reset` and `step` of an environment return. Raises `WrongAnswer` for any form other than gymnasium's.
 
-Rule: None as the info means an empty info. If the info is anything else but a dict, the environment returned something other
-than gymnasium's tuple, perhaps an observation with the same number of elements, and none of it is used.
+Rule: None as the info means an empty info. If the info is neither None nor a dict, what the environment returned isn't
+gymnasium's tuple, but perhaps an observation with the same number of elements. Then none of it is used.
 """
 
 from __future__ import annotations

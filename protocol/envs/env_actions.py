@@ -1,4 +1,4 @@
-"""Converts actions between the form that policies choose and rollouts store and the form that environments expect. Pure.
+"""Converts actions between the form in which they are chosen and stored and the form that environments expect. Pure.
 
 Rule: the chosen action is stored. For the environment, it is converted: shifted by `start`, or, for a Box, scaled if the
 policy asks for that, and then clipped. A mixed action is stored as a row; the environment gets a Dict or Tuple

@@ -40,7 +40,7 @@ def in_main(name: str) -> object:
 
 
 def moved(before: str, now: str) -> bool:
-    """Whether the object once called `before` may now be called `now`: the name is the same, or only got a module."""
+    """Whether the object once called `before` may now be called `now`: the name is the same, or was only given a module."""
     without_module = not found_by_others(before) or ":" not in before
     return before == now or (without_module and last_part(before) == last_part(now))
 

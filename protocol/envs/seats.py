@@ -278,8 +278,8 @@ class ParallelSeats(SeatedEnv):
 
 
 class TurnSeats(SeatedEnv):
-    """One agent acts at a time (`pettingzoo.AECEnv`). A step is the action of one agent. After it, the agents leave whose
-    part of the episode has ended.
+    """One agent acts at a time (`pettingzoo.AECEnv`). A step is the action of one agent. After it, every agent whose part of
+    the episode is over leaves.
     """
 
     takes_turns = True
@@ -343,7 +343,7 @@ class TurnSeats(SeatedEnv):
         )
 
     def pending(self) -> list[float]:
-        """[A] rewards that agents without the move have earned since their last one, as summed by PettingZoo's base class.
+        """[A] rewards that agents without the move have earned since their last move, as PettingZoo's base class sums them.
 
         They are 0 if the environment doesn't use that sum.
         """

@@ -96,7 +96,7 @@ def _dtype(space: gymnasium.Space[Any]) -> Dtype:
 
 
 def _compact(bound: Array) -> Array:
-    """The bounds. If all of them are equal, bit for bit: one bound, as an array without dimensions."""
+    """The bounds; or, if all of them are equal bit for bit, only one, as an array without dimensions."""
     flat = np.ascontiguousarray(bound).ravel()
     if flat.size and flat.tobytes() == flat[:1].tobytes() * flat.size:
         return flat[:1].reshape(())

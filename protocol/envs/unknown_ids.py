@@ -134,7 +134,7 @@ def what_to_write(env_id: str, why_not: Callable[[str], str]) -> str:
 def most_similar(env_id: str, examples: Iterable[str], why_not: Callable[[str], str]) -> str | None:
     """A suggestion of the most similar registered id, or one of `examples`, as the end of a line; None if none is similar.
 
-    An id is suggested only if its environment can be made, or lacks only a package; the line then says how to install that.
+    An id is suggested only if its environment can be made, or lacks only a package; the line then says how to install it.
     """
     by_name = {one.rpartition(":")[2].lower(): one for one in [*gymnasium.registry, *examples]}
     for close in difflib.get_close_matches(env_id.lower(), by_name, cutoff=0.75):

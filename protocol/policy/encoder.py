@@ -102,8 +102,8 @@ class Encoder:
         return self.core(self._seen(x, images), recurrent)
 
     def act(self, x: Tensor, images: Sequence[Tensor], state: Tensor) -> tuple[Tensor, Tensor]:
-        """The input of the MLPs for one step of B copies, and the core's state [B, S] after it. Without a core, the latter
-        is `state`.
+        """The input of the MLPs for one step of B copies, and the core's state [B, S] after it. Without a core, `state` is
+        returned unchanged.
         """
         if self._spec.core is None:
             return self._seen(x, images), state

@@ -70,8 +70,8 @@ def convolutions(leaf: Leaf) -> tuple[tuple[Conv, ...], tuple[int, int, int], in
 def parameter_layout(spec: PolicySpec) -> tuple[tuple[Field, ...], tuple[Field, ...]]:
     """The fields that are needed to act, and the fields of the critics. Linear weights are [out, in].
 
-    For actions in [-1, 1], the encoder comes last among the acting fields, right before the critics, because only the losses
-    of the critics train it.
+    For actions in [-1, 1], the encoder comes last among the acting fields, right before the critics, because it is trained
+    only by the critic losses.
     """
     if spec.own is not None:
         return tuple(Field(array.name, array.shape, 0) for array in spec.own.arrays), ()

@@ -102,7 +102,7 @@ class MLPNode(torch.autograd.Function):
 
 
 class StackedMLP(torch.autograd.Function):
-    """K networks of the same shape on the same input, as one node: `MLPNode` in batched products, [B, D] -> [K, B, O]."""
+    """K networks of the same shape on the same input, as one node: `MLPNode` with batched products. [B, D] -> [K, B, O]."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, relu: bool, flat: Tensor, layers_of: Callable[[Tensor], list[Tensor]]) -> Tensor:
@@ -246,8 +246,8 @@ class ActorCriticNetwork(FlatNetwork):
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Log π(action), the entropy of π, and V, [B] each.
 
-        `mask` [B, choices] says which choices are allowed. The probability and the gradient of one that is not allowed are
-        exactly 0. For the other arguments, see `forward`.
+        `mask` [B, choices] says which choices are allowed. The probability and the gradient of a choice that is not allowed
+        are exactly 0. For the other arguments, see `forward`.
         """
         params, value = self.forward(x, images, recurrent)
         if mask is not None:

@@ -95,7 +95,7 @@ def _make(factory: str, spec: PolicySpec, seed: int) -> torch.nn.Module:
         raise UsageError(f"encoder {factory}: expected it to return a torch.nn.Module, got {type(module).__name__}")
     if kept := [name for name, _ in module.named_buffers()]:
         raise UsageError(f"encoder {factory}: expected only parameters, got the buffer {kept[0]}; use LayerNorm, say")
-    usual = (torch.float32, torch.get_default_dtype())  # the program or an environment may have set the latter
+    usual = (torch.float32, torch.get_default_dtype())  # the program or an environment may have set the default
     if strange := [name for name, parameter in module.named_parameters() if parameter.dtype not in usual]:
         raise UsageError(f"encoder {factory}: expected float32 parameters, got another dtype in {strange[0]}")
     return module.float().eval()

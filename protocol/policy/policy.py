@@ -28,7 +28,7 @@ class Policy(Protocol):
 
 
 def make_policy(spec: PolicySpec, images: ActingDtype = "float32") -> Policy:
-    """The policy of this spec: in numpy if it is an MLP, in torch if it has images or an encoder. Only the latter imports
+    """The policy of this spec. An MLP runs in numpy, without importing torch; a policy with images or an encoder runs in
     torch.
 
     `images` is the precision in which images are processed.

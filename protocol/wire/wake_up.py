@@ -76,7 +76,8 @@ _BYTES = {reason: bytes([reason]) for reason in WakeReason}
 
 
 class SpinWait:
-    """Spins for a short time before it sleeps. Each time that spinning was in vain, more of the following waits don't spin.
+    """Spins for a short time before it sleeps. Each time that spinning was in vain, it skips spinning in more of the waits
+    that follow.
 
     Linux may ignore `sched_yield` for a while; only a sleeping process is certain to free its core. So spinning stops after
     the first turn that takes so long that another process must have run on this core.

@@ -28,8 +28,8 @@ from millrace.protocol.wire.sockets import receive_frames, send_frames
 Decoded = TypeVar("Decoded")
 
 OF_OBSERVER = Limits(frame_bytes=MAX_HEAD_BYTES, messages=8)
-"""The limits of an observer. They are low, because answers to it have no arrays, and its address may come from the run
-folder of a stranger.
+"""The limits of an observer. They are low, because the answers that it gets have no arrays, and the learner's address may
+come from a stranger's run folder.
 """
 
 log = logging.getLogger("millrace.link")

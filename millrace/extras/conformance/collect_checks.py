@@ -101,7 +101,7 @@ class Collecting:
         return permit
 
     def order(self, *permits: Permit, version: int = 1, keep: Iterable[int] = ()) -> None:
-        """Send a Collect, without the weights that it names. `keep`: versions to keep although no ticket names them."""
+        """Send a Collect, without the weights that it names. `keep`: versions that the client must keep without a ticket."""
         watch = self.learner.watch
         self.learner.send(Collect(self.learner.session, version, permits, watch.received(), watch.to_keep(version, *keep)))
 
@@ -194,13 +194,13 @@ def collecting_at_length(learner: Learner, lasts_s: float = LONG_S) -> Script[Co
     """Begin a session with long rollouts, so that something can happen while the client is collecting one."""
     if not learner.step_s:
         session = yield from collecting(learner, TIMED_STEPS, net=LONG_NET)
-        yield from session.collect()  # not measured, because it opens the lane
+        yield from session.collect()  # this rollout isn't measured, because it opens the lane
         took_s = []
         for _ in range(TIMED_ROLLOUTS):
             began_s = learner.now
             yield from session.collect()
             took_s.append(learner.now - began_s)
-        learner.step_s = max(min(took_s), 1e-3) / TIMED_STEPS  # of the fastest rollout, because other programs may slow some
+        learner.step_s = max(min(took_s), 1e-3) / TIMED_STEPS  # the fastest counts, because other programs may slow some
     return (yield from collecting(learner, min(max(int(lasts_s / learner.step_s), STEPS), LONGEST_STEPS), net=LONG_NET))
 
 
@@ -232,7 +232,7 @@ def _rollout_or_declined(learner: Learner, permit: Permit) -> Script[None]:
 
 
 def sets_attributes(learner: Learner) -> Script[None]:
-    """With version 1, set attributes so that the cart isn't pushed; with 2, set none; with 3, so that it is pushed again."""
+    """Send attributes with weights: with version 1, the cart isn't pushed; 2 changes nothing; with 3, it is pushed again."""
     env = yield from described(learner)
     if not is_gymnasium_pole(env):
         raise Skipped("the environment is not gymnasium's CartPole")
@@ -264,7 +264,7 @@ def _repeats(one: Rollout, other: Rollout) -> bool:
 
 
 def keeps_rows(learner: Learner) -> Script[None]:
-    """Collect short rollouts until enough episodes have ended in them, including some in a last row."""
+    """Collect short rollouts until enough episodes have ended, some of them in the last row of a rollout."""
     session = yield from collecting(learner, steps=7)
     ends = 0
     between = False  # whether an episode ended in the last row of a rollout
@@ -359,7 +359,7 @@ def waits_for_weights(learner: Learner) -> Script[None]:
 
 
 def acts_under_the_named_version(learner: Learner) -> Script[None]:
-    """Send newer weights before those that a permit names, as if the latter had been lost. The watch compares versions."""
+    """Send newer weights first, as if the weights that a permit names had been lost. The watch compares versions."""
     session = yield from collecting(learner)
     older = session.permit()
     newer = session.permit()
@@ -566,8 +566,8 @@ def _past_of(rollouts: Sequence[Rollout]) -> LanePast:
 
 
 def continues_a_lane(learner: Learner) -> Script[None]:
-    """Send the client the past of a lane, as if another worker had collected it. The client must continue the lane in the
-    next incarnation with the same bits as that worker would have.
+    """Send the client the past of a lane, as if another worker had collected it. The client must continue the lane, in the
+    next incarnation, bit for bit as that worker would have continued it.
     """
     rounds = 3
     undisturbed = yield from collecting(learner, steps=7)
@@ -626,7 +626,7 @@ def closes_unlisted_lanes(learner: Learner) -> Script[None]:
 
 
 def ignores_a_late_reply(learner: Learner) -> Script[None]:
-    """Send late copies of old HeartbeatReplies, which don't list a lane that was dealt after them."""
+    """Send late copies of old HeartbeatReplies, which don't list a lane that was first dealt after those replies."""
     session = yield from collecting(learner)
     learner.answers_heartbeats = False
     yield from heartbeats(learner, 1)
@@ -770,7 +770,7 @@ def evaluates_under_no_other_version(learner: Learner) -> Script[None]:
 def ends_evaluations(learner: Learner) -> Script[None]:
     """Order an evaluation whose weights are never sent, then another one, which must end the first one.
 
-    The second one is of an older version, which must make no difference.
+    The second order names an older version than the first, which must make no difference.
     """
     session = yield from collecting(learner)
     over = _evaluation(learner, version=3)

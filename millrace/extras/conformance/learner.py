@@ -169,7 +169,7 @@ class Learner:
                 self.is_mute = False
                 return wanted(event)
             case Heard(_, Hello() | Alive() | Inquire() | BadMessage()):
-                return False  # its sender is a supervisor, a process that was ended, or a second worker of the command
+                return False  # its sender is a supervisor, a process that was ended, or a second worker of this command
             case Heard(peer, message) if peer == self.peer and self.hello is not None:
                 return self._take_message(message, event, wanted)
         return False

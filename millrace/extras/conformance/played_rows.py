@@ -17,7 +17,7 @@ from millrace.protocol.rows.played import reason_to_reject
 from millrace.protocol.rules import Rule
 from millrace.protocol.specs import RunSpec
 
-BY_CHANCE = -14.0  # if log P(all sampled actions are the most probable ones) is larger, that may happen by chance
+BY_CHANCE = -14.0  # all sampled actions may be the most probable ones by chance if the log-probability of that is larger
 
 
 class PlayedRows:
@@ -63,7 +63,7 @@ class PlayedRows:
                 raise Broken(Rule.CUT, expected, f"{episode.length} steps")
             if order.send_rows:
                 self._check_episode(n, episode.length, episode.reward, cut)
-        if order.send_rows and can_be_recomputed(self._run) and not self._run.seats:  # rows don't contain which seats act
+        if order.send_rows and can_be_recomputed(self._run) and not self._run.seats:  # rows don't say which seats act
             self._check_actions()
         self.ended = True
 

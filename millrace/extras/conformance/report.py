@@ -16,7 +16,7 @@ from millrace.extras.conformance.mends import MENDS, TOO_SLOW
 from millrace.protocol.rules import Rule
 
 WIDTH = 110
-NUMBER = re.compile(r"\d{3,}")  # sessions and tickets, but not shapes and exit codes, which have fewer digits
+NUMBER = re.compile(r"\d{3,}")  # matches sessions and tickets, but not shapes or exit codes, which have fewer digits
 MARKS = {"passed": "ok     ", "failed": "FAILED ", "skipped": "skipped"}
 
 

@@ -75,7 +75,7 @@ LearnerEffect = SendFrames | StartClient | AskToStop | EndClient | CutConnection
 
 @dataclass(frozen=True)
 class Heard:
-    """ClientEvent: a message arrived, or one that cannot be read."""
+    """ClientEvent: a message arrived, which may be unreadable."""
 
     peer: bytes
     message: ToLearner | Inquire | BadMessage

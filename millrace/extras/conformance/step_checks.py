@@ -201,7 +201,7 @@ def ends_episodes(learner: Learner) -> Script[None]:
 def resets_otherwise(learner: Learner, mode: Mode) -> Script[None]:
     """Use the same seeds and actions with autoreset mode NextStep and then with `mode`, until an episode has ended.
 
-    NextStep shows the last observation of the episode and the first one of the next, for the comparison.
+    NextStep shows both the last observation of that episode and the first one of the next, to compare with.
     """
     steps = yield from stepping(learner)
     row = yield from steps.do(steps.reset())
@@ -247,7 +247,7 @@ def _numbers_of_copy(row: Stepped, n: int) -> tuple[float, bool, bool]:
 
 
 def resets_with_options(learner: Learner) -> Script[None]:
-    """Reset with bounds of the first state as options: the same for all copies, then different ones for each copy."""
+    """Pass bounds of the first state as reset options: first the same for all copies, then different ones for each copy."""
     env = yield from described(learner)
     if not is_gymnasium_pole(env):
         raise Skipped("the environment is not gymnasium's CartPole")
@@ -269,7 +269,7 @@ def _of_copy(row: Stepped, n: int) -> bytes:
 
 
 def _within(longest: int | None, length: Array, row: Stepped) -> None:
-    """Raise `Broken` if an episode has reached the time limit and not ended."""
+    """Raise `Broken` if an episode has reached the time limit without ending."""
     if longest is None:
         return
     at_limit = (length >= longest) & ~(row.terminated | row.truncated)

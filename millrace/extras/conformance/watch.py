@@ -165,7 +165,7 @@ class WatchedSession:
             self._due[ticket] = self.replies
 
     def loses(self) -> None:
-        """Record that messages that were sent may be lost, because the connection is cut."""
+        """Record that messages already sent may be lost, because the connection is cut."""
         self._due.clear()
 
     def _asks(self, order: Order | Permit) -> None:
@@ -222,7 +222,7 @@ class WatchedSession:
                 if not isinstance(order, Evaluate):
                     raise Broken(Rule.EVALUATE, "the ticket of an Evaluate of this session", brief(message))
                 self._see_played(message, order)
-            case Goodbye() | Failure() if self._refused and not self._drains:  # or it may answer the Drain
+            case Goodbye() | Failure() if self._refused and not self._drains:  # after a Drain, it may answer that
                 raise Broken(Rule.AFTER_REFUSE, "no last words after Refuse", brief(message))
             case Goodbye():
                 self._see_tickets(message.tickets)
@@ -461,10 +461,10 @@ def check_stepped(message: Stepped, spec: StepSpec) -> None:
 
 
 def resets_too_early(around: Sequence[tuple[bytes, bytes]]) -> bool:
-    """Whether the copy was reset too early: the last observation of every episode equals the first one of the next episode.
+    """Whether the copy was reset too early, so that every episode's last observation is the first one of the next episode.
 
-    `around`: pairs of these observations, for episodes that terminated. False if all episodes begin in the same way,
-    because then the pairs show nothing.
+    `around`: pairs of these observations, for episodes that terminated. False if all episodes begin in the same way, because
+    then the pairs prove nothing.
     """
     first = {after for _, after in around}
     return len(around) >= 3 and len(first) > 1 and all(last == after for last, after in around)

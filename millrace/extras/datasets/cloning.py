@@ -74,8 +74,8 @@ def clone(algorithm: Algorithm, episodes: Iterable[Batch], pulse: Callable[[], N
 def center_critic(algorithm: ActorCritic, parts: Sequence[Demonstrations]) -> None:
     """Add a number δ to all values of the critic, so that its mean error over these steps is 0: E[V(o) + δ] = E[G + γᵏ δ].
 
-    Otherwise the critic would reach the level of the returns only by many gradient steps, which would saturate its units, so
-    that they would learn little in later updates. If γ is 1 and no episode was terminated, there is no such δ, and nothing
+    Otherwise the critic would need many gradient steps to reach the level of the returns. These would saturate its units,
+    which would then learn little in later updates. If γ is 1 and no episode was terminated, there is no such δ, and nothing
     changes.
     """
     error = weight = 0.0

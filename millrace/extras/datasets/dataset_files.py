@@ -33,7 +33,7 @@ from millrace.protocol.specs import Leaf
 
 METADATA = "metadata.json"
 ARRAYS = "main_data.hdf5"
-MOST_METADATA_BYTES = 1 << 24  # metadata contains two bounds for each element of a space
+MOST_METADATA_BYTES = 1 << 24  # room for two bounds for each element of a space
 REWARD = Leaf("", "box", (), "float32")
 END = Leaf("", "box", (), "bool")
 

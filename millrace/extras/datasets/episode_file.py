@@ -135,7 +135,7 @@ class _RememberingFile(io.RawIOBase):
             done += os.pwrite(self._descriptor, view[done:], self._at + done)
 
     def _tried(self, write: Callable[[], object]) -> bool:
-        """Whether the write succeeded. After the first error, nothing more is written."""
+        """Write, unless an earlier write failed. Returns whether the write succeeded."""
         if self.error is None:
             try:
                 write()

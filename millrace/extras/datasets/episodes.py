@@ -70,7 +70,8 @@ class _LaneState:
     def continued_by(self, rollout: Rollout) -> Bools:
         """[N] whether the rollout continues the newest one in each env copy.
 
-        It does if it begins with the same observation, and with a reset row exactly if the newest rollout ended an episode.
+        It does if its first observation is the newest rollout's last one, and if it begins with a reset row exactly when
+        that rollout ended an episode.
         """
         continued: Bools = rollout.valid[0] != self.ended
         for last, leaf in zip(self.last_obs, rollout.obs, strict=True):
@@ -108,7 +109,7 @@ class EpisodeAssembler:
         if lane is None or not (follows or rollout.sequence == 0):  # a rollout in between was dropped
             self.left_out += lane.waiting if lane is not None else 0
             lane = self._lanes[rollout.lane] = _LaneState(incarnation, rollout.sequence, new)
-        else:  # another worker may continue the lane, with some of its copies or all
+        else:  # another worker may have continued the lane, with all of its copies or only some
             waiting = lane.waiting
             continued = lane.continued_by(rollout)
             running = [one if continued[n] else new[n] for n, one in enumerate(lane.running)]

@@ -21,7 +21,7 @@ from millrace.protocol.errors import RunError
 
 
 class NpyRows:
-    """A context manager. It collects rows in a temporary file, and at its end writes the .npy file if nothing was raised."""
+    """A context manager that collects rows in a temporary file and, unless the body raises, finally writes the .npy file."""
 
     def __init__(self, target: Path | None) -> None:
         """`target`: the file to write. With None, nothing is written and every method does nothing."""

@@ -50,7 +50,7 @@ class PlayedEpisodes:
         self._episodes = self._steps = self._bytes = 0  # episodes, their steps, and bytes of observations, so far
 
     def until(self, steps: int) -> Iterator[tuple[RecordedEpisode, bool]]:
-        """Yield episodes until they have this number of steps in total. With each comes a flag: whether it was cut.
+        """Yield each episode, and whether it was cut, until the episodes have this number of steps in total.
 
         The last episode is finished, unless it would double the number of steps. Then it is cut, and its last step is marked
         as truncated.

@@ -56,8 +56,8 @@ class TrainingRecorder(Callback):
     def on_end(self, progress: Progress) -> None:
         """Finish the dataset, and log one line that describes it.
 
-        Raises `RunError` if the dataset couldn't be written, now or earlier, and nothing else ended the run. The dataset is
-        then removed.
+        If the dataset couldn't be written, now or earlier, it is removed. Then raises `RunError`, unless something else
+        ended the run.
         """
         if self._refused is None:
             self._finish()

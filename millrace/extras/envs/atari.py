@@ -212,7 +212,7 @@ class _EndsWithLives(gymnasium.Wrapper[Any, Any, Any, Any]):
 
 
 class _StepAfterLives(VectorWrapper):
-    """Makes the step after a lost life look like a reset, with no reward and no end, as it is in a loop over env copies.
+    """Makes the step after a lost life look like a reset, without reward or end, just as in a loop over env copies.
 
     In this step, the emulator continues the game with the policy's action. If this very step ends the game or loses a life,
     the end is reported one step later, so that the episode has one step.

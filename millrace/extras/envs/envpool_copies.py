@@ -25,7 +25,7 @@ from millrace.workers.copy_slots import close_copy, give_back
 
 
 class EnvpoolCopies:
-    """N copies in one pool. The pool is made by `reset`, because envpool takes seeds only when the pool is made."""
+    """N copies in one pool. The pool is made by `reset`, because envpool accepts seeds only at that moment."""
 
     def __init__(self, pool: EnvpoolSpec, copies: int, facts: Sequence[str] = ()) -> None:
         """`facts`: names of the numbers in `info` that are reported for each episode."""
@@ -37,7 +37,7 @@ class EnvpoolCopies:
         self._activity = activity()
         self._env: VectorEnv[Any, Any, Any] | None = None
         self._read = make_flatten(self.observation_space)
-        self._truncated = np.zeros(copies, bool)  # [N] whether the newest step was truncated here, unknown to envpool
+        self._truncated = np.zeros(copies, bool)  # [N] whether this class truncated the newest step; envpool doesn't know
 
     def reset(self, seeds: Sequence[int], pulse: Pulse) -> Leaves:
         """Start episodes in all copies, with a seed for each."""

@@ -41,8 +41,8 @@ def read_flags(
 def learner_flags(env: str, rest: Sequence[str], workers: int, *, bind: str, runs: str) -> list[str]:
     """The flags of a learner on a cluster that starts `workers` worker processes for it.
 
-    With these flags, the learner resumes the newest run, and waits ten minutes for workers. `bind`: the address where they
-    join. `runs`: the folder of runs.
+    With these flags, the learner resumes the newest run, and waits ten minutes for workers. `bind`: the address where the
+    workers join. `runs`: the folder of runs.
     """
     waits = ["--no-workers-timeout-s", "600", "--launched-workers", str(workers)]
     return [env, "--bind", bind, "--run-dir", runs, "--resume", "auto", *waits, *rest]

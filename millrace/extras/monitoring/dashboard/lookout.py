@@ -25,7 +25,7 @@ from millrace.protocol.wire.codec import encode
 from millrace.protocol.wire.worker_link import OF_OBSERVER, WorkerLink
 
 ASK_EVERY_S = 0.5
-LOOKED_AT_S = 10.0  # a page counts as open for this long after its last request; an open page requests once a second
+LOOKED_AT_S = 10.0  # a page counts as open for this long after its last request; an open page sends one every second
 FORGOTTEN_S = 300.0  # after this time without an open page, the answers are freed
 SILENT_S = 5.0  # after this time without an answer, the connection is closed
 PAUSE_S = 10.0  # time until the next connection; an endless message can use memory only while a connection is open

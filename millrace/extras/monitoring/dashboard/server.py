@@ -55,7 +55,7 @@ class DashboardServer:
         finally:
             for connection in self._open:
                 connection.cancel()
-            await asyncio.gather(*self._open)  # before the thread that they wait for ends
+            await asyncio.gather(*self._open)  # these must end before the thread that they wait for
             self._pages.shutdown(wait=False, cancel_futures=True)
 
     async def _connected(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:

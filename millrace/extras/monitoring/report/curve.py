@@ -35,7 +35,7 @@ class RunRecord(NamedTuple):
     """The configuration (config.toml) and the rows of metrics of one run folder."""
 
     env: str
-    """The environment's name. It includes keyword arguments that the preset doesn't set, because they make another
+    """The environment's name. It includes keyword arguments that the preset doesn't set, because they make it a different
     environment.
     """
     algo: str
@@ -54,8 +54,8 @@ class RunRecord(NamedTuple):
 def points(rows: Sequence[Mapping[str, Any]], key: str, *, over_time: bool = False) -> Doubles:
     """The values of a metric over env steps: [K, 2] env steps and value, for the K rows that have both.
 
-    `over_time`: seconds of training instead of env steps. Numbers are clipped to ±1e300, so that an axis can be a little
-    longer. For an evaluation, env steps are those of the evaluated policy.
+    `over_time`: seconds of training instead of env steps. Numbers are clipped to ±1e300, so that an axis can extend a little
+    beyond them. For an evaluation, env steps are those of the evaluated policy.
     """
 
     def at(row: Mapping[str, Any]) -> Any:

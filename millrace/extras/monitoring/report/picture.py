@@ -1,7 +1,7 @@
 """The picture that `millrace plot` draws: the learning curves of the report as one SVG, or that SVG as a PNG.
 
 Rule: lines, colors and legends are those of the report. The SVG has its own style, in light colors. The PNG is the same on
-every machine, because its font comes with Pillow; a machine needs fonts only for other scripts.
+every machine, because its font comes with Pillow; a machine needs fonts of its own only for other writing systems.
 """
 
 from __future__ import annotations

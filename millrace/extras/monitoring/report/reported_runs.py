@@ -30,7 +30,7 @@ MAY_DIFFER_IN_A_GROUP = frozenset({
     # when training ends, how often and how long policies are evaluated; but not on which environment (eval_env_kwargs)
     "steps", "target_return", "target_mean_return",
     "eval_episodes", "eval_every", "eval_workers", "eval_copies", "eval_max_steps",
-    # which processes collect and compute, and where: rollouts and updates are the same except for rounding
+    # where rollouts and updates are computed, and by which processes: except for rounding, the results are the same
     "workers", "min_workers", "launched_workers", "max_env_copies", "inference", "device", "torch_threads",
     "transport", "bind", "advertise", "keys", "insecure",
     # how failures are handled
@@ -95,7 +95,7 @@ class RunGroup:
     name: str
     """Name of the algorithm, and a letter if the environment has several groups of that algorithm."""
     differences: str
-    """Settings that distinguish this group from those other groups; empty if there are no other groups."""
+    """Settings that distinguish this group from the other groups of that algorithm; empty if there are none."""
     color: int
     """number of the group's color; groups of the same environment have different colors"""
     runs: tuple[ReportedRun, ...]
