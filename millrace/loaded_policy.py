@@ -36,10 +36,10 @@ Observation: TypeAlias = Any
 class LoadedPolicy:
     """A policy loaded from a run folder: `policy(observation)` returns an action for `env.step`. `millrace.load` makes it.
 
-    It takes one observation of the environment's space, or n of them stacked along a first axis, and returns one action or
-    n. An action is an element of the environment's action space: it has the space's dtype and shape, is within its bounds,
-    and counts from its `start`. For a Dict or Tuple space it is a dict or tuple. Pass observations as the environment
-    returns them; the policy normalizes them if it was trained with normalization.
+    It takes one observation of the environment's space, or n of them stacked along a first axis, and returns one action or n
+    actions. An action is an element of the environment's action space: it has the space's dtype and shape, is within its
+    bounds, and counts from its `start`. For a Dict or Tuple space it is a dict or tuple. Pass observations as the
+    environment returns them; the policy normalizes them if it was trained with normalization.
 
     A policy with a recurrent core remembers what it saw in each env copy: call `reset(n)` before the first observations, and
     pass `first` to mark the copies that begin a new episode.

@@ -52,8 +52,8 @@ class Metrics(dict[str, Array]):
     """The metrics of a run: a numpy array [updates] for each name, such as `metrics["rollout/ep_rew_mean"]`.
 
     Columns of whole numbers are int64. Other columns are float64, with NaN where an update lacks the number, for example
-    because it had no evaluation. The names are those in metrics.jsonl. If Stable-Baselines3 logs the same number, the name
-    is the same as there.
+    because it had no evaluation. The names are those in metrics.jsonl. A number that Stable-Baselines3 also logs has the
+    same name there.
 
     >>> import millrace
     >>> metrics = millrace.Run(run).metrics

@@ -1,6 +1,6 @@
 """Addresses: whether one is valid, whether only this machine can reach it, and what to type on another machine.
 
-Rule: an address counts as reachable by others unless it certainly is not. An IPv6 address is in brackets. Pure,
+Rule: an address counts as reachable by other machines unless it certainly is not. An IPv6 address is in brackets. Pure,
 except for `needs_ipv6` and `resolves`, which ask the system's resolver about names.
 """
 

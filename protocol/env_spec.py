@@ -105,7 +105,7 @@ class PickledCallable:
 
         try:
             data = cloudpickle.dumps(made)
-        except Exception as error:  # of any type: the callable may refer to any object
+        except Exception as error:  # any type of error: the callable may refer to any object
             raise UsageError(
                 f"{what}: its callable cannot be sent to workers: {type(error).__name__}: {first_line(error)}; let it make "
                 "what it needs when it is called"

@@ -277,7 +277,7 @@ class WorkerTraceback(Exception):
     """The traceback of an exception in a worker, shown as a cause, because this process's own traceback lacks its frames."""
 
     def __str__(self) -> str:
-        return f'\n"""\n{super().__str__()}\n"""'  # as the standard library shows another process's traceback
+        return f'\n"""\n{super().__str__()}\n"""'  # the form in which the standard library shows another process's traceback
 
 
 def worker_exception(traceback: str) -> Exception | None:

@@ -69,7 +69,7 @@ def generator(seed: int, purpose: Purpose, *indices: int) -> np.random.Generator
 class RoundStreams:
     """One stream for each round: the stream of round r begins 2**64 · r draws after that of round 0 (the period is 2**128).
 
-    This is several times faster than `generator`. The streams share one generator, so only the newest may be drawn from.
+    This is several times faster than `generator`. The streams share one generator, so draw only from the newest stream.
     """
 
     def __init__(self, seed: int, purpose: Purpose, *indices: int) -> None:

@@ -1,8 +1,8 @@
 """The commands of `millrace`, in groups, with the function that runs each. They include the commands of millrace's extras.
 
 Rule: a command's module is imported only when the command runs, so that `--help` is fast, and so that a machine with only a
-worker's packages can run the commands that need no others. Other packages install commands as entry points of the group
-`millrace.commands`. These are read only for `--help`, or if the user types a name that isn't built in.
+worker's packages can run the commands that need no other packages. Other packages install commands as entry points of the
+group `millrace.commands`. These are read only for `--help`, or if the user types a name that isn't built in.
 """
 # ruff: noqa: E501
 

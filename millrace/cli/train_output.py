@@ -37,7 +37,7 @@ class ShownRun:
     """Shows the progress of a run, and prints how it ended."""
 
     def __init__(self, argv: list[str], new: Config | None = None, command: str = "train") -> None:
-        """`new`: the settings of a new run; None if a run is resumed. Their origin is shown before the first report.
+        """`new`: the settings of a new run, whose origin is shown before the first report; None if a run is resumed.
 
         `command`: the millrace command that trains the run, and can resume it.
         """

@@ -187,7 +187,7 @@ def start_vector_env(settings: VectorEnvSettings, crew: Crew) -> ZmqVectorEnv:
 
 
 class VectorEnvPool:
-    """The worker pool of a vector environment, which `vector_env` makes once a worker has described its copies."""
+    """The workers of a vector environment. `vector_env` makes the environment once a worker has described its copies."""
 
     def __init__(
         self, settings: VectorEnvSettings, requested: RequestedCopies, pool: ActingPool, resources: ExitStack

@@ -104,7 +104,7 @@ class Measurements(msgspec.Struct, frozen=True, kw_only=True):
         return self.alone.own_s + self.reset_s / self.ends_every
 
     def costs(self, workers: int) -> StepCosts:
-        """The costs measured with this number of workers, or the next larger number; otherwise with the largest number."""
+        """The costs measured with this number of workers or the next larger one; if neither was tried, with the largest."""
         return next((each for each in self.side_by_side if each.workers >= workers), self.side_by_side[-1])
 
 

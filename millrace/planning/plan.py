@@ -125,7 +125,7 @@ def _limits(max_env_copies: int, allowed: int) -> list[ChosenSetting]:
 
 
 def _evaluation_copies(allowed: int) -> int:
-    """How many of the allowed copies play evaluations: the default number, or 1 if that were more than a third of them."""
+    """How many of the allowed copies play evaluations: the default number, or 1 if the default is more than a third."""
     return EVALUATION_COPIES if not allowed or allowed >= 3 * EVALUATION_COPIES else 1
 
 

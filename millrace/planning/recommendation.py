@@ -19,7 +19,7 @@ from millrace.planning.measurements import WORKER_BYTES, Machine, Measurements
 AS_GOOD = 0.95
 SLOW_S = 0.005  # if step time / number of copies at once is larger, an algorithm with a replay buffer finishes sooner
 SLOW_WITH_IMAGES_S = 0.05  # the same limit for continuous actions and images
-MOST_ENVS = 64  # if steps compute, more env copies gain little
+MOST_ENVS = 64  # if a step computes rather than waits, more env copies gain little
 UNEVEN = 3.0  # steps are uneven if the 95th percentile of the step time, divided by the median, is larger
 LEARNER_BYTES = 500 << 20
 TRANSITION_BYTES = 24  # memory of a transition in addition to its observation

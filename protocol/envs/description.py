@@ -175,7 +175,7 @@ def _spec_from_text(text: str) -> GymnasiumSpec | None:
         return None
     try:
         return GymnasiumSpec.from_json(text)
-    except Exception as error:  # of any type, because the text may be anything
+    except Exception as error:  # any type of error, because the text may be anything
         raise BadMessage(f"spec: expected gymnasium's as JSON: {one_line(first_line(error), 200)}") from error
 
 

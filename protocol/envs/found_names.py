@@ -66,5 +66,5 @@ def importable(module: str) -> bool:
     """Whether another process with the same search path could import this module."""
     try:
         return importlib.util.find_spec(module) is not None
-    except Exception:  # of any type: `find_spec` imports the parent package
+    except Exception:  # any type of error: `find_spec` imports the parent package
         return False

@@ -44,7 +44,7 @@ class SeatStep(NamedTuple):
     infos: list[Mapping[str, Any]]
     """infos of the seats that got an observation in this step; empty for the others"""
     reward: list[float]
-    """for complete rows, the sum of the rewards since the seat acted; 0 for the others"""
+    """for complete rows, the sum of the rewards since the seat acted; 0 for other seats"""
     terminated: list[bool]
     truncated: list[bool]
     """for complete rows, whether the seat's part of the episode ends with the row"""

@@ -73,7 +73,7 @@ def plugin_modules() -> set[str]:
 
 
 def registered_by_plugins(env_id: str) -> bool:
-    """Whether a plugin registers this id. The id is registered in this process, but perhaps by other code."""
+    """Whether a plugin registers this id. It is registered in this process already, but perhaps by other code."""
     here = gymnasium.registry.pop(env_id)
     try:
         load_plugins(env_id)

@@ -56,7 +56,9 @@ class EnvCopy:
 
 
 FIRST_COPY = EnvCopy()
-"""Stands for the first copy of a run, and for the one that is made to be described. It holds no slot on the machine."""
+"""Stands for the first copy of a run, and for a copy that is made only to describe the environment. It holds no slot on the
+machine.
+"""
 
 
 @dataclass

@@ -3,7 +3,7 @@
 Rule: a group is also bound by the limits of every group above it, so the lowest limit counts. The kernel has two versions
 of control groups, and may use both at once: version 2 has one tree of groups, version 1 has one for each controller.
 
-Pure: the functions read everything below a folder that stands for `/`, so a test can pass another.
+Pure: the functions read everything below a folder that stands for `/`, so a test can pass another folder.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def free_bytes(system: Path) -> int | None:
 
 
 def cpu_quota(system: Path) -> float:
-    """Cores' worth of CPU time that the groups of this process may use; infinite if they have no quota."""
+    """CPU time that the groups of this process may use, in cores; infinite if they have no quota."""
     return min((_cpu_quota(group) for group in _groups(system, "cpu")), default=math.inf)
 
 

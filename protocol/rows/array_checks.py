@@ -62,7 +62,7 @@ def wrong_values(array: Array, space: Leaf | ActionSpec | None = None, axes: Axe
         return ""
     if space.kind == "mixed":
         sizes = np.array((*space.sizes, *[2] * space.bits), np.int64)
-        array = array[..., : len(sizes)]  # without the numbers of Box parts, which come last
+        array = array[..., : len(sizes)]  # leaves out the numbers of Box parts, which come last
     else:
         sizes = np.reshape(space.sizes, space.shape) if space.sizes else np.full(space.shape, 2)  # 2: MultiBinary
     start = np.reshape(space.start, space.shape) if space.start and isinstance(space, Leaf) else np.zeros_like(sizes)

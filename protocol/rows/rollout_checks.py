@@ -127,7 +127,7 @@ def _check_mask(mask: Array, rollout: Rollout, action: ActionSpec, axes: Axes) -
 def wrong_episode(episode: Episode, run: RunSpec, most_steps: int) -> str:
     """What is wrong with an episode; empty if it is possible in this run. An episode has at most `most_steps` steps."""
     whole = 0 < episode.length <= most_steps and 0 <= episode.seconds < math.inf
-    if not (whole and abs(episode.reward) <= episode.length * run.seats_of_copy * LARGEST_REWARD):  # also wrong for NaN
+    if not (whole and abs(episode.reward) <= episode.length * run.seats_of_copy * LARGEST_REWARD):  # NaN is wrong too
         return f"expected a finite return of 1 to {most_steps} float32 rewards and a duration, got {episode}"
     return wrong_facts(episode, run)
 

@@ -132,7 +132,7 @@ class LearnerLink:
 
     def _peer(self, routing_id: bytes, key: str) -> bytes:
         """The id of the peer with this routing id and key. Records that this key is the last one to use the routing id."""
-        self._last_keys.pop(routing_id, None)  # so that the dict stays in the order of last messages
+        self._last_keys.pop(routing_id, None)  # so that the dict stays ordered by last message
         self._last_keys[routing_id] = key
         if len(self._last_keys) > MAX_REMEMBERED_KEYS:
             del self._last_keys[next(iter(self._last_keys))]

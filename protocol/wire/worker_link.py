@@ -48,8 +48,8 @@ class WorkerLink:
     ) -> None:
         """Connect to the address. With a token (only over tcp), the link connects only to the learner of that token.
 
-        Over inproc, `context` must be the learner's context; closing the link leaves it open. If `limits` is None, they are
-        those of a worker. Raises `UsageError` for an address or a name that is not valid.
+        Over inproc, `context` must be the learner's context; closing the link doesn't close the context. If `limits` is
+        None, they are those of a worker. Raises `UsageError` for an address or a name that is not valid.
         """
         check_address(address)
         check_worker_name(name)
@@ -58,7 +58,7 @@ class WorkerLink:
         self.problem: ConnectionProblem | None = None
         """why there is no connection; None if that is not known"""
         self.connected = False
-        """whether there seems to be a connection; always False for other transports than tcp"""
+        """whether there seems to be a connection; always False for transports other than tcp"""
         far = token is not None or not is_local(address)
         self.packing = Packing(stack=far, zstd=far and has_zstd())
         """how rollouts may be packed; they aren't packed unless the connection is encrypted or leaves this machine"""

@@ -65,7 +65,7 @@ TIMED_ROLLOUTS = 3
 LONG_S = 1.0  # duration of a long rollout
 LONGEST_STEPS = 50_000  # largest T of a long rollout
 NET = (16, 16)
-LONG_NET = (256, 256)  # for long rollouts: with a small net, a compiled client would make 50,000 steps in milliseconds
+LONG_NET = (256, 256)  # net of long rollouts: with a small one, a compiled client would make 50,000 steps in milliseconds
 EVALUATED_STEPS = 40
 APART_ROLLOUTS = 3  # after this many rollouts of each lane, env copies must differ
 
@@ -232,7 +232,7 @@ def _rollout_or_declined(learner: Learner, permit: Permit) -> Script[None]:
 
 
 def sets_attributes(learner: Learner) -> Script[None]:
-    """Send attributes with weights: with version 1, the cart isn't pushed; 2 changes nothing; with 3, it is pushed again."""
+    """Send attributes with weights: with version 1, the cart isn't pushed; 2 sets none; with 3, the cart is pushed again."""
     env = yield from described(learner)
     if not is_gymnasium_pole(env):
         raise Skipped("the environment is not gymnasium's CartPole")

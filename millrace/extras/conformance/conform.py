@@ -162,7 +162,7 @@ class _Port:
         return [Heard(peer, message) for peer, message in self._link.receive()]
 
     def discard(self) -> None:
-        """Discard the messages that have arrived, because their sender was ended."""
+        """Discard the messages that have arrived, because the process that sent them was ended."""
         self.heard(0.0)
 
 

@@ -61,7 +61,7 @@ class _LaneState:
     running: list[list[_Fragment] | None] = field(default_factory=list)
     """[N] the unfinished episode of each env copy; None, until its end, if its beginning is missing"""
     last_obs: tuple[Array, ...] = ()  # the last observations of the newest rollout, [N, *leaf] each
-    ended: Bools = field(default_factory=lambda: np.zeros(0, bool))  # [N] whether that rollout ended with an episode
+    ended: Bools = field(default_factory=lambda: np.zeros(0, bool))  # [N] whether an episode ended in its last row
 
     @property
     def waiting(self) -> int:
@@ -95,7 +95,7 @@ class EpisodeAssembler:
         return sum(lane.waiting for lane in self._lanes.values())
 
     def add(self, rollout: Rollout, incarnation: int) -> list[RecordedEpisode]:
-        """The episodes that end in this rollout, in the order of their ends.
+        """The episodes that end in this rollout, in the order in which they end.
 
         `incarnation`: the incarnation of the lane when the rollout was collected.
         """
@@ -122,7 +122,7 @@ class EpisodeAssembler:
         return [episode for _, episode in sorted(ends, key=lambda end: end[0])]
 
     def _column(self, rollout: Rollout, lane: _LaneState, n: int) -> list[tuple[int, RecordedEpisode]]:
-        """The episodes of env copy `n` that end in this rollout, each with the step of its end."""
+        """The episodes of env copy `n` that end in this rollout, each with the step at which it ends."""
         done = []
         start = 0
         steps = len(rollout.reward)

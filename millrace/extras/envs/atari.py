@@ -276,4 +276,4 @@ def _envpool(**kwargs: Any) -> tuple[str, dict[str, Any]]:
     return f"{settings.game}-v5", options | sizes
 
 
-make_game.envpool = _envpool  # type: ignore[attr-defined]  # for `millrace.extras.envs.envpool`
+make_game.envpool = _envpool  # type: ignore[attr-defined]  # read by `millrace.extras.envs.envpool`

@@ -124,7 +124,7 @@ def answer_parts(request: PageRequest | None, answer: PageAnswer) -> Iterator[by
         if request.headers.get("if-none-match") == tag:
             status = 304
         elif request.method == "GET" and (wanted := _wanted_part(request.headers, tag, whole.size)) is not None:
-            status = 206 if wanted else 416  # for a video that is played from the middle
+            status = 206 if wanted else 416  # 206: for example, a video played from the middle
             part = wanted
             headers["Content-Range"] = f"bytes {f'{part.start}-{part.stop - 1}' if part else '*'}/{whole.size}"
     if status == 405:
