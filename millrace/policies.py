@@ -1,4 +1,4 @@
-"""The policies that workers can act with: the classes by which a user chooses one, and the layout of its flat parameters.
+"""The policies that workers can act with: the classes with which you choose a policy, and the layout of its flat parameters.
 
 A policy here is only the acting part: it maps an observation to a distribution over actions. Anything else that a learner
 trains, such as a critic, is up to the learner. Imports no torch.

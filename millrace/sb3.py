@@ -51,7 +51,7 @@ def make_vec_env(
         n_envs: number of env copies; by default 1, or the length of the list.
         seed: seed of the first reset, in which copy n gets `seed + n`, and of samples of `action_space`.
         monitor: record the return and length of each episode, for `rollout/ep_rew_mean`. As in SB3, these are recorded
-            inside `wrapper_class`, so they are those of the environment without it.
+            inside `wrapper_class`, so the wrapper doesn't affect them.
         wrapper_class: called in the workers with each env copy: a wrapper, or a function that applies several. Because it is
             code, it is sent over TCP only to workers that have a key.
         env_kwargs: keyword arguments of the environment.

@@ -38,7 +38,7 @@ class Sparkline:
         return "".join(self._blocks[round((y - low) / step)] for y in values)
 
     def _last_of_parts(self, parts: int) -> list[tuple[float, float]]:
-        """The last point of each of `parts` equal parts of the run; the newest point is a part by itself."""
+        """The last point of each of `parts` parts of the run. The newest point is one part; the others are equally long."""
         first = self._points[0][0]
         last = self._points[-1][0]
         return list({int((parts - 1) * (x - first) / (last - first)): (x, y) for x, y in self._points}.values())

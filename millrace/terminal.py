@@ -361,7 +361,7 @@ def how_far(progress: Progress) -> tuple[float | None, str]:
 
 
 def render_block(progress: Progress, returns: Sparkline) -> RenderableType:
-    """The block: a progress bar, or how the run ended, followed by the rows."""
+    """The block: first a progress bar, or how the run ended; then the rows."""
     share, said = how_far(progress)
     head: RenderableType = Text(escaped(said), style="bold")
     if share is not None:

@@ -79,7 +79,7 @@ Nest = Callable[[Sequence[Any]], Any]
 
 
 def make_nest(paths: Sequence[Path]) -> Nest:
-    """Return a function that takes one value per path, in order, and returns the dict or tuple that has them at these paths.
+    """Return a function that puts values into a dict or tuple, one at each of these paths. It takes them in this order.
 
     If there is only one path, it may be empty: the function then returns the value itself. Raises `ValueError` unless the
     paths describe a Dict or Tuple.

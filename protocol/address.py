@@ -62,7 +62,7 @@ def is_local(address: str) -> bool:
 
 
 def needs_ipv6(address: str) -> bool:
-    """True for an IPv6 address, and for a name without an IPv4 address: with IPv6 on, ZeroMQ doesn't try IPv4 addresses."""
+    """True for an IPv6 address, and for a name with only IPv6 addresses: with IPv6 on, ZeroMQ tries no IPv4 address."""
     host = host_of(address)
     if host.startswith("["):
         return True
@@ -106,8 +106,8 @@ def check_worker_name(name: str) -> None:
 
 
 def worker_name(peer: bytes) -> bytes:
-    """The worker's name: the peer's routing id up to the first zero byte. At a learner with keys, a zero byte and the
-    peer's key follow the name.
+    """The worker's name: the peer's id up to the first zero byte. If the learner has keys, a zero byte and the peer's key
+    follow the name.
     """
     return peer.partition(b"\0")[0]
 

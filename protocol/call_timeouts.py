@@ -19,7 +19,7 @@ Doing = Literal[
 `making` is making an env copy. `repeating` is repeating a step of an episode that another worker has lost. `preparing` is
 making a policy, including its imports. `acting` is a call of a user-defined policy.
 """
-CLOSE_S = 10.0  # limit for closing one env copy; it is short, because the environment has already done its work
+CLOSE_S = 10.0  # limit for closing one env copy; short, because the environment has already done its work
 OUR_CODE: frozenset[Doing] = frozenset({"starting", "waiting"})
 OF_POLICY: frozenset[Doing] = frozenset({"preparing", "acting"})
 CALLS: dict[Doing, str] = {

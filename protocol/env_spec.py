@@ -226,9 +226,7 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def called_code(self) -> str:
-        """What a worker would have to call for the learner, in words: a factory, or a wrapper. Empty if there is only an
-        id.
-        """
+        """The factory or wrapper that a worker must call for the learner, in words; empty if there is only an id."""
         if self.factory is not None or names_a_function(self.id):
             return FACTORY
         return "a wrapper" if self.wrappers else ""
@@ -312,7 +310,7 @@ def _why_not(env_id: str) -> str:
 
 
 class _Factory:
-    """A callable that makes an environment and wraps it; it is what gets pickled."""
+    """A callable that makes an environment and wraps it. This is the object that gets pickled."""
 
     def __init__(
         self,
@@ -345,9 +343,7 @@ class _Factory:
 
 
 class _UnpickledLater:
-    """A class or function that is unpickled when it is called, so that a process that never calls it doesn't need its
-    modules.
-    """
+    """A class or function that is unpickled only when it is called. Without a call, a process doesn't need its modules."""
 
     def __init__(self, point: Callable[..., object]) -> None:
         """Pickle `point`. Raises `UsageError` if it can't be sent."""
@@ -397,7 +393,7 @@ def _sent(spec: GymnasiumSpec) -> GymnasiumSpec:
 
 
 def remembered_name(env: EnvLike | EnvSpec) -> str:
-    """The name under which a run records an environment that was passed as a Python object, to find it again if possible."""
+    """The name under which a run records an environment that was passed as a Python object, so that a resume can find it."""
     return env.id if isinstance(env, EnvSpec) else _named(env)[0]
 
 

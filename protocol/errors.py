@@ -367,7 +367,7 @@ class BadRollout(PeerError):
 
 
 def unexpected_arguments(words: Sequence[str], *, one_run: bool) -> str:
-    """The error message for a command that got these extra words. `one_run`: it expects a single run, and already has it."""
+    """The error message for a command that got these extra words. `one_run`: the command takes one run and has it."""
     if one_run:
         return f"expected one run, got {1 + len(words)}; name one of them"
     return f"unexpected argument {words[0]}"

@@ -116,7 +116,7 @@ def rollout_bytes(run: RunSpec) -> int:
     if run.masked:
         steps.append((T + 1, (run.policy.action.choices,), "bool"))
     steps += [(T, extra.shape, extra.dtype) for extra in run.extras]
-    fixed = T * N * (2 * np.dtype(np.float32).itemsize + 3)  # log_prob, reward; terminated, truncated, valid
+    fixed = T * N * (2 * np.dtype(np.float32).itemsize + 3)  # log_prob and reward; terminated, truncated and valid
     fixed += (T + 1) * run.copies if run.seats else 0  # resets
     fixed += memory_bytes(run)
     return fixed + sum(rows * N * math.prod(shape) * np.dtype(dtype).itemsize for rows, shape, dtype in steps)

@@ -14,7 +14,7 @@ from millrace.protocol.space_spec import Shape
 from millrace.protocol.wire.weight_dtypes import ActingDtype
 
 WIDE_DTYPES = frozenset({"float64", "int32", "uint32", "int64", "uint64"})  # more precise than float32's 24 bits
-MIN_IMAGE_SIDE = 5  # pixels: room for a 3 x 3 convolution, then one with stride 2
+MIN_IMAGE_SIDE = 5  # pixels: room for a 3 x 3 convolution, and then for one with stride 2
 HEARTBEAT_S = 1.0  # seconds between two heartbeats of a worker, unless the learner wants them more often
 
 

@@ -53,9 +53,9 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _end_of_installed() -> int:
-    """The index in `sys.path` at which the installed modules end: before the clone from which millrace is installed, if any.
+    """The index in `sys.path` after the installed modules, but before the clone from which millrace is installed, if any.
 
-    A clone contains other folders than `millrace`, which must not hide the user's `learner.py` or `tests`.
+    Besides `millrace`, a clone contains other folders, which must not hide the user's `learner.py` or `tests`.
     """
     if (INSTALLED_IN / "millrace" / "learner").is_symlink() and str(INSTALLED_IN) in sys.path:
         return len(sys.path) - 1 - sys.path[::-1].index(str(INSTALLED_IN))

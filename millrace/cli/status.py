@@ -98,7 +98,7 @@ def status(argv: list[str], out: TextIO) -> None:
 
 
 def last_state(run: Path) -> RunLine | None:
-    """The last state of a run that no process trains; None if a process seems to train it, or if it isn't a run."""
+    """The last state of a run that no process trains; None if a process seems to train it, or if the folder isn't a run."""
     line = read_line(run, time.time()) if is_run_folder(run) else None
     return None if line is None or line.state in ("training", "unreadable") else line
 

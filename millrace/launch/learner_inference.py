@@ -93,7 +93,7 @@ def settings_of_run(config: Config, env: EnvSpec, where: BindSettings, workers: 
 
 
 def _longest_order_s(config: Config) -> float:
-    """How long an order that makes and resets every copy may take. A worker whose environment hangs is ended before that."""
+    """How long an order that makes and resets every copy may take. If the environment hangs, the worker is ended earlier."""
     timeouts = config.call_timeouts()
     each_s = 2 * timeouts.start_s + timeouts.step_s
     return each_s * config.envs if timeouts.start_s and timeouts.step_s else NEVER_S
@@ -118,7 +118,7 @@ class SteppingPool:
 
     @contextmanager
     def start(self, crew: Crew, before: LobbySettings) -> Iterator[Lobby]:
-        """A context manager: starts as many of the crew's workers as there are copies for, and yields their lobby."""
+        """A context manager that starts the crew's workers, but no more than there are copies, and yields their lobby."""
         self._before = before
         with self._stepping.start(crew, before) as lobby:
             try:
@@ -200,7 +200,7 @@ class _ActingProcesses(WorkerProcesses):
 
 
 def acting_policy(spec: PolicySpec, device: str, images: ActingDtype) -> Policy:
-    """The policy that acts. If numpy can compute it, it runs in numpy on the CPU and gives the same bits as on a worker.
+    """The policy that acts. If numpy can compute the policy, it runs in numpy on the CPU, with the same bits as on a worker.
 
     Otherwise it runs in torch on the device, for all lanes in one pass.
     """

@@ -281,7 +281,7 @@ def open_vector_env_pool(settings: VectorEnvSettings, resources: ExitStack) -> V
 def call_timeouts_of(timeout_s: float) -> CallTimeouts:
     """How long a call of the environment may take before the worker's supervisor ends the worker.
 
-    This is longer than `timeout_s`, after which the learner treats the worker as lost, and kills it if it is local. So it
+    This is longer than `timeout_s`, after which the learner treats the worker as lost and kills a local one. So this limit
     only matters for a worker elsewhere, and while the learner isn't waiting.
     """
     seconds = max(STEP_TIMEOUT_LEAST_S, 2 * timeout_s) if timeout_s < STEP_TIMEOUT_MOST_S else 0.0

@@ -85,7 +85,7 @@ class ActingPool:
 
     @contextmanager
     def start(self, crew: Crew, before: LobbySettings) -> Iterator[Lobby]:
-        """A context manager: starts the local workers, unless workers join from elsewhere, and yields the lobby."""
+        """A context manager that starts the local workers, unless workers join from elsewhere, and yields the lobby."""
         if self.where.bind:
             self.bound.announce(self.where.advertise)
         else:

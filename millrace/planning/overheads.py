@@ -126,7 +126,7 @@ def overheads(config: Config, env: StoodFor) -> Overheads:
 
 
 def _slope(difference: float, by: float) -> float:
-    """A difference of measured times, divided by `by`. Noise may make the difference negative; then the slope is 0."""
+    """A difference of measured times, divided by `by`. If noise has made the difference negative, the slope is 0."""
     return max(0.0, difference) / by
 
 

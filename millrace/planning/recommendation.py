@@ -121,7 +121,7 @@ def choose_algorithm(measured: Measurements, machine: Machine) -> ChosenSetting:
 
 
 def choose_replay_size(default: int, measured: Measurements, machine: Machine) -> ChosenSetting | None:
-    """A smaller replay buffer, if one of `default` transitions would need too much memory; otherwise None."""
+    """A smaller replay buffer, if a buffer of `default` transitions would need too much memory; otherwise None."""
     if machine.free_bytes is None:
         return None
     of_one = measured.observation_bytes + TRANSITION_BYTES

@@ -113,7 +113,7 @@ class _TimedAgents:
         self._notes = notes
 
     def __getattr__(self, name: str) -> Any:
-        if name == "env":  # not set yet; getattr(self.env, …) would recurse
+        if name == "env":  # `env` isn't set yet, so getattr(self.env, …) would recurse
             raise AttributeError(name)
         return getattr(self.env, name)
 

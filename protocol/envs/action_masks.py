@@ -52,5 +52,5 @@ def without_mask(observation: gymnasium.Space[Any], action: gymnasium.Space[Any]
 def seen_space(
     observation: gymnasium.Space[Any], action: gymnasium.Space[Any], *, masked: bool, critic_keys: Sequence[str]
 ) -> gymnasium.Space[Any]:
-    """The observation space of stored rows: in a masked run it has no mask, and the critic's keys come last."""
+    """The observation space of stored rows. In a masked run, it has no mask. The critic's keys come last."""
     return with_last(without_mask(observation, action) if masked else observation, critic_keys)

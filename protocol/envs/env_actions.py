@@ -118,7 +118,7 @@ def _make_rows(spec: ActionSpec) -> Callable[[Sequence[Array]], Array]:
 
 
 def _stored(policy: PolicySpec) -> Callable[[Array], Array]:
-    """Return a function that converts the environment's actions [..., *action] to stored actions; not for mixed actions."""
+    """Return a function that converts the environment's actions [..., *action], unless they are mixed, to stored actions."""
     spec = policy.action
     if spec.kind != "box":
         start = np.reshape(np.asarray(spec.start or 0), spec.shape if spec.start else ())

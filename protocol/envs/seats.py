@@ -30,7 +30,7 @@ STATE = "state"
 """Keys of observations: `seat` is the seat's number (with `--seat-id`), `state` is the environment's `state()` (with
 `--critic-keys state`).
 """
-MAX_AGENT_NAME = MAX_NAME - len("return_")  # characters; leaves room for the prefix of the agent's return
+MAX_AGENT_NAME = MAX_NAME - len("return_")  # characters; leaves room for the prefix in the name of the agent's return
 _NO_INFO: Mapping[str, Any] = {}
 RETURNED_WRONGLY = AttributeError, KeyError, TypeError, ValueError, OverflowError
 """Exceptions of code that reads an environment's results if a dict lacks an agent, or values aren't dicts or numbers."""
@@ -162,7 +162,7 @@ class SeatedEnv(gymnasium.Env[SeatStep, Sequence[Any]]):
         """Step the environment, and write the result into `step`. Returns whether the episode is over."""
 
     def owner(self, name: str) -> Any:
-        """The outermost of PettingZoo's wrappers that has this attribute itself; the environment if no wrapper has it."""
+        """The outermost PettingZoo wrapper that itself has this attribute; the environment if no wrapper has it."""
         owner = self.env
         while name not in dir(owner) and hasattr(owner, "env"):
             owner = owner.env

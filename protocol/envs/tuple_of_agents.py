@@ -18,7 +18,7 @@ from millrace.protocol.errors import UsageError, safe_repr
 
 
 def agents_in_tuples(observation: gymnasium.Space[Any], action: gymnasium.Space[Any]) -> int:
-    """The number of agents that these spaces suggest: the number of elements if both are Tuples of equal length, else 0."""
+    """The number of agents that these spaces suggest: their length if both are Tuples of equal length, else 0."""
     count = len(_elements(action))
     return count if count == len(_elements(observation)) else 0
 

@@ -100,7 +100,7 @@ def _is_whole(entry_point: metadata.EntryPoint) -> bool:
 
 
 def is_registered(env_id: str) -> bool:
-    """Whether gymnasium can make this id: it is registered, or it has no version and some version of it is registered."""
+    """Whether gymnasium can make this id: it is registered, or it has no version and one of its versions is registered."""
     if env_id in gymnasium.registry:
         return True
     try:

@@ -43,7 +43,7 @@ def wrong_arrays(expected: Iterable[Expected], axes: Axes | None = STEP_AND_COPY
 def wrong_observation(
     arrays: Sequence[Array], leaves: Sequence[Leaf], rows: tuple[int, ...], axes: Axes | None = STEP_AND_COPY
 ) -> str:
-    """What is wrong with an observation's arrays: there is one array [*rows, *leaf] for each leaf."""
+    """What is wrong with an observation's arrays, one [*rows, *leaf] for each leaf; empty if nothing is."""
     if len(arrays) != len(leaves):
         return f"observation: expected {len(leaves)} arrays, got {len(arrays)}"
     each = zip(leaves, arrays, strict=True)

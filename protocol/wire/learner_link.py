@@ -1,4 +1,4 @@
-"""The learner's end of the connections: one ROUTER socket, many workers. The address chooses the transport.
+"""The learner's end of the connections: one ROUTER socket for many workers. The address determines the transport.
 
 The socket needs two options. Without ROUTER_MANDATORY, a ROUTER silently drops messages at its high-water mark. Without
 ROUTER_HANDOVER, a worker that returns is locked out until its half-open connection times out. Only one thread may use a

@@ -1,10 +1,10 @@
 """Converts plain values to bytes and back, for `info` dicts and the results of calls. Types are kept. Pure; no pickle.
 
 A value is plain if it is None, a bool, int, float, complex, str, bytes, list, tuple, dict, or a numpy scalar or array of
-bools, numbers, text or bytes, or a numpy array of plain objects. Strings with a lone surrogate, which UTF-8 cannot encode,
-and integers with more decimal digits than Python converts are not plain. A value that isn't plain raises `TypeError`; if the
-caller asks for it, the value is instead sent as its `repr` and arrives as a `ReprString`, which cannot be confused with a
-string. For such a caller, subclasses of dict are plain too: they arrive as dicts.
+bools, numbers, text, bytes, dates or durations, or a numpy array of plain objects. Strings with a lone surrogate, which
+UTF-8 cannot encode, and integers with more decimal digits than Python converts are not plain. A value that isn't plain
+raises `TypeError`; if the caller asks for it, the value is instead sent as its `repr` and arrives as a `ReprString`, which
+cannot be confused with a string. For such a caller, subclasses of dict are plain too: they arrive as dicts.
 """
 
 from __future__ import annotations

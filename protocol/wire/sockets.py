@@ -46,7 +46,7 @@ def send_frames(socket: zmq.Socket[bytes], frames: Sequence[Buffer]) -> None:
 def _user(frame: zmq.Frame) -> str:
     try:
         return str(frame.get("User-Id"))
-    except zmq.ZMQError:  # should never happen: there is no key. No client has the key ""
+    except zmq.ZMQError:  # no key, which should never happen; no client has the key ""
         return ""
 
 

@@ -16,7 +16,7 @@ from time import perf_counter
 # On x86, no core sees a later store before an earlier one. Elsewhere, only a system call orders them, so we don't spin
 # there.
 CAN_SPIN = platform.machine() in {"x86_64", "AMD64", "i686"}
-SPIN_S = 0.0002  # a learner that only computes its next action is back by then; sleeping and waking costs 50 µs
+SPIN_S = 0.0002  # long enough for a learner that only computes its next action; sleeping and waking costs 50 µs
 BUSY_CORE_S = 0.00005  # if one turn of spinning takes longer, another process ran in between and needs this core
 MAX_SKIPPED_SPINS = 63  # largest number of waits without spinning between two attempts to spin
 

@@ -1,4 +1,4 @@
-"""A worker's end of its connection: one DEALER socket. The address chooses the transport. Only one thread may use a link."""
+"""A worker's end of its connection: one DEALER socket. The address sets the transport. Only one thread may use a link."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class WorkerLink:
         """whether there seems to be a connection; always False for transports other than tcp"""
         far = token is not None or not is_local(address)
         self.packing = Packing(stack=far, zstd=far and has_zstd())
-        """how rollouts may be packed; they aren't packed unless the connection is encrypted or leaves this machine"""
+        """how rollouts may be packed: only if the connection is encrypted or leaves this machine"""
         self._log_limiter = LogRateLimiter()
         self._owns_context = context is None
         self.context: zmq.Context[zmq.Socket[bytes]] = context or zmq.Context()

@@ -126,7 +126,7 @@ class Collecting:
         yield Wait(self.rollout_s / 5)
 
     def rollout(self, permit: Permit, rule: Rule | None = None) -> Script[Rollout]:
-        """The rollout for a permit that was dealt; wait for it if it hasn't arrived yet.
+        """The rollout for a permit that was dealt. Waits if the rollout hasn't arrived yet.
 
         If it doesn't arrive, raises `Broken` with `rule`, or by default with the rule that was probably broken.
         """

@@ -1,7 +1,7 @@
 """Checks a client: opens the learner's port, starts the client's process, and passes its messages to the examiner.
 
 Rule: this file decides nothing about the conversation; the examiner does (`examiner.py`). It only sends and receives
-messages, and starts and ends processes, always with a deadline. No process that it started outlives it.
+messages, and starts and ends processes, always with a deadline. No process that it starts outlives the test.
 """
 
 from __future__ import annotations
@@ -167,7 +167,7 @@ class _Port:
 
 
 class _Process:
-    """The client's process, in its own session, so that everything that it starts can be ended with it."""
+    """The client's process. It has its own session, so that all processes that it starts can be ended with it."""
 
     def __init__(self, command: Sequence[str], address: str, token: Path | None) -> None:
         words = {ADDRESS_WORD: address, TOKEN_WORD: "" if token is None else str(token)}

@@ -110,7 +110,7 @@ class WatchedSession:
         """the largest number of env steps that a Heartbeat has reported"""
 
     def to_keep(self, *named: int) -> tuple[int, ...]:
-        """The versions that an order lists as those to keep: `named`, and the versions of all unanswered tickets."""
+        """The versions that an order tells the client to keep: `named`, and the versions of all unanswered tickets."""
         of_permits = {ticket: dealt.version for ticket, dealt in self.permits.items()}
         of_orders = {ticket: order.version for ticket, order in self.orders.items() if isinstance(order, Evaluate)}
         answered = self.answers.keys() | self._results.keys()

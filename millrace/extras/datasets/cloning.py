@@ -29,8 +29,8 @@ from millrace.protocol.policy.torch_distributions import policy_log_prob
 from millrace.protocol.random_streams import Purpose, generator
 from millrace.protocol.rollout import Batch
 
-BATCH_SIZE = 64  # rows in a minibatch; updates often use a larger batch size, which would need more epochs here
-LEARNING_RATE = 1e-3  # updates often use a lower rate, so that they change little; it would need more epochs here
+BATCH_SIZE = 64  # rows in a minibatch; with a larger size, which updates often use, cloning would need more epochs
+LEARNING_RATE = 1e-3  # updates often use a lower rate, to change little; with such a rate, cloning would need more epochs
 
 
 def clone(algorithm: Algorithm, episodes: Iterable[Batch], pulse: Callable[[], None]) -> dict[str, float]:

@@ -79,7 +79,7 @@ class _RememberingFile(io.RawIOBase):
         """the first error, if any"""
         self._descriptor = descriptor
         self._at = 0
-        self._unwritten: list[tuple[int, bytes]] = []  # offset and data, in the order of the writes
+        self._unwritten: list[tuple[int, bytes]] = []  # pairs of offset and data, in the order of writing
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
         """Go to an offset from the beginning, the current position, or the end."""

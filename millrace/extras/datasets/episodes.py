@@ -59,7 +59,7 @@ class _LaneState:
     incarnation: int
     sequence: int  # sequence number of the next rollout
     running: list[list[_Fragment] | None] = field(default_factory=list)
-    """[N] the unfinished episode of each env copy; None, until its end, if its beginning is missing"""
+    """[N] the unfinished episode of each env copy; None until it ends if its beginning is missing"""
     last_obs: tuple[Array, ...] = ()  # the last observations of the newest rollout, [N, *leaf] each
     ended: Bools = field(default_factory=lambda: np.zeros(0, bool))  # [N] whether an episode ended in its last row
 

@@ -27,7 +27,7 @@ def make_native(env: EnvSpec, copies: int) -> VectorEnv[Any, Any, Any]:
 
 
 def check_unwrapped_id(env: EnvSpec, vector: str) -> None:
-    """Raise `UsageError` if the environment can't have a vectorized form: a callable, or an environment in wrappers."""
+    """Raise `UsageError` for a callable or an environment in wrappers, because these have no vectorized form."""
     if env.wrappers:
         raise UsageError(
             f"environment {env.id}: vector {vector}: wrappers are applied to single env copies; use --vector loop"

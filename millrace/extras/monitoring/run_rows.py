@@ -46,8 +46,8 @@ class RowFilter:
         return numbers(progress.row({**progress.metrics, **self._logged}))
 
     def _remember_logged(self, progress: Progress) -> None:
-        """Remember the numbers that callbacks logged. The run forgets them when it has written the row to metrics.jsonl, but
-        the row may not have been sent by then.
+        """Remember the numbers that callbacks logged. The run forgets them once it has written the row to metrics.jsonl,
+        perhaps before the row is sent.
         """
         if progress.updates != self._logged_update:
             self._logged_update = progress.updates
