@@ -15,7 +15,7 @@ class RunProgress(msgspec.Struct, frozen=True, kw_only=True):
     """The progress of a run at one moment. Returns are sums of raw rewards. A number that does not exist is None."""
 
     at_s: Moment = 0.0
-    """that moment; 0 if it is not known"""
+    """the time of this moment; 0 if it is not known"""
     env_steps: Natural = 0
     """env steps that updates have used so far, including those before a resume"""
     collected: Natural = 0
@@ -35,7 +35,7 @@ class RunProgress(msgspec.Struct, frozen=True, kw_only=True):
     lag_mean: Figure = 0.0
     """mean lag of the rollouts of the last update, in versions of the weights"""
     lag_max: Natural = 0
-    """the largest of these lags"""
+    """the largest lag of these rollouts"""
     workers_alive: Natural = 0
     """workers that have joined and are not lost"""
     workers_expected: Natural = 0

@@ -4,8 +4,8 @@ The text of a rule is written once, in README.md, after a marker with the rule's
 
     <!-- rule ORDER_ONCE -->An order that comes again is not executed again: the same answer is sent again.
 
-Rule: all code that keeps, checks or breaks a rule names it. State tables and other code do so in a comment
-(`rule ORDER_ONCE`). The model's invariants and mutations, the checks of clients and the mutants of a client do so by
+Rule: all code that keeps, checks or breaks a rule names it. State tables and other code name it in a comment (`rule
+ORDER_ONCE`). The model's invariants and mutations, the checks of clients, and the mutants of a client name it as
 `Rule.ORDER_ONCE`. `tests/protocol/test_rules.py` lists all of them, and checks that none is missing.
 
 The text of a rule ends at the next marker, which may have no name, or at the end of its paragraph, list item or table cell.

@@ -112,8 +112,7 @@ class EnvDescription(msgspec.Struct, frozen=True, array_like=True):
     wrappers: Annotated[tuple[Line, ...], Meta(max_length=MAX_WRAPPERS)] = ()
     """the classes of the copy's gymnasium wrappers, as `module:Class`, and the wrapper classes from which these derive"""
     seats: Annotated[tuple[Name, ...], Meta(max_length=MAX_SEATS)] = ()
-    """the names of the agents, if the environment has several, or PettingZoo's interface; the spaces are those of each agent
-    """
+    """the agents' names, if the environment has several or has PettingZoo's interface; the spaces are those of each agent"""
     takes_turns: bool = False
     """whether a seat may have to wait for others between two of its actions"""
 

@@ -1,7 +1,7 @@
 """The name by which the user can start this program in a shell, for lines that say what to type next.
 
 Rule: printed commands work when the user types them. `millrace` works only if the shell finds this very program under that
-name; in a clone whose virtual environment isn't active, it doesn't.
+name, which it doesn't in a clone whose virtual environment isn't active.
 """
 
 from __future__ import annotations

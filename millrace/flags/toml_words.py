@@ -1,8 +1,8 @@
 """Turns a word in `NAME VALUE ...` into a value, and a value into such a word.
 
 Rule: a word that is a value in TOML is that value, as in a config file. Any other word is text, unless it is a value in
-another language (`None`, `True`, `.5`). Such a word is refused, because nobody means it as text: the text "False" would be
-true.
+another language (`None`, `True`, `.5`). Such a word is refused, because nobody means it as text. (The text "False" would
+count as true.)
 """
 
 from __future__ import annotations

@@ -103,8 +103,8 @@ def worker_cores(config: RolloutConfig) -> list[int]:
 
     New weights wake all workers at once, while the learner still runs. Linux then often puts two workers on one core and
     leaves another core idle, too briefly for it to move a worker there. Workers aren't pinned if they are fewer than the
-    cores: Linux finds a free core for each, and pinned workers might share a core with the workers of another run. They
-    aren't pinned in a run with a lag either, because nothing would be gained.
+    cores: Linux finds a free core for each, and pinned workers might share a core with the workers of another run. Nor are
+    they pinned in a run with a lag, because nothing would be gained.
     """
     if not hasattr(os, "sched_setaffinity"):
         return []

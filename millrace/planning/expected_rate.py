@@ -159,7 +159,7 @@ def _stretched_s(collecting_s: float, busy: float, learner_s: float, cores: int)
 
 
 def _larger(a: float, b: float) -> float:
-    """A smooth maximum of two times. It is a little larger than both if they are similar, because then each of them is the
+    """A smooth maximum of two times. If they are similar, it is a little larger than both, because each of them is then the
     larger one in some rounds.
     """
     return math.pow(math.pow(a, SHARPNESS) + math.pow(b, SHARPNESS), 1 / SHARPNESS)

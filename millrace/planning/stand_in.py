@@ -1,8 +1,8 @@
 """An environment that has the spaces of another one and does nothing, so that only the time of millrace itself is measured.
 
-Rule: it returns the same observation at each step, and its episode never ends. A step waits if steps of the real environment
-wait, because a process that was asleep computes more slowly for a while. The sum of the rewards of a step is the CPU time in
-seconds that the worker has used since the previous step.
+Rule: it returns the same observation at each step, and its episode never ends. If steps of the real environment wait, its
+steps wait too, because a process computes more slowly for a while after it was asleep. The sum of the rewards of a step is
+the CPU time in seconds that the worker has used since the previous step.
 """
 
 from __future__ import annotations

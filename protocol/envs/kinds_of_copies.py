@@ -2,8 +2,8 @@
 
 Rule: the name of a kind stands for an object `module:name`, which is imported when a run asks for the kind. Built-in kinds
 are in `KINDS`. Other packages install theirs as entry points of the group `millrace.copies`, which are read only for a name
-that isn't built in. The learner imports kinds too (all but `loop`, which has every ability), so the module of a kind must
-not import a simulator at its top level.
+that isn't built in. The learner also imports kinds (except `loop`, which has every ability), so a kind's module must not
+import a simulator at its top level.
 """
 
 from __future__ import annotations

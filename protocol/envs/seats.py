@@ -1,7 +1,7 @@
 """Environments with several agents: PettingZoo's parallel and AEC interfaces, as one environment with A seats.
 
-A seat is an agent's place in an env copy, in the order of `possible_agents`. Its agent may act at every step, have the move
-only now and then, leave before the others, or join later.
+A seat is an agent's place in an env copy, in the order of `possible_agents`. Its agent may act at every step or only when it
+has the move, leave before the others, or join later.
 
 Rule: a row of a seat spans the time from one of the seat's actions to its next observation: the one in which it has the move
 again, or its last one. `SeatStep.complete` marks the step that returns this observation. Until then the seat waits, and its

@@ -146,7 +146,7 @@ class KeyFolder:
 
     @contextmanager
     def _locked(self) -> Iterator[None]:
-        """Hold the folder's lock, so that two commands that run at the same time do not lose each other's entry."""
+        """Hold the folder's lock, so that two commands that run at the same time don't overwrite each other's entries."""
         folder = os.open(self.path, os.O_RDONLY)
         try:
             fcntl.flock(folder, fcntl.LOCK_EX)
@@ -159,7 +159,7 @@ class Keyring:
     """The learner's key and the current list of clients. Two threads read it; `refresh` replaces the list as one object."""
 
     def __init__(self, key: Key, allowed: ClientList, folder: KeyFolder | None = None) -> None:
-        """`folder` is where the list is read again when it changes; if it is None, the list never changes."""
+        """`folder`: when the list in it changes, it is read again. If `folder` is None, the list never changes."""
         self.key = key
         self.allowed = allowed
         self.folder = folder

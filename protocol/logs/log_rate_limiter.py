@@ -17,7 +17,7 @@ class LogRateLimiter:
         """Allow one line for each key in `every_s` seconds, for at most `most` keys in that time."""
         self.every_s = every_s
         self.most = most
-        self._last_lines: dict[str, tuple[float, int]] = {}  # per key: time of the last line, lines suppressed since
+        self._last_lines: dict[str, tuple[float, int]] = {}  # per key: time of the last line, and lines suppressed since
 
     def due(self, key: str, now: float) -> int | None:
         """Ask whether to log a line with this key now.

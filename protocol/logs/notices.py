@@ -10,7 +10,7 @@ import logging
 
 
 def log_notice(log: logging.Logger, line: str, *, kept: bool = True) -> None:
-    """Log one line as a notice. `kept` says whether it may also be written to a file; an address with a token may not."""
+    """Log one line as a notice. `kept`: whether it may also be written to a file; False for an address with a token."""
     log.warning("%s", line, extra={"notice": True, "kept": kept})
 
 

@@ -1,7 +1,7 @@
 """Makes PyTorch's threads sleep while they wait for one another. Import this module before PyTorch.
 
-By default they spin, and occupy the core that the slowest of them needs: if other processes are busy, a pass takes up to
-sixty times as long. OpenMP reads the environment variable only when it is loaded, together with PyTorch.
+By default they spin, and thus occupy the core that the slowest thread needs. If other processes are busy, a pass then takes
+up to sixty times as long. OpenMP reads the environment variable only when it is loaded, together with PyTorch.
 """
 
 from __future__ import annotations

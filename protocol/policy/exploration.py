@@ -105,9 +105,7 @@ class EpsilonGreedy:
 
 
 class _Bounded:
-    """Base of the two distributions of actions in [-1, 1]. Noise is [..., 2 D]: normal numbers, then uniform ones in [-1,
-    1].
-    """
+    """Base of the two distributions of actions in [-1, 1]. Noise is [..., 2 D]: D normal, then D uniform numbers."""
 
     def __init__(self, shape: tuple[int, ...]) -> None:
         self._size = math.prod(shape)
@@ -133,7 +131,7 @@ class _Bounded:
         return BoundedNoise(noise[..., : self._size], noise[..., self._size :])
 
     def _uniform_in_warm_up(self, warm_up: Floats, uniform: Floats, action: Floats) -> Array:
-        """The action [..., D] in the shape of the action space; where `warm_up` [..., 1] is above 0, the uniform action."""
+        """The action [..., D], or `uniform` where `warm_up` [..., 1] is above 0, in the shape of the action space."""
         chosen = np.where(warm_up > 0, uniform, action)
         return chosen.reshape(*action.shape[:-1], *self._shape)
 

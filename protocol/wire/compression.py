@@ -2,7 +2,7 @@
 
 A packing has a name. The head lists the packings of an array in the order in which they were applied. `zstd` is a Zstandard
 frame (RFC 8878) that declares its content size. `stack` is for frame stacks, as made by gymnasium's FrameStackObservation:
-uint8 [T+1, N, k, H, W, …]. In most cases, step t+1 is step t shifted by one frame, so that only its newest frame is new. The
+uint8 [T+1, N, k, H, W, …]. In most cases, step t+1 is step t shifted by one frame, and only its newest frame is new. The
 payload of a stack is
 
     bits     [N, T]        1: step t+1 of copy n is step t shifted by one frame; lowest bit first, zeros up to a whole byte

@@ -6,8 +6,8 @@ link.
 
 With keys, a peer is identified by its routing id *and* its key, which libzmq verifies for every message. A client that
 claims another's routing id with its own key is therefore another peer: it can neither speak in that worker's session nor end
-it. It cannot even cut that worker's connection by a handover (which leaves the earlier connection open but unread), because
-a worker's routing id ends in a tag that only the holder of its key can compute.
+it. Nor can it cut that worker's connection by a handover, which would leave the worker's connection open but unread: the
+worker's routing id ends in a tag that only the holder of its key can compute.
 """
 
 from __future__ import annotations

@@ -112,7 +112,7 @@ def says_hello(learner: Learner) -> Script[None]:
     token = learner.settings.token
     peer = (
         learner.peer.rpartition(b"\0")[0] if token else learner.peer
-    )  # without the key that the learner's socket appends to the routing id
+    )  # removes the key that the learner's socket appends to the routing id
     if peer.partition(b"\0")[0] != hello.worker.encode():
         raise Broken(Rule.HELLO, f"the routing id {hello.worker!r}, the worker's name", f"{peer!r}")
     if peer != (expected := routing_id(hello.worker, token)):

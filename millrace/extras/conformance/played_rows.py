@@ -98,8 +98,8 @@ class PlayedRows:
             )
 
     def _against_the_best(self, rows: EpisodeRows) -> tuple[Array, Array, Array]:
-        """For each row: the log-probability of the most probable action, by how much the chosen action's log-probability is
-        lower, and whether the chosen action is the most probable one.
+        """Three values for each row: the log-probability of the most probable action, how far the chosen action's is below
+        it, and whether the chosen action is the most probable one.
         """
         params = params_of(self._run, self._weights, [leaf[:-1, None] for leaf in rows.obs])
         policy = distribution(self._run.policy)

@@ -528,7 +528,7 @@ def forgets_unlisted_lanes(learner: Learner) -> Script[None]:
 
 
 def _has_no_copies(steps: Stepping, rule: Rule) -> Script[None]:
-    """Check that lane 0, whose copies had episodes, was closed: a Reset of one copy must be ignored, or make new copies."""
+    """Check that lane 0, whose copies had episodes, was closed. A Reset of one copy must be ignored or make new copies."""
     order = steps.reset(copies=(0,))
     steps.learner.send(order)
     yield Wait(0.5, lambda event: isinstance(event, Heard) and getattr(event.message, "ticket", 0) == order.ticket)

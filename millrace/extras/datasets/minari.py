@@ -135,7 +135,7 @@ class MinariDataset:
 
         data = self._folder / "data"
         data.mkdir(parents=True)
-        for namespace in self._namespaces:  # not made by Minari's own function, which follows links in all datasets
+        for namespace in self._namespaces:  # Minari's own function isn't used, because it follows links in all datasets
             if not (namespace / OF_NAMESPACE).exists():
                 (namespace / OF_NAMESPACE).write_text("{}")
         spec = self._env.spec if _spec_can_be_stored(self._env) else None

@@ -83,7 +83,7 @@ def envpool_spec(env: EnvSpec) -> EnvpoolSpec:
             if isinstance(action, spaces.Box):  # envpool casts actions to float32
                 action = spaces.Box(action.low.astype(np.float32), action.high.astype(np.float32))
     except (TypeError, AssertionError) as error:
-        says = str(error).strip().partition("() ")  # without the name of the function that got a wrong argument
+        says = str(error).strip().partition("() ")  # removes the name of the function that got a wrong argument
         raise UsageError(f"environment {env.id}: envpool cannot make it: {says[2] or says[0]}; use --vector loop") from error
     limit = options.get("max_episode_steps") or known.max_episode_steps or made.config.max_episode_steps
     return EnvpoolSpec(task, {**options, "max_episode_steps": min(limit + 1, MAX_EPISODE_STEPS)}, limit, observation, action)

@@ -1,6 +1,6 @@
 """Serves the learner's metrics to Prometheus at `/metrics`. Their names follow Prometheus's conventions.
 
-Rule: the training loop now and then publishes a whole snapshot in one assignment, and never waits. The server's threads read
+Rule: now and then, the training loop publishes a whole snapshot in one assignment. It never waits. The server's threads read
     only the newest snapshot. Labels have few values: millrace's own, and at most `MAX_FACTS` names of `info_keys`, but never
     names of workers, paths or keys.
 """

@@ -1,8 +1,8 @@
 """Reads a growing metrics.jsonl, each time from where the last read ended, and keeps a bounded number of its rows.
 
 Rule: of a long file, it keeps rows at equal intervals, rows with an evaluation (all of them as long as they are few), and
-the newest row. The newest row is read again each time, because a run may add numbers to it. If the file was replaced, as it
-is when a run is resumed, it is read from the beginning.
+the newest row. The newest row is read again each time, because a run may add numbers to it. If the file was replaced, for
+example by a resume, it is read from the beginning.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class MetricsTail:
         self._evaluations = _Thinned(self._most)
 
     def _add(self, text: bytes) -> bytes:
-        """Add the lines of this text. Returns the rest, from the newest whole line on, because that line may change."""
+        """Add the lines of this text, except the newest whole line, which may change. Returns the text from that line on."""
         ends = np.flatnonzero(np.frombuffer(text, np.uint8) == NEWLINE)
         begins = np.concatenate([[0], ends + 1])
         if np.diff(begins, append=len(text)).max() > MOST_LINE_BYTES:
