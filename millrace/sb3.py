@@ -194,7 +194,7 @@ class Sb3VecEnv(VecEnv):
         return self.env.render() if self.render_mode == "rgb_array" else [None] * self.num_envs
 
     def _call_each(self, indices: Indices, name: str, *args: Any, **kwargs: Any) -> list[Any]:
-        """The attribute `name` of each env copy, called if it is a method, in the order of `indices`."""
+        """The attribute `name` of each env copy, in the order of `indices`; if it is a method, the result of calling it."""
         copies = self._copies(indices)
         ascending = sorted(set(copies))
         results = dict(zip(ascending, self.env.calls.call(ascending, name, args, kwargs), strict=True))

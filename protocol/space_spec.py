@@ -99,7 +99,7 @@ class EnvDescription(msgspec.Struct, frozen=True, array_like=True):
     observation: SpaceSpec
     action: SpaceSpec
     metadata: Array
-    """[bytes] uint8, `plain_values`: the entries of `Env.metadata` that are plain data"""
+    """[bytes] uint8: the entries of `Env.metadata` that are plain data, packed by `plain_values`"""
     spec: Text
     """gymnasium's `EnvSpec` as JSON; empty if the environment has none, or one that JSON cannot represent"""
     longest_episode: Natural

@@ -138,7 +138,8 @@ def _decided(
 ) -> RunPlan:
     """The plan that follows from the measurements.
 
-    `first` and `others`: settings that are listed before and after the numbers of workers, copies and lanes, and the lag.
+    It lists the settings in `first`, then the numbers of workers, copies and lanes, and the lag, then the settings in
+    `others`.
     """
     has_replay = isinstance(config.algorithm, OffPolicyConfig)
     default_steps = config.algorithm.rollout_steps

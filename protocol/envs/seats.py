@@ -62,7 +62,7 @@ def side_by_side(copies: Iterable[SeatStep]) -> SeatStep:
 
 
 def columns_of(copies: Sequence[int], seats: int) -> Sequence[int]:
-    """The columns of these env copies in the rows of their lane, where each copy has this many adjacent columns."""
+    """The columns of these env copies in the rows of their lane. Each copy has `seats` adjacent columns."""
     return copies if seats == 1 else [n * seats + seat for n in copies for seat in range(seats)]
 
 

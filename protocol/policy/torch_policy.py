@@ -1,4 +1,4 @@
-"""The forward pass in torch with which workers act if the policy needs it (images, user-defined encoders).
+"""The forward pass in torch, with which workers act if the policy has images or a user-defined encoder.
 
 Rule: a pass does not depend on the torch defaults that the program, or an environment, has set for its own purposes.
 """

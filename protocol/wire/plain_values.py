@@ -33,9 +33,7 @@ class ReprString(str):
 
 
 def pack(value: object, use_repr: bool = False) -> bytes:
-    """Convert a plain value to bytes. If it isn't plain, `use_repr` packs its `repr` instead; otherwise, raises
-    `TypeError`.
-    """
+    """Convert a plain value to bytes. For any other value, packs its `repr` if `use_repr`; otherwise raises `TypeError`."""
     return _pack(_to_msgpack(value, "", use_repr, 0))
 
 

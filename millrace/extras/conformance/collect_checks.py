@@ -1,7 +1,7 @@
 """The checks of the collector profile: the client chooses actions with the weights, and sends rollouts.
 
-Each check is a function that `profiles.py` lists (`script.py`). Its docstring says what the learner does to the client. In
-every check, the watch also recomputes what it can of every rollout (`lane_rows.py`).
+Each check is a function that `profiles.py` lists; see `script.py`. Its docstring says what the learner does to the client.
+In every check, the watch also recomputes what it can of every rollout (`lane_rows.py`).
 """
 
 from __future__ import annotations

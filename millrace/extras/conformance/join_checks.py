@@ -1,7 +1,7 @@
 """The checks that both profiles share: joining, leaving, and describing the environment.
 
-Each check is a function that `profiles.py` lists (`script.py`). Its docstring says what the learner does to the client. The
-checks follow the order of states and messages in the section "The worker's half" of the wire document.
+Each check is a function that `profiles.py` lists; see `script.py`. Its docstring says what the learner does to the client.
+The checks follow the order of states and messages in the section "The worker's half" of the wire document.
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ from millrace.protocol.rows.played import reason_to_reject
 from millrace.protocol.rules import Rule
 from millrace.protocol.specs import RunSpec
 
-BY_CHANCE = -14.0  # all sampled actions may be the most probable ones by chance if the log-probability of that is larger
+BY_CHANCE = -14.0  # if log P(every sampled action is the most probable one) exceeds this, that may be chance
 
 
 class PlayedRows:

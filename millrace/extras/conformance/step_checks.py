@@ -1,6 +1,6 @@
 """The checks of the environment profile: the learner chooses actions, and the client resets and steps on order.
 
-Each check is a function that `profiles.py` lists (`script.py`). Its docstring says what the learner does to the client.
+Each check is a function that `profiles.py` lists; see `script.py`. Its docstring says what the learner does to the client.
 """
 
 from __future__ import annotations

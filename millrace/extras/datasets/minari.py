@@ -61,7 +61,7 @@ class MinariDataset:
         self._id = dataset_id
         self._env = env
         self._about = about
-        self._storage: Any = None  # the dataset's files, made with the first episode to write
+        self._storage: Any = None  # the dataset's files, made when the first episode is written
         self._episodes = self._steps = 0  # numbers of episodes and steps in these files
         self._chunk: list[Any] = []
         self._chunk_bytes = 0

@@ -221,7 +221,7 @@ class _StepAfterLives(VectorWrapper):
     def __init__(self, env: VectorEnv[Any, Any, Any]) -> None:
         super().__init__(env)
         self._ended = np.zeros(env.num_envs, bool)  # whether the newest step ended an episode
-        self._hidden = np.zeros(env.num_envs, bool)  # whether the newest step hid an end
+        self._hidden = np.zeros(env.num_envs, bool)  # whether the newest step hid the end of an episode
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         self._ended[:] = self._hidden[:] = False

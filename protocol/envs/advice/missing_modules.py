@@ -1,4 +1,4 @@
-"""What to install for a missing Python module whose package has another name, or must not be the newest. Pure."""
+"""What to install for a missing Python module if its package has another name, or is needed in an older version. Pure."""
 
 from __future__ import annotations
 

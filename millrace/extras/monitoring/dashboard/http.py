@@ -147,7 +147,7 @@ def _stored(body: bytes | StoredBody) -> StoredBody:
 
 
 def _wanted_part(headers: Mapping[str, str], tag: str, size: int) -> range | None:
-    """The range of bytes that the browser requests, empty if they don't exist; None for all (RFC 9110, section 14)."""
+    """The range of bytes that the browser requests; empty if it doesn't exist; None for all bytes (RFC 9110, section 14)."""
     match = RANGE.fullmatch(headers.get("range", ""))
     if match is None or not any(match.groups()) or headers.get("if-range", tag) != tag:
         return None

@@ -123,7 +123,9 @@ class Lookout:
         self._thread.join()
 
     def look(self, run: Path) -> Seen:
-        """What is known about the learner of this run. From now on, the learner is asked while a page of the run is open."""
+        """What is known about the learner of this run. From now on, the learner is asked again and again while a page of the
+        run is open.
+        """
         with self._lock:
             watched = self._watched.setdefault(run, _Watched(self._clock()))
             watched.looked_s = self._clock()

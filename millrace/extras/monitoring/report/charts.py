@@ -99,7 +99,7 @@ def chart(all_series: Sequence[Series], width: int, height: int, x_label: str, d
 
 
 def chart_for_all_widths(all_series: Sequence[Series], wide: tuple[int, int], x_label: str, describe: str) -> str:
-    """The chart in two sizes. The style sheet shows the one that fits, because text must not shrink with its chart."""
+    """The chart in two sizes. The style sheet shows the one that fits, because a chart's text must not shrink with it."""
     sizes = {"for-wide": wide, "for-narrow": ON_A_PHONE}
     return "".join(f'<div class="{css}">{chart(all_series, *size, x_label, describe)}</div>' for css, size in sizes.items())
 
