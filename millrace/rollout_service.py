@@ -263,7 +263,7 @@ class RolloutService:
     def normalizer(self) -> Normalizer:
         """Running mean and standard deviation of observations and returns, as in the built-in trainer.
 
-        The first access makes it, and imports torch. From then on, `publish` sends its mean and standard deviation to a
+        The first access creates it and imports torch. From then on, `publish` sends its mean and standard deviation to a
         policy that normalizes observations.
 
         >>> import millrace

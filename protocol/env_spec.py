@@ -137,15 +137,15 @@ class PickledCallable:
 def check_arguments(arguments: Mapping[str, Any], of: str, makes: str = "gymnasium.make(ID, {name}={name})") -> None:
     """Raise `UsageError` for a keyword argument that no message can carry.
 
-    `of` names, in the error, what the arguments are for. `makes` is the call that the error suggests for a value of another
-    type: the user puts it in a function of their own.
+    `of`: what the arguments are for, in the words of the error. `makes`: for a value of another type, the error suggests
+    that the user put this call into a function of their own.
     """
     for name, value in arguments.items():
         try:
             if not isinstance(value, Scalar):  # msgspec would encode a date, for example, as text
                 raise TypeError
             msgspec.msgpack.decode(msgspec.msgpack.encode({name: value}), type=dict[str, Scalar])
-        except (TypeError, ValueError, OverflowError) as error:  # msgspec.ValidationError is a ValueError
+        except (TypeError, ValueError, OverflowError) as error:  # a msgspec.ValidationError is also a ValueError
             raise UsageError(
                 f"{of}: argument {name}: expected a number of at most 64 bits, text, True or False, got "
                 f"{type(value).__name__} {one_line(safe_repr(value), 60)}; for others, pass a function in place of the "

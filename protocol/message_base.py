@@ -1,4 +1,4 @@
-"""The base of all messages except `Rollout`. It imports little, so that a small program can use single messages."""
+"""The base of all messages except `Rollout`. It imports little, so that a small program can use just a few messages."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Measures the time that millrace itself needs on this machine for collecting and updates.
 
-The environment that it collects from does nothing.
+For this, it collects from an environment that does nothing.
 
 Rule: nothing is assumed about the machine. Rounds of different sizes are timed, and the times of a row, a lane, a copy and a
 rollout are computed from the differences. CPU time is measured, so that other programs on this machine hardly affect the

@@ -1,4 +1,4 @@
-"""The random generators of gymnasium spaces as text, so that a seeded space draws the same samples in another process. Pure.
+"""Gymnasium spaces' random generators as text, so that a seeded space draws the same samples in another process. Pure.
 
 Rule: only existing generators are described. A space that was never seeded has none, and makes one when it is first sampled.
 Generators other than PCG64, which gymnasium uses, are left out.

@@ -126,7 +126,7 @@ def filled(kwargs: Mapping[str, Any], env: str) -> dict[str, Any]:
 
 
 def _value(node: ast.expr, names: Mapping[str, int]) -> int:
-    """The value of an expression. Raises `LookupError` if it contains other names or operators than `filled` allows."""
+    """The value of an expression. Raises `LookupError` if it contains names or operators that `filled` doesn't allow."""
     match node:
         case ast.Name(name):
             return names[name]

@@ -131,7 +131,7 @@ def pack_stack(array: Array) -> Bytes | None:
     payload = np.empty(bits.size + chosen.size * frames.shape[-1], np.uint8)
     payload[: bits.size] = bits
     out = payload[bits.size :].reshape(chosen.size, -1)
-    np.take(frames.reshape(-1, frames.shape[-1]), chosen, axis=0, out=out, mode="clip")  # mode "raise" copies once more
+    np.take(frames.reshape(-1, frames.shape[-1]), chosen, axis=0, out=out, mode="clip")  # mode "raise" would copy once more
     return payload
 
 

@@ -131,7 +131,7 @@ class LearnerLink:
         return "" if self.keyring is None else self.name_for_log(peer)
 
     def _peer(self, routing_id: bytes, key: str) -> bytes:
-        """The id of the peer with this routing id and key. Records that this key is the last one to use the routing id."""
+        """The id of the peer with this routing id and key. Records that this key was the last one to use the routing id."""
         self._last_keys.pop(routing_id, None)  # so that the dict stays ordered by last message
         self._last_keys[routing_id] = key
         if len(self._last_keys) > MAX_REMEMBERED_KEYS:

@@ -427,7 +427,7 @@ def keeps_its_weights(learner: Learner) -> Script[None]:
     session = yield from collecting_at_length(learner)
     permit = session.permit()
     session.deal(permit)
-    for version in range(2, 20):  # sent without their orders, as if the orders had been lost
+    for version in range(2, 20):  # these weights are sent without their orders, as if the orders had been lost
         session.give(session.weights(version))
         yield Wait(session.rollout_s / 10)
     yield from session.rollout(permit)

@@ -1,4 +1,4 @@
-"""`--record`: a callback that writes the whole episodes of training as a Minari dataset.
+"""`--record`: a callback that writes every whole episode of training into a Minari dataset.
 
 Rule: if the dataset can't be written, training doesn't stop. The dataset is removed, and the run fails when it has ended.
 """

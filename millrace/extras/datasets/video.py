@@ -92,7 +92,7 @@ def record_videos(
 def _write(path: Path, frames: list[Array], frames_per_s: float) -> None:
     """Encode each of these frames [H, W, 3] once.
 
-    moviepy's own clips have a length in seconds, and would lose the last frame by rounding.
+    moviepy's own clips have a length in seconds; rounding it would lose the last frame.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # packages that moviepy uses give warnings
