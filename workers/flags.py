@@ -27,7 +27,7 @@ class WorkerFlags(msgspec.Struct, frozen=True, kw_only=True):
     stay: bool = False
     """after a run, wait for the next learner at ADDRESS, until SIGTERM or Ctrl-C; every run gets new processes"""
     evaluate: bool = False
-    """only play the evaluations of the run, beside training if the learner has --eval-workers; never collect"""
+    """only play the evaluations of the run, alongside training if the learner has --eval-workers; never collect"""
     token: Annotated[str, Flag("FILE")] = ""
     """file with the join token; or set MILLRACE_TOKEN to a file or a token"""
     insecure: bool = False
