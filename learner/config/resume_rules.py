@@ -20,7 +20,7 @@ class OnResume(Enum):
     """What a resumed run does if a setting gets another value. A member's value is its text in the documentation."""
 
     FREE = "Another value takes effect at once."
-    ADAPTABLE = "Another value takes effect at once. Lanes whose number of env copies changes begin new episodes."
+    ADAPTABLE = "Another value takes effect at once. A lane begins new episodes if its number of env copies changes."
     FIXED = "Another value is refused: the weights or the state of the run would not match the new value."
 
 
