@@ -114,7 +114,14 @@ def workers_to_wait_for(config: RolloutConfig, local: int | None) -> int:
 
 
 def unused_setting(config: Config) -> str:
-    """A line for the user if a setting needs evaluations during training, and there are none; otherwise empty."""
+    """A line for the user if a setting has no effect: the run ends before the first gradient step, or a setting needs
+    evaluations during training, and there are none. Otherwise empty.
+    """
+    if isinstance(config.algorithm, OffPolicyConfig) and config.steps <= config.algorithm.learning_starts:
+        return (
+            f"learning_starts {config.algorithm.learning_starts:,}: nothing is learned in the {config.steps:,} env steps of "
+            f"this run; take --learning-starts {config.steps // 10} or more --steps"
+        )
     if config.eval_every:
         return ""
     if config.eval_workers:

@@ -14,7 +14,7 @@ MOST_LINES = 300
 def test_the_client_is_as_short_as_it_says() -> None:
     lines = client().count("\n")
     assert lines < MOST_LINES
-    assert f"It has {lines} lines" in PAGE.read_text(encoding="utf-8")
+    assert f"The example has {lines} lines" in PAGE.read_text(encoding="utf-8")
 
 
 def test_the_client_imports_a_zeromq_library_and_a_msgpack_library_and_nothing_of_millrace() -> None:

@@ -131,6 +131,14 @@ def test_a_target_that_no_evaluation_can_reach_is_said() -> None:
     assert not unused_setting(resolve("CartPole-v1", preset="none"))
 
 
+def test_a_run_that_ends_before_it_learns_is_warned_of() -> None:
+    assert unused_setting(resolve("Pendulum-v1", algo="xqc", preset="none", steps=1000, learning_starts=1000)) == (
+        "learning_starts 1,000: nothing is learned in the 1,000 env steps of this run; take --learning-starts 100 or more "
+        "--steps"
+    )
+    assert not unused_setting(resolve("Pendulum-v1", algo="xqc", preset="none", steps=1001, learning_starts=1000))
+
+
 @pytest.mark.parametrize(
     ("keywords", "says"),
     [
