@@ -140,7 +140,7 @@ class Lobby:
 
     def hand_over(self) -> Membership[Member]:
         """Close the lobby. Returns the workers that wait for the run, for its hub to take over."""
-        self._server.listen(0.0)  # so that the hub takes over no worker whose process has ended or whose key was revoked
+        self._server.listen(0.0)  # first, because the hub must not take over ended or revoked workers
         self._server.close()
         return self._coordinator.membership
 

@@ -173,7 +173,7 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
     # ---------------------------------------------------------------- some lanes, while others step
 
     def begin_step(self, lanes: Sequence[int], actions: Any) -> None:
-        """Order the copies of these lanes to step. Other lanes may be stepping. Actions have a row for every copy."""
+        """Start a step of these lanes; others may still be stepping. `actions` has a row for every copy of all lanes."""
         self._check_idle("begin_step", of_sent=True)
         self._step(lanes, actions, together=False)
 

@@ -29,8 +29,8 @@ _OPERATORS: dict[type[ast.operator], Callable[[int, int], int]] = {
 class EnvCopy:
     """One copy of the environment: its numbers in the run, and its slot on its machine.
 
-    A factory with one argument gets it, `millrace.env_copy()` returns it, and strings among the keyword arguments of the
-    environment may use its integers, as in `{5000 + slot}`.
+    It is passed to a factory that takes one argument, and returned by `millrace.env_copy()`. String keyword arguments of the
+    environment can refer to its integer fields, as in `{5000 + slot}`.
 
     >>> import gymnasium, millrace
     >>> def make_env(copy: millrace.EnvCopy) -> gymnasium.Env:

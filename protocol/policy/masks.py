@@ -47,7 +47,7 @@ class MaskedEpsilonGreedy(EpsilonGreedy):
     """The allowed action with the highest value, or, with probability ε, one drawn uniformly from all allowed actions."""
 
     def sample(self, params: Floats, noise: Floats) -> Array:
-        """Sampled actions, int64, counting from 0."""
+        """The sampled actions, as zero-based int64 indices."""
         allowed = _allowed(params)
         whether, which = GreedyNoise.of(noise)
         number = (which * allowed.sum(-1)).astype(np.int64)  # index among the allowed actions

@@ -179,10 +179,10 @@ class Hindsight:
     # ---------------------------------------------------------------- under another goal
 
     def outcome(self, achieved: Array, desired: Array, terminated: Bools, goal: Array) -> Outcome:
-        """The rewards and ends [K] of steps under replacement goals, `goal` [K, *goal].
+        """Rewards and terminations [K] of steps whose goals are replaced by `goal` [K, *goal].
 
-        The steps led to the goals `achieved` while `desired` applied, and `terminated` [K] says which of them terminated
-        their episode. A termination stays if reaching the desired goal did not cause it.
+        The steps reached `achieved`; their original goals were `desired`; `terminated` [K] says which of them terminated
+        their episode. Terminations that reaching the original goal caused are dropped; others are kept.
         """
         led_to = _flat(achieved)
         wanted = _flat(goal)
