@@ -156,6 +156,6 @@ class OpponentPool:
             state.rating += change
 
     def _change(self, of_opponent: float, score: float) -> float:
-        """The change in the policy's rating that this score causes. Equally strong teams are expected to win equally often."""
+        """The change in the policy's rating that this score causes. Equally strong teams should win equally often."""
         others = self._settings.teams - 1
         return K * (score - 1 / (1 + others * 10 ** ((of_opponent - self.state.rating) / SCALE)))
