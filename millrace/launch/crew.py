@@ -83,8 +83,9 @@ def crew_of_run(config: Config, run: Path) -> Crew:
     count = local_workers(config) + config.eval_workers
     if config.transport == "inproc":
         return Crew(count, config.eval_workers)
-    cores = [] if config.eval_workers else worker_cores(config)
-    return Crew(count, config.eval_workers, _log_folder(run), cores)
+    # A pinned worker that only steps would push the thread that acts off its core at each step.
+    unpinned = config.eval_workers or config.inference == "learner"
+    return Crew(count, config.eval_workers, _log_folder(run), [] if unpinned else worker_cores(config))
 
 
 def _log_folder(run: Path) -> Path:

@@ -15,7 +15,7 @@ import torch
 from msgspec.structs import replace
 
 import millrace
-from millrace.launch.crew import worker_cores
+from millrace.launch.crew import crew_of_run, worker_cores
 from millrace.learner import torch_setup
 from millrace.learner.between_updates.crowded_cores import CrowdedCores
 from millrace.learner.config.costs import minibatch_rows
@@ -63,6 +63,12 @@ def test_a_program_has_its_threads_again_whichever_run_ends_first(monkeypatch: p
 def test_workers_keep_to_the_cores_that_this_process_may_use(workers: int, max_lag: int, kept: bool) -> None:
     config = resolve("CartPole-v1", workers=workers, max_lag=max_lag)
     assert worker_cores(config) == (sorted(CORES) if kept else [])
+
+
+def test_workers_that_only_step_use_any_core(tmp_path: Path) -> None:
+    """The thread that acts would have to leave its core whenever it orders a step of a worker that is pinned there."""
+    for inference, cores in (("workers", sorted(CORES)), ("learner", [])):
+        assert crew_of_run(resolve("CartPole-v1", workers=2, inference=inference), tmp_path).cores == cores
 
 
 def test_where_the_system_cannot_they_do_not(monkeypatch: pytest.MonkeyPatch) -> None:
