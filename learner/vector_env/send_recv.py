@@ -8,7 +8,7 @@ error, and no other lane loses its results.
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -188,32 +188,18 @@ class SendRecv:
     def recv_all(self, timeout_s: float | None = None) -> Ready:
         """Wait until every lane is ready, and take them. Raises what `recv` raises, after giving up on all lanes."""
         sent = self._sent
-        hub = self._parts.hub
         timeout_s = self.timeout_s if timeout_s is None else timeout_s
-        try:
-            if self._parts.lost_lanes.unreported:
-                self.look(timeout_s)
-            while not sent.all_ready:
-                hub.wait(timeout_s, together=True)
-                self.look(timeout_s)
-            self._raise_losses()
-        except BaseException:
-            self.abandon()
-            raise
+        self._wait_until(
+            lambda: sent.all_ready, timeout_s, look_first=bool(self._parts.lost_lanes.unreported), together=True
+        )
         return sent.take()
 
     def recv_some(self, lanes: Sequence[int]) -> Ready:
         """Like `recv_all`, but waits for these lanes only, and takes no others. After an error, it gives up on all lanes."""
-        try:
-            self.look(self.timeout_s)
-            while not self._sent.are_ready(lanes):
-                self._parts.hub.wait(self.timeout_s, together=False)
-                self.look(self.timeout_s)
-            self._raise_losses()
-        except BaseException:
-            self.abandon()
-            raise
-        return self._sent.take_some(lanes)
+        sent = self._sent
+        # Look first: a result may have arrived while other lanes were waited for, and then no worker wakes this process.
+        self._wait_until(lambda: sent.are_ready(lanes), self.timeout_s, look_first=True, together=False)
+        return sent.take_some(lanes)
 
     def look(self, timeout_s: float) -> None:
         """Record which of the lanes under way have returned a result or were lost. Never waits.
@@ -236,6 +222,19 @@ class SendRecv:
         lost_lanes.report([lane for lane in steps if lane in lost_lanes.unreported])
 
     # ---------------------------------------------------------------- inside
+
+    def _wait_until(self, ready: Callable[[], bool], timeout_s: float, *, look_first: bool, together: bool) -> None:
+        """Wait until `ready`. Raises what `recv` raises, after giving up on all lanes."""
+        try:
+            if look_first:
+                self.look(timeout_s)
+            while not ready():
+                self._parts.hub.wait(timeout_s, together=together)
+                self.look(timeout_s)
+            self._raise_losses()
+        except BaseException:
+            self.abandon()
+            raise
 
     def _check_back(self, lanes: Iterable[int]) -> None:
         if out := self._sent.among(lanes):

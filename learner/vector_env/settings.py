@@ -54,7 +54,7 @@ class VectorEnvSettings:
     """Wrappers of every env copy, the innermost first."""
     single_lanes: int = 0
     """Number of additional copies for evaluations, which follow the others. Each is a lane of its own, and can be stepped
-    alone with `ZmqVectorEnv.step_async`.
+    alone with `ZmqVectorEnv.begin_step`.
     """
     evaluates: bool = False
     """Whether all copies are for evaluations."""

@@ -76,6 +76,7 @@ class LaneRunner:
         self.stages: Stages = {"open": 0.0, "act": 0.0, "step": 0.0}
         """seconds spent opening lanes (making copies and their first reset), choosing actions and stepping copies"""
         self.together: TogetherSteps = NoneTogether() if together is None else together
+        self.to_env_action = action_converter_of(run.policy)
         self._run = run
         self._stored = stored_leaves(run)
 
@@ -86,7 +87,7 @@ class LaneRunner:
         raise. Raises `EnvironmentFailed` and `PolicyFailed`, and `EpisodesLost` in an evaluation. The values of the rows are
         not checked, unless something raised.
         """
-        stepped = [_SteppedPart(self._run, part, self.together, self.stages) for part in parts]
+        stepped = [_SteppedPart(self._run, part, self) for part in parts]
         try:
             for t in range(parts[0].rows.steps):
                 for each in stepped:
@@ -115,11 +116,11 @@ class LaneRunner:
 class _SteppedPart:
     """A part that is being stepped: `begin` chooses the actions and orders a step; `end` waits for the step to finish."""
 
-    def __init__(self, run: RunSpec, part: Part[StepActions], together: TogetherSteps, stages: Stages) -> None:
+    def __init__(self, run: RunSpec, part: Part[StepActions], runner: LaneRunner) -> None:
         self._rows, self._actions = part
-        self._together = together
-        self._stages = stages
-        self._to_env_action = action_converter_of(run.policy)
+        self._together = runner.together
+        self._stages = runner.stages
+        self._to_env_action = runner.to_env_action
         self._with_seats = bool(run.seats)
         self._counts_rows = self._with_seats or not self._rows.of_lanes[0].lane.autoresets
         self._forgets = self._rows.state.size > 0 and not self._counts_rows
