@@ -29,7 +29,7 @@ class RolloutKeywords(TypedDict, total=False):
     """Seed of all random numbers of the run."""
     workers: int | None
     """Number of worker processes on this machine (train only). none: one for each core, but at most one for each lane.
-    Use more if env steps wait for something other than the CPU.
+    Use more if env steps wait for something other than the CPU; a run without this setting says so.
     """
     envs: int
     """Number of env copies, summed over all workers. Must be a multiple of lanes."""

@@ -35,6 +35,7 @@ class WorkerThread:
     ) -> None:
         """Start the thread. `evaluates` says whether the worker only plays evaluations."""
         self.name = name
+        self.session = None
         self._identity = identity(name, evaluates=evaluates)
         self.process_nonce = self._identity.process_nonce
         self._page = Activity()

@@ -10,6 +10,11 @@ from millrace.learner.config.rollout_config import RolloutConfig
 from millrace.protocol.machine.cpu_cores import usable_cores
 
 
+def enough_workers(lanes: int, workers: int) -> int:
+    """The least number of workers with which the busiest one has no more lanes than with `workers` workers."""
+    return -(-lanes // -(-lanes // workers))
+
+
 def local_workers(config: RolloutConfig, cores: int | None = None) -> int:
     """The number of worker processes. Unless the settings give it, one for each core, but at most one for each lane.
 
@@ -19,12 +24,7 @@ def local_workers(config: RolloutConfig, cores: int | None = None) -> int:
     if config.workers is not None:
         return config.workers
     most = min(config.lanes, usable_cores() if cores is None else cores)
-    return _as_fast(config.lanes, most)
-
-
-def _as_fast(lanes: int, workers: int) -> int:
-    """The least number of workers with which the busiest one has no more lanes than with `workers` workers."""
-    return -(-lanes // -(-lanes // workers))
+    return enough_workers(config.lanes, most)
 
 
 def chosen_workers(config: RolloutConfig, cores: int) -> str:
@@ -56,7 +56,7 @@ def uneven_lanes(config: RolloutConfig) -> str:
             f"{better}"
         )
     most = -(-config.lanes // workers)
-    fewer = _as_fast(config.lanes, workers)
+    fewer = enough_workers(config.lanes, workers)
     as_fast = f"--workers {fewer} is as fast, and " if fewer < workers else ""
     return (
         f"{config.lanes} lanes don't divide among {workers} workers: some step {most} of them while others wait; {as_fast}"

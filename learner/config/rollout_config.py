@@ -54,7 +54,7 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     """Seed of all random numbers of the run."""
     workers: Free[Count | None] = None
     """Number of worker processes on this machine (train only). none: one for each core, but at most one for each lane. Use
-    more if env steps wait for something other than the CPU.
+    more if env steps wait for something other than the CPU; a run without this setting says so.
     """
     envs: Adaptable[Count] = 8
     """Number of env copies, summed over all workers. Must be a multiple of lanes."""

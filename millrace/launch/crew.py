@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from millrace.learner.config.config import Config
@@ -44,6 +44,10 @@ class Crew:
     """Which workers to start. They are called w0, w1, and so on."""
 
     count: int = 0
+    lanes: int = 0
+    """the lanes of the run, if its settings leave the number of workers open, so that a better one is suggested; else 0"""
+    envs: int = 0
+    """the env copies in these lanes"""
     evaluating: int = 0
     """how many of the workers only evaluate: the last ones"""
     logs: Path | None = None
@@ -55,7 +59,12 @@ class Crew:
 
     def evaluates(self, worker: str) -> bool:
         """Whether this worker only evaluates."""
-        return int(worker.removeprefix("w")) >= self.count - self.evaluating
+        return int(worker.removeprefix("w")) >= self.collecting
+
+    @property
+    def collecting(self) -> int:
+        """How many of the workers collect."""
+        return self.count - self.evaluating
 
     def log_of(self, worker: str) -> Path | None:
         """The file to which this worker's stderr goes; None: to this process's stderr."""
@@ -80,12 +89,15 @@ def crew_of_run(config: Config, run: Path) -> Crew:
 
     Raises `UsageError` if the logs can't be written there.
     """
-    count = local_workers(config) + config.eval_workers
+    crew = Crew(local_workers(config) + config.eval_workers, evaluating=config.eval_workers)
     if config.transport == "inproc":
-        return Crew(count, config.eval_workers)
-    # A pinned worker that only steps would push the thread that acts off its core at each step.
-    unpinned = config.eval_workers or config.inference == "learner"
-    return Crew(count, config.eval_workers, _log_folder(run), [] if unpinned else worker_cores(config))
+        return crew
+    crew = replace(crew, logs=_log_folder(run))
+    if config.inference == "learner":  # a pinned worker that only steps would push the thread that acts off its core
+        return crew
+    if config.workers is None:
+        crew = replace(crew, lanes=config.lanes, envs=config.envs)
+    return replace(crew, cores=[] if config.eval_workers else worker_cores(config))
 
 
 def _log_folder(run: Path) -> Path:

@@ -10,7 +10,9 @@ Workers that still run at the end of this context are stopped almost at once. To
 
 from __future__ import annotations
 
+import logging
 import math
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, field
@@ -20,6 +22,7 @@ from typing import Protocol
 
 from millrace.launch.crew import Crew
 from millrace.launch.private_address import private_address
+from millrace.launch.waiting_steps import SeenWorker, WaitingSteps
 from millrace.learner.members.bound import Bound, bind, listen
 from millrace.learner.members.lobby import Lobby, LobbySettings
 from millrace.learner.members.who_may_connect import BindSettings, generate_run_keys
@@ -28,11 +31,15 @@ from millrace.protocol.alive import StartFailed, WorkerActivity, WorkerExit
 from millrace.protocol.envs.description import DescribedEnv
 from millrace.protocol.keys.key_folder import Keyring, chosen_key_folder
 from millrace.protocol.keys.keys import Token
+from millrace.protocol.logs.notices import log_notice
+from millrace.protocol.machine.available_memory import available_bytes
 from millrace.protocol.messages import Status
 from millrace.workers.machine_slots import copies_per_machine
 from millrace.workers.supervise.supervisor import Running, Supervisor
 from millrace.workers.supervise.worker_process import WorkerCommand, WorkerProcess
 from millrace.workers.worker_thread import WorkerThread
+
+log = logging.getLogger("millrace.learner")
 
 STOP_BEFORE_RUN_S = 0.5  # short, because a worker that is still constructing its environment can't answer anyway
 
@@ -149,9 +156,20 @@ class _LocalProcesses(WorkerProcesses):
         self.most_copies = copies_per_machine() if crew.count else 0
         self._crew = crew
         self._supervisor = Supervisor(start, crew.count)
+        self._waiting_steps = WaitingSteps(crew.collecting, crew.lanes, crew.envs)
 
     def ended(self) -> Sequence[WorkerExit | StartFailed]:
+        if self._waiting_steps.is_due(time.monotonic()):
+            self._look_whether_steps_wait()
         return self._supervisor.poll()
+
+    def _look_whether_steps_wait(self) -> None:
+        began_s = time.monotonic()
+        used = self._supervisor.used()
+        running = (each for each in self._supervisor.activities() if each.worker in used)
+        seen = [SeenWorker(each.doing, used[each.worker]) for each in running]
+        if line := self._waiting_steps.look(seen, available_bytes(), began_s, time.monotonic()):
+            log_notice(log, line)
 
     def activities(self) -> Sequence[WorkerActivity]:
         return self._supervisor.activities()

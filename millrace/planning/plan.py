@@ -9,7 +9,6 @@ from functools import cache
 import msgspec
 
 from millrace.arguments import checked
-from millrace.learner.algorithms.replay.available_memory import available_bytes
 from millrace.learner.config.config import Config
 from millrace.learner.config.hyperparameters import OffPolicyConfig
 from millrace.learner.config.layers import resolve
@@ -33,6 +32,7 @@ from millrace.planning.run_plan import ExpectedSpeed, RunPlan, train_command
 from millrace.protocol.env_spec import EnvLike
 from millrace.protocol.envs.wrappers import WrapperLike, wrapper_names
 from millrace.protocol.errors import UsageError
+from millrace.protocol.machine.available_memory import available_bytes
 from millrace.protocol.machine.cpu_cores import usable_cores
 from millrace.protocol.random_streams import Purpose, generator
 from millrace.workers.machine_slots import copies_per_machine

@@ -18,11 +18,11 @@ import numpy as np
 from millrace.protocol.arrays import Array, Doubles
 from millrace.protocol.envs.seats import has_seats
 from millrace.protocol.machine.core_delay import CoreDelay
-from millrace.workers.supervise.process_group import live_members, process_stat
+from millrace.workers.supervise.process_group import RSS, live_members, process_stat
 
 STEP, RESET, PROCESSES = 0.0, 1.0, 2.0  # kinds of notes
 FLUSH_S = 0.25
-UTIME, STIME, RSS = 11, 12, 21  # indices of fields of `process_stat`
+UTIME, STIME = 11, 12  # indices of fields of `process_stat`
 
 
 class Notes:

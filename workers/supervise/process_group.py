@@ -1,4 +1,4 @@
-"""Ends a worker's session: the worker, and the processes that its environment has started.
+"""Finds, measures and ends the processes of a worker's session: the worker, and what its environment has started.
 
 Rule: a process counts as gone when it no longer holds any port or file. So a zombie counts as gone, even if it is never
 reaped.
@@ -10,9 +10,12 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
+from typing import NamedTuple
+
+THREADS, RSS = 17, 21  # indices of fields of `process_stat`
 
 
 def live_members(leader: int) -> list[int]:
@@ -20,14 +23,51 @@ def live_members(leader: int) -> list[int]:
 
     On a system without /proc, none is found.
     """
-    pids = []
+    # State Z means that the first thread of a process has ended; other threads may still hold its files.
+    return [
+        pid
+        for pid, fields in _processes()
+        if str(leader) in fields[2:4] and (fields[0] not in "ZX" or int(fields[THREADS]) > 1)
+    ]
+
+
+class SessionUse(NamedTuple):
+    """What a process group or session uses of this machine at one moment."""
+
+    computes: bool = False
+    """whether a thread runs, or is ready to run"""
+    resident: int = 0
+    """bytes of memory; shared memory counts in each process"""
+
+
+def use_of_sessions(leaders: Collection[int]) -> dict[int, SessionUse]:
+    """What the process groups or sessions of these leaders use now; those without a process are left out.
+
+    Reads all of /proc once. On a system without /proc, all are left out.
+    """
+    used: dict[int, SessionUse] = {}
+    for pid, fields in _processes():
+        leader = next((int(field) for field in fields[2:4] if int(field) in leaders), None)
+        if leader is not None:
+            before = used.get(leader, SessionUse())
+            resident = before.resident + int(fields[RSS]) * os.sysconf("SC_PAGE_SIZE")
+            used[leader] = SessionUse(before.computes or "R" in _thread_states(pid), resident)
+    return used
+
+
+def _processes() -> Iterator[tuple[int, list[str]]]:
+    """All processes and their `process_stat`; none on a system without /proc."""
     with suppress(FileNotFoundError):
         for name in filter(str.isdecimal, os.listdir("/proc")):
-            fields = process_stat(int(name))
-            # State Z means that the first thread of a process has ended; other threads may still hold its files.
-            if str(leader) in fields[2:4] and (fields[0] not in "ZX" or int(fields[17]) > 1):
-                pids.append(int(name))
-    return pids
+            if fields := process_stat(int(name)):
+                yield int(name), fields
+
+
+def _thread_states(pid: int) -> Iterator[str]:
+    """The state of each thread of a process: R if it runs or is ready to run."""
+    with suppress(OSError):  # the process has ended
+        for thread in os.listdir(f"/proc/{pid}/task"):
+            yield from process_stat(pid, thread)[:1]
 
 
 def kill(pids: Iterable[int]) -> None:
@@ -37,11 +77,12 @@ def kill(pids: Iterable[int]) -> None:
             os.kill(pid, signal.SIGKILL)
 
 
-def process_stat(pid: int) -> list[str]:
+def process_stat(pid: int, thread: str = "") -> list[str]:
     """The fields of /proc/PID/stat that follow the name, from the state on; empty if there is no such process
-    or no /proc.
+    or no /proc. With `thread`, those of one of the process's threads.
     """
+    where = f"/proc/{pid}/task/{thread}/stat" if thread else f"/proc/{pid}/stat"
     try:
-        return Path(f"/proc/{pid}/stat").read_text(errors="replace").rpartition(")")[2].split()
+        return Path(where).read_text(errors="replace").rpartition(")")[2].split()
     except OSError:
         return []

@@ -32,6 +32,7 @@ from millrace.protocol.bounds import one_line
 from millrace.protocol.errors import UsageError
 from millrace.workers.exit_codes import EXIT_NO_LEARNER, EXIT_REFUSED, EXIT_UNSUITABLE
 from millrace.workers.supervise.how_it_ended import Ending
+from millrace.workers.supervise.process_group import SessionUse, use_of_sessions
 
 log = logging.getLogger("millrace.worker")
 
@@ -58,6 +59,11 @@ class Running(Protocol):
     @property
     def process_nonce(self) -> int:
         """The worker's secret number: `process_nonce` of its Hello."""
+        ...
+
+    @property
+    def session(self) -> int | None:
+        """The id of the session in which the worker and the processes of its environment run; None for a thread."""
         ...
 
     def ended(self) -> Ending | None:
@@ -215,6 +221,16 @@ class Supervisor:
         now = self._clock()
         activities = (worker.running.activity(now) for worker in self._workers if worker.running is not None)
         return [activity for activity in activities if activity is not None]
+
+    def used(self) -> dict[str, SessionUse]:
+        """What each worker uses of this machine, together with the processes of its environment. Threads are left out."""
+        sessions = {
+            each.name: each.running.session
+            for each in self._workers
+            if each.running is not None and each.running.session is not None
+        }
+        used = use_of_sessions(set(sessions.values()))
+        return {name: used[session] for name, session in sessions.items() if session in used}
 
     def said(self) -> dict[str, str]:
         """The last line of each running worker's log, if it has written one."""

@@ -110,6 +110,11 @@ class WorkerProcess:
         """The process id of the worker."""
         return self._process.pid
 
+    @property
+    def session(self) -> int:
+        """The worker leads a session of its own."""
+        return self._process.pid
+
     def ended(self) -> Ending | None:
         """How the worker ended; None while it, or a process that it started, still runs."""
         if self._runs():

@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from millrace.learner.algorithms.replay.available_memory import GIB, available_bytes
 from millrace.learner.algorithms.replay.replay_buffer import Content, ReplayBuffer, Sample
 from millrace.protocol.arrays import Floats, Ints
 from millrace.protocol.errors import UsageError
+from millrace.protocol.machine.available_memory import GIB, available_bytes
 from millrace.protocol.random_streams import Purpose
 from millrace.protocol.rollout import Batch
 

@@ -26,7 +26,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from millrace.learner.algorithms.replay.available_memory import GIB, available_bytes
 from millrace.learner.algorithms.replay.episode_paths import NO_SLOT, EpisodePaths
 from millrace.learner.algorithms.replay.hindsight import Goals, Hindsight
 from millrace.learner.algorithms.replay.rewinding import Remembered, Rewinding
@@ -35,6 +34,7 @@ from millrace.learner.algorithms.replay.sum_tree import SumTree
 from millrace.learner.algorithms.returns import EpisodeEnds
 from millrace.protocol.arrays import Array, Bools, Doubles, Floats, Ints
 from millrace.protocol.errors import UsageError
+from millrace.protocol.machine.available_memory import GIB, available_bytes
 from millrace.protocol.random_streams import Purpose, generator
 from millrace.protocol.rollout import Batch
 from millrace.protocol.specs import ActionSpec, Leaf

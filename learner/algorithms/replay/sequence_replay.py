@@ -21,13 +21,13 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from millrace.learner.algorithms.replay.available_memory import GIB, available_bytes
 from millrace.learner.algorithms.replay.replay_buffer import PRIORITY_OFFSET
 from millrace.learner.algorithms.replay.rewinding import Remembered, Rewinding
 from millrace.learner.algorithms.replay.sum_tree import SumTree
 from millrace.learner.algorithms.returns import EpisodeEnds, n_step_returns
 from millrace.protocol.arrays import Array, Bools, Doubles, Floats, Ints
 from millrace.protocol.errors import UsageError
+from millrace.protocol.machine.available_memory import GIB, available_bytes
 from millrace.protocol.random_streams import Purpose, generator
 from millrace.protocol.rollout import Batch
 from millrace.protocol.specs import PolicySpec

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from millrace.learner.algorithms.replay.available_memory import available_bytes
+from millrace.protocol.machine.available_memory import available_bytes
 from millrace.protocol.machine.control_groups import cpu_quota, free_bytes
 from millrace.protocol.machine.cpu_cores import usable_cores
 

@@ -15,6 +15,7 @@ from pathlib import Path
 import psutil
 import pytest
 
+from millrace.protocol.machine.cpu_cores import usable_cores
 from tests.system.stage import preloaded
 from tests.system.stage.preloaded import workers_of
 from tests.system.stage.processes import ROOT, START_S, Learner, Running, Stage, free_port, wait_for
@@ -51,6 +52,14 @@ def served(stage: Stage, env: str, settings: Mapping[str, object], *worker_flags
     address = f"tcp://127.0.0.1:{free_port()}"
     learner = stage.learner(address, {**SMALL, **settings}, env=f"{ENVS}:{env}")
     return learner, stage.worker(address, "w0", *worker_flags)
+
+
+def test_if_steps_wait_a_worker_for_each_lane_is_suggested(stage: Stage) -> None:
+    lanes = 2 * usable_cores()
+    learner = trained(stage, "Slow-v0", {"env-kwargs": "step_s 0.1 k 30", "envs": lanes, "lanes": lanes})
+    learner.hears(
+        rf"env steps wait for \d+% of their time: --workers {lanes}, one for each lane, would be faster", RUN_ENDS_S
+    )
 
 
 def never_given_up(learner: Learner) -> None:

@@ -15,7 +15,7 @@ import pytest
 
 from millrace.workers.machine_slots import Slots
 from millrace.workers.supervise import worker_process
-from millrace.workers.supervise.process_group import kill, live_members, process_stat
+from millrace.workers.supervise.process_group import kill, live_members, process_stat, use_of_sessions
 from millrace.workers.supervise.worker_process import WorkerCommand, WorkerProcess
 
 WITHIN_S = 60.0
@@ -45,6 +45,32 @@ def wait_until(is_so: Callable[[], Any]) -> None:
     while not is_so():
         assert time.monotonic() < deadline_s
         os.sched_yield()
+
+
+SPINS = "exec('while True: pass')"
+IN_A_CHILD = f"subprocess.Popen([sys.executable, '-c', {SPINS!r}])"
+
+
+@pytest.mark.parametrize(
+    "computing", [IN_A_CHILD, f"threading.Thread(target=lambda: {SPINS}).start()"], ids=["in a child", "in a thread"]
+)
+def test_a_session_computes_even_if_its_leader_sleeps(computing: str) -> None:
+    with session(f"{computing}; print(flush=True); time.sleep(1000)") as (process, _):
+        wait_until(lambda: process_stat(process.pid)[0] == "S" and use_of_sessions({process.pid})[process.pid].computes)
+
+
+def test_a_session_that_sleeps_does_not_compute_but_keeps_its_memory() -> None:
+    with session("print(flush=True); time.sleep(1000)") as (process, _):
+        wait_until(lambda: process_stat(process.pid)[0] == "S")
+        computes, resident = use_of_sessions({process.pid})[process.pid]
+        assert not computes
+        assert resident > 1 << 20
+
+
+def test_a_session_that_has_ended_uses_nothing() -> None:
+    with session("print(flush=True)") as (process, _):
+        process.wait(WITHIN_S)
+        assert use_of_sessions({process.pid}) == {}
 
 
 def test_a_zombie_that_nobody_reaps_is_gone() -> None:

@@ -34,6 +34,7 @@ class FakeRunning:
     end: Ending | None = None
     requests: list[str] = field(default_factory=list)
     process_nonce: int = NONCE
+    session: int | None = None
     doing: Doing = "waiting"
     since_s: float = 0.0
     enforced: list[float] = field(default_factory=list)

@@ -17,10 +17,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from millrace.learner.algorithms.replay import replay_buffer as module
-from millrace.learner.algorithms.replay.available_memory import GIB
 from millrace.learner.algorithms.replay.replay_buffer import Content, ReplayBuffer, Sample
 from millrace.learner.algorithms.replay.sum_tree import SumTree
 from millrace.protocol.errors import UsageError
+from millrace.protocol.machine.available_memory import GIB
 from millrace.protocol.rollout import Batch
 from millrace.protocol.specs import Leaf
 from tests.support.examples import examples

@@ -1,0 +1,86 @@
+"""Tells the user if env steps mostly wait for something other than this machine's cores: a timer, a GPU or a server. Pure.
+
+By default there is one worker for each core. If steps wait, the cores are idle, and a run collects faster if each lane has a
+worker of its own. This can't be known before the run, so the workers are watched while they collect.
+
+Rule: a worker computes if any thread or process of it runs, or is ready to run. So workers that lack a core don't seem to
+wait. Rule: workers are only suggested. If some joined now, lanes would move to them, and episodes that can't be repeated
+would end, so results would depend on the moment.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from millrace.learner.config.local_workers import enough_workers
+from millrace.protocol.call_timeouts import Doing
+from millrace.workers.supervise.process_group import SessionUse
+
+LOOK_EVERY_S = 0.1
+MOST_TIME = 0.05  # share of the time that looking may take; it reads all of /proc
+LOOKS = 50  # this many are judged together
+MOST_LOOKS = 1000  # after these, steps won't begin to wait
+ENOUGH = 0.5  # if workers wait for this share of the time, a core has time for a second worker
+OF_MEMORY = 0.8  # share of the available memory that more workers may take
+COLLECTING: frozenset[Doing] = frozenset({"resetting", "stepping", "repeating", "acting"})
+
+
+class SeenWorker(NamedTuple):
+    """A worker at one moment."""
+
+    doing: Doing
+    uses: SessionUse
+
+
+class WaitingSteps:
+    """Watches the workers of one run."""
+
+    def __init__(self, workers: int, lanes: int, envs: int) -> None:
+        """So many workers collect, in a run with so many lanes and env copies. Without lanes, nothing is watched."""
+        self._workers = workers
+        self._lanes = lanes
+        self._envs = envs
+        self._look_at_s = 0.0
+        self._looks = 0
+        self._collecting = 0
+        self._waiting = 0
+
+    def is_due(self, now: float) -> bool:
+        """Whether to look at the workers now."""
+        return self._workers < self._lanes and self._looks < MOST_LOOKS and now >= self._look_at_s
+
+    def look(self, workers: Sequence[SeenWorker], free_bytes: int | None, began_s: float, ended_s: float) -> str:
+        """Record what the workers do, as seen from `began_s` to `ended_s`. Returns a line for the user; mostly empty.
+
+        `free_bytes`: the available memory of this machine; None if it isn't known.
+        """
+        self._look_at_s = ended_s + max(LOOK_EVERY_S, (ended_s - began_s) / MOST_TIME)
+        collecting = [worker for worker in workers if worker.doing in COLLECTING]
+        if not collecting:
+            return ""
+        self._looks += 1
+        self._collecting += len(collecting)
+        self._waiting += sum(not worker.uses.computes for worker in collecting)
+        if self._looks % LOOKS:
+            return ""
+        share = self._waiting / self._collecting
+        self._collecting = self._waiting = 0
+        if share < ENOUGH:
+            return ""
+        self._looks = MOST_LOOKS
+        return self._line(share, max(worker.uses.resident for worker in collecting), free_bytes)
+
+    def _line(self, share: float, worker_bytes: int, free_bytes: int | None) -> str:
+        most = self._lanes
+        if free_bytes is not None:
+            most = min(most, self._workers + int(OF_MEMORY * free_bytes / max(worker_bytes, 1)))
+        better = enough_workers(self._lanes, most)
+        waits = f"env steps wait for {share:.0%} of their time"
+        if better <= self._workers:
+            return f"{waits}: more workers would be faster, but their memory isn't free"
+        whose = "one for each lane" if better == self._lanes else "all that fit into the memory"
+        line = f"{waits}: --workers {better}, {whose}, would be faster, with the same results"
+        if self._lanes < self._envs:
+            line += f"; --lanes {self._envs} would let each env copy have a worker"
+        return line
