@@ -58,7 +58,7 @@ def open_hub(
         config.acting_dtype,
     )
     hub = Hub(lobby.link, coordinator, settings, lobby.processes, check_interrupt, observer)
-    hub.take_over(lobby.hand_over())
+    hub.take_over(lobby.hand_over(), lobby.described_in_s)
     return hub
 
 

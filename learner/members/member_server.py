@@ -169,19 +169,24 @@ class MemberServer:
         if self._membership.events:
             self._log_events(cause)
 
-    def wait_for(self, workers: int, timeout_s: float, turn: Callable[[], None]) -> None:
+    def wait_for(self, workers: int, timeout_s: float, turn: Callable[[], None], *, describing_until_s: float = 0.0) -> None:
         """Call `turn`, which must listen, until this number of `workers` have joined.
 
         Raises `NoWorkers` after `timeout_s`, or at once if that many can no longer join. Workers that only evaluate don't
-        count.
+        count. Until `describing_until_s` on the clock, it also waits for those that still describe the environment.
         """
         deadline_s = self._clock() + timeout_s
         wait = LongWait(self._clock())
-        while (joined := len(self._membership.collectors())) < workers:
+        while True:
             now = self._clock()
-            self.check_left(workers, collecting=True)
-            if now > deadline_s:
-                raise self.no_workers(workers, timeout_s)
+            collectors = self._membership.collectors()
+            joined = len(collectors)
+            if joined < workers:
+                self.check_left(workers, collecting=True)
+                if now > deadline_s:
+                    raise self.no_workers(workers, timeout_s)
+            elif now >= describing_until_s or not any(member.describes for member in collectors):
+                return
             if wait.due(now):
                 told = self.what_workers_do()
                 log.warning(

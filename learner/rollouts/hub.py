@@ -132,6 +132,7 @@ class Hub:
         self._check_interrupt = check_interrupt
         self._observer = observer
         self._clock = clock
+        self._describing_until_s = 0.0  # until then, the run waits for workers that still describe the environment
         self._lags: list[int] = []  # the lag of each rollout of the last `gather`
         self.lag_statistics = LagStatistics()
         self._progress = Progress()
@@ -141,15 +142,22 @@ class Hub:
         self._server = MemberServer(link, coordinator, self, self._processes, clock=clock)
         self._time = LearnerTime(coordinator, clock(), self._server.awaited, self._processes)
 
-    def take_over(self, waiting: Membership[Member]) -> None:
-        """Begin the run for the workers that wait for it."""
+    def take_over(self, waiting: Membership[Member], described_in_s: float = 0.0) -> None:
+        """Begin the run for the workers that wait for it. `described_in_s`: how long the environment's description took.
+
+        Some workers may still describe the environment, because that took long. Another one takes as long at most, unless it
+        hangs; if the run began without it, its lanes would be opened by other workers, one after another.
+        """
+        self._describing_until_s = self._clock() + described_in_s
         self._server.send(self.coordinator.take_over(waiting, self._clock()))
 
     # ---------------------------------------------------------------- what the loop calls
 
     def wait_for(self, workers: int) -> None:
         """Wait until this number of `workers` have joined. Raises `NoWorkers` after `no_workers_timeout_s`."""
-        self._server.wait_for(workers, self.settings.no_workers_timeout_s, lambda: self._turn(POLL_S))
+        timeout_s = self.settings.no_workers_timeout_s
+        until_s = self._describing_until_s
+        self._server.wait_for(workers, timeout_s, lambda: self._turn(POLL_S), describing_until_s=until_s)
 
     def publish(
         self,

@@ -353,3 +353,23 @@ def test_whoever_waits_for_workers_is_told_how_many_came_and_how_to_start_one() 
         served.server.wait_for(2, 1.0, lambda: served.server.listen(POLL_S))
     served.link.inbox.append((b"w0", example(Heartbeat, session=1)))
     served.server.wait_for(1, 1.0, lambda: served.server.listen(POLL_S))
+
+
+def test_a_run_waits_for_workers_that_still_describe_the_environment_but_not_longer_than_said() -> None:
+    served = Served()
+    member = served.coordinator.members[b"w0"]
+    member.describes = True
+    turns = 0
+
+    def turn() -> None:
+        nonlocal turns
+        turns += 1
+        served.server.listen(POLL_S)
+        member.describes = member.describes and turns != ends_after
+
+    for ends_after, expected_s in ((math.inf, 2.0), (10, 10 * POLL_S)):
+        turns, member.describes, began_s = 0, True, served.link.now
+        served.server.wait_for(1, TIMEOUT_S, turn, describing_until_s=began_s + 2.0)
+        assert served.link.now - began_s == pytest.approx(expected_s, abs=POLL_S)
+    served.server.wait_for(1, TIMEOUT_S, turn)
+    assert turns == 10
