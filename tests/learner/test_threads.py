@@ -68,7 +68,7 @@ def test_workers_keep_to_the_cores_that_this_process_may_use(workers: int, max_l
 def test_workers_that_only_step_use_any_core(tmp_path: Path) -> None:
     """The thread that acts would have to leave its core whenever it orders a step of a worker that is pinned there."""
     for inference, cores in (("workers", sorted(CORES)), ("learner", [])):
-        assert crew_of_run(resolve("CartPole-v1", workers=2, inference=inference), tmp_path).cores == cores
+        assert list(crew_of_run(resolve("CartPole-v1", workers=2, inference=inference), tmp_path).cores) == cores
 
 
 def test_where_the_system_cannot_they_do_not(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import itertools
 import math
 from collections.abc import Iterator
 from types import SimpleNamespace
@@ -355,21 +356,26 @@ def test_whoever_waits_for_workers_is_told_how_many_came_and_how_to_start_one() 
     served.server.wait_for(1, 1.0, lambda: served.server.listen(POLL_S))
 
 
-def test_a_run_waits_for_workers_that_still_describe_the_environment_but_not_longer_than_said() -> None:
+@pytest.mark.parametrize(("describes_for", "expected_s"), [(10, 10 * POLL_S), (10**6, 2.0)])
+def test_a_run_waits_for_workers_that_still_describe_the_environment_but_not_longer_than_said(
+    describes_for: int, expected_s: float
+) -> None:
+    """`describes_for`: number of turns until the worker has described the environment."""
     served = Served()
     member = served.coordinator.members[b"w0"]
     member.describes = True
-    turns = 0
+    turns = itertools.count(1)
 
     def turn() -> None:
-        nonlocal turns
-        turns += 1
         served.server.listen(POLL_S)
-        member.describes = member.describes and turns != ends_after
+        member.describes = next(turns) < describes_for
 
-    for ends_after, expected_s in ((math.inf, 2.0), (10, 10 * POLL_S)):
-        turns, member.describes, began_s = 0, True, served.link.now
-        served.server.wait_for(1, TIMEOUT_S, turn, describing_until_s=began_s + 2.0)
-        assert served.link.now - began_s == pytest.approx(expected_s, abs=POLL_S)
-    served.server.wait_for(1, TIMEOUT_S, turn)
-    assert turns == 10
+    began_s = served.link.now
+    served.server.wait_for(1, TIMEOUT_S, turn, describing_until_s=began_s + 2.0)
+    assert served.link.now - began_s == pytest.approx(expected_s, abs=POLL_S)
+
+
+def test_a_run_that_has_what_it_needs_does_not_wait() -> None:
+    served = Served()
+    served.coordinator.members[b"w0"].describes = True
+    served.server.wait_for(1, TIMEOUT_S, lambda: pytest.fail("it waits"))
