@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import logging
 import itertools
+import logging
 import math
 from collections.abc import Iterator
 from types import SimpleNamespace
