@@ -18,12 +18,14 @@ from benchmarks.scores import return_text, steps_text
 from benchmarks.wall_clock_curves import Curve
 from benchmarks.wall_clock_programs import ENVS, NAMES, OURS, PROGRAMS, THEIRS, Program
 from benchmarks.wall_clock_rates import Rate, RateAt, largest_error, rate_at
+from benchmarks.wall_clock_returns import comparison, returns_table
 
 STEP_TIMES_S = (0.01, 0.05, 1.0)
 NEAR = range(275_000, 325_001)
 """the env steps whose evaluations determine a task's return"""
 BETWEEN = 24
 """number of intervals between two step times of the table, to find where the quickest algorithm changes"""
+NO_MINUTES = "No rates are kept yet, so there are no minutes; `benchmarks/README.md` says how to measure them."
 NOTHING = "No figures are kept yet; `benchmarks/README.md` says how to make them.\n"
 
 
@@ -142,9 +144,19 @@ def ranges_text(rows: Sequence[Row]) -> str:
 
 def page_part(curves: Sequence[Curve], rates: Sequence[Rate]) -> str:
     """The part of the page about these curves and rates, as Markdown."""
-    targets = {env: target for env in ENVS if (target := target_of(curves, env)) is not None}
-    if not targets or not rates:  # minutes need both
+    if not curves:
         return NOTHING
+    parts = ["Returns of greedy episodes:", returns_table(curves), comparison(curves)]
+    targets = {env: target for env in ENVS if (target := target_of(curves, env)) is not None}
+    if targets and rates:
+        parts += _minutes(curves, rates, targets)
+    else:
+        parts.append(NO_MINUTES)
+    return "\n\n".join(part.rstrip("\n") for part in parts if part) + "\n"
+
+
+def _minutes(curves: Sequence[Curve], rates: Sequence[Rate], targets: dict[str, float]) -> list[str]:
+    """The paragraphs and tables of minutes and rates. `targets`: the return to reach in each task."""
     parts = [_sources(curves, rates, targets)]
     for processor in sorted({rate.processor for rate in rates}) or [""]:
         here = [rate for rate in rates if rate.processor == processor]
@@ -157,7 +169,7 @@ def page_part(curves: Sequence[Curve], rates: Sequence[Rate]) -> str:
             parts += ["The quickest algorithm, by the time of a step:", quickest_table(rated)]
         for env, rows in rated.items():
             parts += [f"The rates on {env}:", rates_table(rows)]
-    return "\n\n".join(part.rstrip("\n") for part in parts) + "\n"
+    return parts
 
 
 def _sources(curves: Sequence[Curve], rates: Sequence[Rate], targets: dict[str, float]) -> str:

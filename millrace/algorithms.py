@@ -24,8 +24,9 @@ The algorithm itself:
 
 - `Algorithm`: the base class of all algorithms. `GradientDescent`: the base of the built-in ones, with their optimizers,
   schedules, running statistics, `UpdateMetrics` and saved state. `ActorCritic`: the base of algorithms with an actor and a
-  critic (`PPO`, `A2C`, `IMPALA`, `REINFORCE`). `OffPolicy`: the base of algorithms with a replay buffer (`DQN`, `SAC`,
-  `TD3`). `Continuous`: the base of `SAC` and `TD3`, for actions in a bounded Box and an exact replay ratio.
+  critic (`PPO`, `A2C`, `IMPALA`, `REINFORCE`). `OffPolicy`: the base of algorithms with a replay buffer (`DQN`,
+  `Rainbow`). `Continuous`: the base of those for actions in a bounded Box, with an exact replay ratio (`SAC`, `TD3`, `TQC`,
+  `CrossQ`, `XQC`).
 - `AlgorithmConfig`, `ActorCriticConfig`, `OffPolicyConfig` and `ContinuousConfig`: base classes for an algorithm's `Config`.
   `PPOConfig` and similar classes are the settings of the built-in algorithms. Every setting has a default value and a type,
   which may have bounds: `Annotated[float, msgspec.Meta(gt=0)]`. The string under a setting is its help text.
@@ -63,12 +64,14 @@ from __future__ import annotations
 from millrace.learner.algorithms.a2c import A2C
 from millrace.learner.algorithms.actor_critic import ActorCritic, Estimates
 from millrace.learner.algorithms.algorithm import Algorithm, Start
+from millrace.learner.algorithms.crossq import CrossQ
 from millrace.learner.algorithms.dqn import DQN
 from millrace.learner.algorithms.gradient_descent import GradientDescent, UpdateMetrics, check_finite, scheduled
 from millrace.learner.algorithms.impala import IMPALA
 from millrace.learner.algorithms.minibatches import LossInput, Observations
 from millrace.learner.algorithms.ppo import PPO
 from millrace.learner.algorithms.prior_data import PriorData
+from millrace.learner.algorithms.rainbow import Rainbow
 from millrace.learner.algorithms.reinforce import REINFORCE
 from millrace.learner.algorithms.replay.continuous import Continuous
 from millrace.learner.algorithms.replay.hindsight import Hindsight
@@ -82,18 +85,24 @@ from millrace.learner.algorithms.returns import EpisodeEnds, gae, vtrace
 from millrace.learner.algorithms.running_statistics import ObservationNormalizer, RewardScaler
 from millrace.learner.algorithms.sac import SAC
 from millrace.learner.algorithms.td3 import TD3
+from millrace.learner.algorithms.tqc import TQC
+from millrace.learner.algorithms.xqc import XQC
 from millrace.learner.config.hyperparameters import (
     A2CConfig,
     ActorCriticConfig,
     AlgorithmConfig,
     ContinuousConfig,
+    CrossQConfig,
     DQNConfig,
     IMPALAConfig,
     OffPolicyConfig,
     PPOConfig,
+    RainbowConfig,
     REINFORCEConfig,
     SACConfig,
     TD3Config,
+    TQCConfig,
+    XQCConfig,
 )
 from millrace.learner.config.resume_rules import Adaptable, Fixed, Free
 from millrace.protocol.errors import UsageError
@@ -115,6 +124,8 @@ __all__ = [
     "REINFORCE",
     "SAC",
     "TD3",
+    "TQC",
+    "XQC",
     "A2CConfig",
     "ActionSpec",
     "ActorAndCritics",
@@ -128,6 +139,8 @@ __all__ = [
     "Continuous",
     "ContinuousConfig",
     "CriticLoss",
+    "CrossQ",
+    "CrossQConfig",
     "DQNConfig",
     "Encoder",
     "EpisodeEnds",
@@ -150,6 +163,8 @@ __all__ = [
     "Purpose",
     "QNetwork",
     "REINFORCEConfig",
+    "Rainbow",
+    "RainbowConfig",
     "RecurrentInput",
     "ReplayBuffer",
     "RewardScaler",
@@ -160,9 +175,11 @@ __all__ = [
     "Sequences",
     "Start",
     "TD3Config",
+    "TQCConfig",
     "Transitions",
     "UpdateMetrics",
     "UsageError",
+    "XQCConfig",
     "check_finite",
     "features",
     "gae",

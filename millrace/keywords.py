@@ -157,8 +157,8 @@ class TrainKeywords(RolloutKeywords, total=False):
     from_parts: Literal["auto", "policy", "best", "critic", "all"]
     """What `--from` takes over. policy: the newest policy and the statistics. best: the policy of the best evaluation.
     critic: also the critic, the target networks and the temperature. all: also the optimizers. A replay buffer is
-    never taken over. auto: critic with sac and td3 if the run has a checkpoint, because their actors immediately
-    follow the critic; otherwise policy.
+    never taken over. auto: critic with sac, td3, tqc, crossq and xqc if the run has a checkpoint, because their actors
+    immediately follow the critic; otherwise policy.
     """
     device: Literal["auto", "cpu", "cuda"]
     """Device of the learner. auto: cuda if PyTorch finds a GPU, else cpu."""
@@ -320,9 +320,10 @@ class TrainKeywords(RolloutKeywords, total=False):
     core: Literal["lstm", "gru"] | None
     """ppo, a2c, impala: Recurrent layer in front of the hidden layers. Minibatches then consist of whole sequences: all T
     steps of some env copies.
-    dqn, rainbow, sac, td3, tqc, crossq, xqc: Recurrent layer in front of the hidden layers. A gradient step then takes
-    whole sequences: the rollout_steps steps of an env copy, preceded by its previous rollout as burn-in. Actor and
-    critics share the layer, and the critics' loss trains it.
+    dqn, sac, td3, tqc, crossq, xqc: Recurrent layer in front of the hidden layers. A gradient step then takes whole
+    sequences: the rollout_steps steps of an env copy, preceded by its previous rollout as burn-in. Actor and critics
+    share the layer, and the critics' loss trains it.
+    rainbow: Must be none: Rainbow can't train a recurrent policy, dqn can.
     """
     core_size: int
     """ppo, a2c, dqn, rainbow, impala, sac, td3, tqc, crossq, xqc: Number of units of the recurrent layer."""

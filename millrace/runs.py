@@ -279,7 +279,8 @@ def train(
         callbacks: Called between updates; they may also end the run. A callback is an object with some of the methods of
             `Callback`; a name such as "my_module:factory", which a resumed run finds again; or a function, which gets a
             `Progress` after each update, and several times a second during an evaluation or a long wait.
-        progress: Show the progress: in one display in a notebook, in place on a terminal, otherwise as a line every 5 s.
+        progress: Show the progress: in one display in a notebook, in place on a terminal, otherwise as a line every 5 s or
+            less often.
         **settings: The flags of `millrace train`, with the same names, such as `learning_rate=1e-3`. `algo` may be your own
             class (`millrace.algorithms`). If the class is defined in a script or a notebook, pass it again on resume. Type
             checkers don't know settings that only your class has: pass them as `**own`, a `dict[str, Any]`. `start_from`

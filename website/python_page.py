@@ -64,14 +64,16 @@ GROUPS = {
         "What an algorithm of your own derives from. Importing `millrace.algorithms` imports PyTorch.",
         "algorithms.Algorithm algorithms.GradientDescent algorithms.ActorCritic algorithms.OffPolicy algorithms.Continuous "
         "algorithms.PPO algorithms.A2C algorithms.IMPALA algorithms.REINFORCE algorithms.DQN "
-        "algorithms.SAC algorithms.TD3 testing.check_algorithm testing.AlgorithmMistakes",
+        "algorithms.Rainbow algorithms.SAC algorithms.TD3 algorithms.TQC algorithms.CrossQ algorithms.XQC "
+        "testing.check_algorithm testing.AlgorithmMistakes",
     ),
     "algorithm_settings": Group(
         "Settings of algorithms",
         "The records to derive `Config` from. [Settings](../settings.md) lists what they hold.",
         "algorithms.AlgorithmConfig algorithms.ActorCriticConfig algorithms.OffPolicyConfig algorithms.ContinuousConfig "
         "algorithms.PPOConfig algorithms.A2CConfig algorithms.IMPALAConfig algorithms.REINFORCEConfig algorithms.DQNConfig "
-        "algorithms.SACConfig algorithms.TD3Config algorithms.Free algorithms.Adaptable algorithms.Fixed",
+        "algorithms.RainbowConfig algorithms.SACConfig algorithms.TD3Config algorithms.TQCConfig algorithms.CrossQConfig "
+        "algorithms.XQCConfig algorithms.Free algorithms.Adaptable algorithms.Fixed",
     ),
     "algorithm_data": Group(
         "What algorithms learn from",
@@ -101,7 +103,9 @@ GROUPS = {
     ),
 }
 """The groups, by the names of their pages"""
-WITHOUT_MEMBERS = ("Config", ".PPO", ".A2C", ".IMPALA", ".REINFORCE", ".DQN", ".SAC", ".TD3")
+WITHOUT_MEMBERS = (
+    "Config", ".PPO", ".A2C", ".IMPALA", ".REINFORCE", ".DQN", ".Rainbow", ".SAC", ".TD3", ".TQC", ".CrossQ", ".XQC",
+)  # fmt: skip
 """Ends of names whose members are on another page, or are those of a base"""
 WITH_INHERITED_MEMBERS = {"millrace.Progress"}
 """Names whose base is no public name of its own"""

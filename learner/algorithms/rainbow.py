@@ -23,7 +23,7 @@ from millrace.learner.algorithms.replay.sequence_replay import SequenceSample
 from millrace.learner.algorithms.replay.transitions import Transitions
 from millrace.learner.config.hyperparameters import QLearningConfig, RainbowConfig
 from millrace.protocol.errors import UsageError
-from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
+from millrace.protocol.specs import PolicySpec
 
 
 class Rainbow(DQN):
@@ -43,13 +43,6 @@ class Rainbow(DQN):
         """See `DQN`."""
         normalized = Normalized.BEFORE if self.config.batch_norm else Normalized.NOWHERE
         return QuantileQNetwork(self.policy, self.config.quantiles, normalized, device, seed)
-
-    @classmethod
-    def policy_spec(cls, config: QLearningConfig, observation: tuple[Leaf, ...], action: ActionSpec) -> PolicySpec:
-        """See `DQN`. Also raises `UsageError` for a policy with memory."""
-        if config.core is not None:
-            raise UsageError(f"rainbow: core: expected none, got {config.core}; take --algo dqn for a policy with memory")
-        return super().policy_spec(config, observation, action)
 
     def transitions(self, sample: Sample | SequenceSample) -> Transitions:
         """See `OffPolicy`. Nothing is encoded yet, because observations and next observations are encoded together."""

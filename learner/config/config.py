@@ -46,8 +46,8 @@ class Config(RolloutConfig, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     from_parts: Fixed[Literal["auto", "policy", "best", "critic", "all"]] = "auto"
     """What `--from` takes over. policy: the newest policy and the statistics. best: the policy of the best evaluation.
     critic: also the critic, the target networks and the temperature. all: also the optimizers. A replay buffer is never
-    taken over. auto: critic with sac and td3 if the run has a checkpoint, because their actors immediately follow the
-    critic; otherwise policy.
+    taken over. auto: critic with sac, td3, tqc, crossq and xqc if the run has a checkpoint, because their actors
+    immediately follow the critic; otherwise policy.
     """
     device: Free[Literal["auto", "cpu", "cuda"]] = "auto"
     """Device of the learner. auto: cuda if PyTorch finds a GPU, else cpu."""

@@ -290,6 +290,8 @@ class RainbowConfig(QLearningConfig, frozen=True):
     """
     n_step: Free[Count] = 3
     """Number of rewards in a target before it bootstraps. With several agents, each agent's own steps count."""
+    core: Fixed[Literal["lstm", "gru"] | None] = None
+    """Must be none: Rainbow can't train a recurrent policy, dqn can."""
     quantiles: Fixed[Annotated[int, msgspec.Meta(ge=2)]] = 16
     """Number of quantiles of the return that are learned for each action."""
     batch_norm: Fixed[bool] = True

@@ -11,7 +11,7 @@ import msgspec
 from millrace.flags.values import convert
 from millrace.learner.config.config import TABLES, Config
 from millrace.learner.config.evaluation_size import evaluation_size
-from millrace.learner.config.hyperparameters import OffPolicyConfig, PolicyGradientConfig, RecurrentConfig
+from millrace.learner.config.hyperparameters import OffPolicyConfig, PolicyGradientConfig, RainbowConfig, RecurrentConfig
 from millrace.learner.config.rollout_config import RolloutConfig
 from millrace.learner.run_folder.results import METRICS_BESIDE_FACTS
 from millrace.protocol.address import advertised_address, check_address
@@ -37,6 +37,8 @@ def validate(config: Config) -> None:
             most := (steps + 1) * config.envs // config.lanes
         ):
             raise UsageError(f"replay_size {size}: a rollout takes up to {most}; take --replay-size {most} or more")
+        case RainbowConfig(core=str(core)):
+            raise UsageError(f"core: rainbow has no memory: expected none, got {core}; take --algo dqn")
     if config.inference == "learner":
         _check_learner_inference(config)
     _check_prior(config)

@@ -13,13 +13,16 @@ from typing import Any
 
 import gymnasium
 import pytest
+from msgspec.structs import replace
 
 from benchmarks import slow_env, wall_clock, wall_clock_curves, wall_clock_rates
 from benchmarks.kept_records import merged
 from benchmarks.wall_clock_curves import Curve, read_curves, write_curves
 from benchmarks.wall_clock_programs import COPIES, ENVS, OURS, PROGRAMS, THEIRS, Program, curve_command, rate_command
 from benchmarks.wall_clock_rates import Rate, can_be_measured, largest_error, rate_at, rate_of, read_rates, write_rates
+from benchmarks.wall_clock_returns import comparison, return_after, returns_table
 from benchmarks.wall_clock_tables import (
+    NO_MINUTES,
     NOTHING,
     Row,
     minutes_table,
@@ -184,13 +187,45 @@ def test_from_which_step_time_on_another_algorithm_is_the_quickest() -> None:
 def test_the_part_of_the_page_has_what_there_is() -> None:
     curves = [curve(SAC, 1, (300_000, 5.0))]
     assert page_part([], []) == NOTHING
-    assert page_part(curves, []) == NOTHING, "without rates"
-    assert page_part([curve(XQC, 1, (300_000, 5.0))], [rate(XQC, 0.01, 9.0)]) == NOTHING, "without a return to reach"
+    assert page_part(curves, []).endswith(f"{NO_MINUTES}\n"), "without rates"
+    assert page_part([curve(XQC, 1, (300_000, 5.0))], [rate(XQC, 0.01, 9.0)]).endswith(f"{NO_MINUTES}\n"), "without a goal"
     whole = page_part([*curves, curve(SAC, 2, (300_000, 4.0))], [rate(SAC, 0.01, 400.0, 300.0), rate(SAC, 0.05, 320.0)])
     assert f"**{ENV}**, minutes until a return of 4.50 on p:" in whole
     assert "Each row has 2 seeds. A measured rate is the median of at least 1 round." in whole
     assert "the two differ by at most 0 %" in whole
     assert ENVS[1] not in whole
+
+
+def test_a_return_is_that_of_the_first_evaluation_that_is_late_enough() -> None:
+    points = ((90_000, 9.0), (99_999, 8.0), (100_016, 5.0), (110_000, 7.0))
+    assert return_after(curve(SAC, 1, *points), 100_000) == 5.0
+    assert return_after(curve(SAC, 1, *points), 110_001) is None
+
+
+def test_the_table_of_returns_has_the_mean_and_the_range_of_the_seeds_that_got_so_far() -> None:
+    curves = [
+        curve(SAC, 1, (100_000, 400.0), (300_000, 1_000.0)),
+        curve(SAC, 2, (100_000, 200.0)),
+        curve(XQC, 1, (100_000, 600.0)),
+        curve(XQC, 2, (100_001, 1_800.0)),
+    ]
+    assert returns_table(curves).splitlines()[2:] == [
+        f"| {ENV} | millrace SAC | 300 (200 to 400, 2 seeds) | 1,000 (one seed) |",
+        f"| {ENV} | millrace XQC | 1,200 (600 to 1,800, 2 seeds) |  |",
+    ]
+    assert f"300k: 1.20 on {ENV}." in comparison(curves)
+
+
+def test_of_several_tasks_the_mean_of_the_ratios_is_said() -> None:
+    curves = []
+    for env, new in zip(ENVS, (500.0, 1_000.0, 3_000.0), strict=True):
+        curves += [replace(curve(SAC, 1, (300_000, 1_000.0)), env=env), replace(curve(XQC, 1, (100_000, new)), env=env)]
+    assert comparison(curves).endswith("their mean is 1.50.")
+
+
+def test_without_both_curves_nothing_is_compared() -> None:
+    assert comparison([curve(XQC, 1, (100_000, 600.0)), curve(SAC, 1, (299_999, 1.0))]) == ""
+    assert returns_table([]) == ""
 
 
 def test_a_newer_curve_takes_the_place_of_that_of_the_same_seed() -> None:

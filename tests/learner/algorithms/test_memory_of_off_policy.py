@@ -14,6 +14,7 @@ from millrace.learner.algorithms import algorithm_class
 from millrace.learner.algorithms.replay.sequence_replay import SequenceSample
 from millrace.learner.algorithms.replay.transitions import Transitions
 from millrace.learner.config.hyperparameters import HYPERPARAMETERS
+from millrace.learner.config.layers import resolve
 from millrace.protocol.errors import UsageError
 from millrace.protocol.policy.encoder import RecurrentInput
 from millrace.protocol.policy.policy import make_policy
@@ -258,17 +259,15 @@ def test_without_a_core_dqn_does_not() -> None:
     assert right <= 1 / 3
 
 
-@pytest.mark.parametrize(
-    ("algo", "settings", "says"),
-    [
-        ("rainbow", {}, "rainbow: core: expected none, got gru; take --algo dqn for a policy with memory"),
-        ("dqn", {"hindsight": 0.8}, "hindsight 0.8: expected core none"),
-    ],
-)
-def test_what_has_no_memory_says_so(algo: str, settings: dict[str, Any], says: str) -> None:
-    config = msgspec.convert(SETTINGS | {"core": "gru"} | settings, HYPERPARAMETERS[algo])
-    with pytest.raises(UsageError, match=says):
-        algorithm_class(algo).policy_spec(config, DISCRETE.observation, DISCRETE.action)
+def test_hindsight_has_no_memory() -> None:
+    config = msgspec.convert(SETTINGS | {"core": "gru", "hindsight": 0.8}, HYPERPARAMETERS["dqn"])
+    with pytest.raises(UsageError, match=r"hindsight 0\.8: expected core none"):
+        algorithm_class("dqn").policy_spec(config, DISCRETE.observation, DISCRETE.action)
+
+
+def test_rainbow_has_no_memory_and_says_so_before_workers_start() -> None:
+    with pytest.raises(UsageError, match="core: rainbow has no memory: expected none, got gru; take --algo dqn"):
+        resolve("CartPole-v1", algo="rainbow", core="gru")
 
 
 def test_images_pass_the_core_too() -> None:

@@ -93,7 +93,13 @@ def test_what_weights_or_state_depend_on_is_fixed() -> None:
 
 
 @pytest.mark.parametrize(
-    ("algo", "name"), [(algo, name) for algo, record in HYPERPARAMETERS.items() for name in fixed(record)]
+    ("algo", "name"),
+    [
+        (algo, name)
+        for algo, record in HYPERPARAMETERS.items()
+        for name in fixed(record)
+        if (algo, name) != ("rainbow", "core")  # can't be set at all
+    ],
 )
 def test_each_fixed_setting_of_an_algorithm_is_refused_and_nothing_is_written(tmp_path: Path, algo: str, name: str) -> None:
     run = a_run(tmp_path, algo=algo)
