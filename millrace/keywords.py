@@ -308,8 +308,8 @@ class TrainKeywords(RolloutKeywords, total=False):
     when they are drawn from the buffer, and clip them to ±10; with n_step, this clips the sum of n rewards.
     reinforce: Divide rewards by the running standard deviation of the discounted return, and clip them to ±10.
     Otherwise the loss of the baseline dominates the gradient.
-    xqc: Divide rewards by the running standard deviation of the discounted return, or by more, so that no discounted
-    return so far exceeds return_bound.
+    xqc: Divide rewards by the running standard deviation of the discounted return, or by more, so that neither a
+    discounted return so far nor the value of going on after a truncated episode exceeds return_bound.
     """
     clone_epochs: int
     """ppo, a2c, impala, reinforce: Number of epochs of cloning on the dataset of --prior, before the first rollouts are

@@ -12,7 +12,7 @@ until there are `FEW` rows, so all rows are kept until then.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -21,7 +21,7 @@ import torch
 from msgspec.structs import replace
 
 from millrace.learner.algorithms.returns import EpisodeEnds, discounted_return
-from millrace.protocol.arrays import Array, Doubles, Floats
+from millrace.protocol.arrays import Array, Bools, Doubles, Floats
 from millrace.protocol.policy.features import feature_size, features, leaf_of_features
 from millrace.protocol.policy.layout import buffer_size
 from millrace.protocol.policy.normalize import CLIP, normalize
@@ -178,6 +178,12 @@ def _bounded(rows: Floats | Doubles, center: Floats | Doubles, spread: Floats | 
     return np.where(far, center + np.copysign(CLIP * spread, distance), rows) if far.any() else rows
 
 
+def continued(by_lane: Mapping[int, Doubles], lane: int, fresh: Bools) -> Doubles:
+    """The running sums [N] with which a lane's env copies begin a rollout: 0 for copies that are `fresh` [N]."""
+    known = 0.0 if fresh.all() else by_lane.get(lane, 0.0)  # a fresh lane may have more or fewer env copies
+    return np.where(fresh, 0.0, known)
+
+
 class RewardScaler:
     """Divides rewards by the running standard deviation of the discounted return, without a shift (Engstrom et al. 2020).
 
@@ -188,7 +194,6 @@ class RewardScaler:
     def __init__(self, gamma: float) -> None:
         self._gamma = gamma
         self._moments = RunningMoments()
-        self._largest = 0.0  # the largest absolute value of a discounted return so far
         self._returns: dict[int, Doubles] = {}  # by lane, the running return [columns] of each env copy
 
     def count_and_scale(self, batch: Batch) -> Floats:
@@ -201,11 +206,6 @@ class RewardScaler:
         clipped: Floats = np.clip(reward / self.std, -CLIP, CLIP).astype(np.float32)
         return clipped
 
-    def bounded(self, reward: Floats, bound: float) -> Floats:
-        """These rewards, float32, divided by `std`, or by more if discounted returns so far would exceed the bound."""
-        divided: Floats = (reward / max(self.std, self._largest / bound)).astype(np.float32)
-        return divided
-
     @property
     def std(self) -> float:
         """The standard deviation of the discounted return; 1 before any reward is counted."""
@@ -217,26 +217,26 @@ class RewardScaler:
         for at in range(0, len(batch.lane), batch.columns_per_rollout):  # rollouts of a lane are in order of collection
             columns = slice(at, at + batch.columns_per_rollout)
             lane = int(batch.lane[at])
-            fresh = batch.fresh[columns]
-            known = 0.0 if fresh.all() else self._returns.get(lane, 0.0)  # a fresh lane may have more or fewer env copies
-            start = np.where(fresh, 0.0, known)
-            returns, self._returns[lane] = discounted_return(
-                batch.reward[:, columns], ends.columns(columns), self._gamma, start
-            )
-            valid = returns[ends.valid[:, columns]]
-            self._moments.update(valid)
-            self._largest = max(self._largest, float(abs(valid).max(initial=0)))
+            reward, fresh, of_lane = batch.reward[:, columns], batch.fresh[columns], ends.columns(columns)
+            start = continued(self._returns, lane, fresh)
+            returns, self._returns[lane] = discounted_return(reward, of_lane, self._gamma, start)
+            self._moments.update(returns[of_lane.valid])
+            self.counted(returns, reward, of_lane, lane, fresh)
+
+    def counted(self, returns: Doubles, reward: Floats, ends: EpisodeEnds, lane: int, fresh: Bools) -> None:
+        """Called for each rollout, with its discounted returns and rewards [T, N]. A derived class may count more.
+
+        `fresh` [N]: which env copies don't continue the lane's last rollout.
+        """
 
     def state_dict(self) -> dict[str, Any]:
         """A copy of the state, as tensors and numbers."""
         return {
             "moments": self._moments.state_dict(),
-            "largest": self._largest,
             "returns": {lane: torch.tensor(returns) for lane, returns in self._returns.items()},
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from a `state_dict`."""
         self._moments.load_state_dict(state["moments"])
-        self._largest = float(state.get("largest", 0))  # states saved by version 0.2.0 lack this
         self._returns = {int(lane): returns.numpy().copy() for lane, returns in state["returns"].items()}

@@ -2,7 +2,7 @@
 
 It has three parts: batch normalization before each activation; weights that are kept at norm 1, because optimizer steps turn
 large weights by smaller angles; and critics that predict the probabilities of returns and learn by cross-entropy, whose
-gradient is bounded. Rewards are scaled so that returns lie within the categories. `NormalizedSAC` has the parts that XQC and
+gradient is bounded. Rewards are scaled so that values lie within the categories. `NormalizedSAC` has the parts that XQC and
 CrossQ share.
 """
 
@@ -17,6 +17,7 @@ from millrace.learner.algorithms.bodies.actor_with_critics import ActorWithCriti
 from millrace.learner.algorithms.bodies.heads import Categories
 from millrace.learner.algorithms.bodies.normalized_sac import NormalizedSAC
 from millrace.learner.algorithms.bodies.stacked_mlps import MLPShape, Normalized
+from millrace.learner.algorithms.bounded_returns import BoundedReturns
 from millrace.learner.algorithms.replay.off_policy import CriticLoss
 from millrace.learner.algorithms.replay.transitions import Transitions
 from millrace.learner.config.hyperparameters import XQCConfig
@@ -36,6 +37,7 @@ class XQC(NormalizedSAC):
     def __init__(self, config: XQCConfig, policy: PolicySpec, *, total_steps: int, seed: int, device: str = "cpu") -> None:
         self.categories = Categories(config.atoms, config.return_bound, device)
         super().__init__(config, policy, total_steps=total_steps, seed=seed, device=device)
+        self.rewards: BoundedReturns = BoundedReturns(config.gamma, config.return_bound)
         if config.ent_coef is None:
             self.log_temperature.fill_(math.log(INITIAL_TEMPERATURE))
         if config.target_entropy is None:
@@ -55,10 +57,13 @@ class XQC(NormalizedSAC):
         return ActorWithCritics(self.policy, *self.shapes(), self.categories.mean, device, self.seed)
 
     def scaled(self, reward: Floats) -> Floats:
-        """See `GradientDescent`. Rewards are scaled so that no discounted return so far exceeds `return_bound`."""
-        if not self.config.normalize_rewards:
-            return reward
-        return self.rewards.bounded(reward, self.config.return_bound)
+        """See `GradientDescent`. Rewards are scaled so that values don't exceed `return_bound`.
+
+        With hindsight, an agent that stays at a goal gets the goal's reward in every step, which no collected return shows.
+        """
+        if self.config.hindsight and self.config.goal_ends is None:
+            self.rewards.may_last(reward)
+        return super().scaled(reward)
 
     def target_distribution(self, rows: Transitions, next_logits: Tensor, next_log_prob: Tensor) -> Tensor:
         """The distribution [B, O] over categories of Σ γⁱ r + γᵏ (Z′ − α log π(a′|s′)), without a gradient.

@@ -388,8 +388,8 @@ class XQCConfig(NormalizedConfig, frozen=True):
     return_bound: Fixed[Positive] = 5.0
     """Largest return, in units of scaled reward, that a critic can learn."""
     normalize_rewards: Fixed[bool] = True
-    """Divide rewards by the running standard deviation of the discounted return, or by more, so that no discounted return so
-    far exceeds return_bound.
+    """Divide rewards by the running standard deviation of the discounted return, or by more, so that neither a discounted
+    return so far nor the value of going on after a truncated episode exceeds return_bound.
     """
 
 

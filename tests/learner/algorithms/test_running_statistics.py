@@ -281,28 +281,6 @@ def test_a_scaled_reward_is_clipped() -> None:
     assert sorted(set(scaled.ravel().tolist())) == [-10, 0, 10]
 
 
-@pytest.mark.parametrize("bound", [0.5, 100.0])
-def test_bounded_rewards_are_divided_by_the_larger_of_the_deviation_and_the_largest_return_over_the_bound(
-    bound: float,
-) -> None:
-    """Also after a second batch whose returns go on from the first, and are smaller."""
-    life = lives(12, 2)
-    scaler, columns = RewardScaler(GAMMA), columns_of(life)
-    reward, ended, valid = life
-    for at, factor in ((0, 10), (6, 0.1)):
-        rows = slice(at, at + 6)
-        reward[rows] *= np.float32(factor)
-        scaler.count(batch(reward[rows], [0, 0], [at == 0] * 2, ended[rows], valid[at]))
-    largest = max(abs(g) for g in slow_returns(columns))
-    by_std, by_bound = slow_std(columns), largest / bound
-    assert (by_bound > by_std) == (bound < 1)
-    found = scaler.bounded(reward, bound)
-    np.testing.assert_allclose(found, reward / max(by_std, by_bound), rtol=1e-5)
-    assert found.dtype == np.float32
-    returns = slow_returns(columns_of((found, ended, valid)))
-    assert max(abs(g) for g in returns) <= bound * (1 + 1e-5)
-
-
 def test_what_never_varied_is_divided_by_one() -> None:
     constant = batch(np.full((1, 3), 0.3), [0, 0, 0], [True] * 3, copies=3)
     np.testing.assert_array_equal(RewardScaler(GAMMA).count_and_scale(constant), constant.reward)
@@ -337,17 +315,6 @@ def test_a_float64_feature_has_its_own_spread_however_small_beside_its_mean() ->
     assert never.std == 1
 
 
-def test_a_state_that_does_not_know_the_largest_return_goes_on() -> None:
-    """That of an older version of millrace."""
-    reward, ended, valid = lives(8, 2)
-    scaler, again = RewardScaler(GAMMA), RewardScaler(GAMMA)
-    scaler.count(batch(reward, [0, 0], [True, True], ended, valid[0]))
-    state = scaler.state_dict()
-    del state["largest"]
-    again.load_state_dict(state)
-    np.testing.assert_array_equal(again.scaled(reward), scaler.scaled(reward))
-
-
 @pytest.mark.parametrize("steps", [1, 4])
 def test_the_state_goes_through_a_file(steps: int) -> None:
     reward, ended, valid = lives(8, 2)
@@ -356,7 +323,6 @@ def test_the_state_goes_through_a_file(steps: int) -> None:
     again.load_state_dict(through_a_file(scaler.state_dict()))
     following = batch(reward[4 : 4 + steps], [0, 0], [False, False], ended[4 : 4 + steps], valid[4])
     np.testing.assert_array_equal(again.count_and_scale(following), scaler.count_and_scale(following))
-    np.testing.assert_array_equal(again.bounded(following.reward, 1.0), scaler.bounded(following.reward, 1.0))
 
     x = np.random.default_rng(0).normal(size=(2, 3, 6)).astype(np.float32)
     normalizer, restored = ObservationNormalizer(SPEC), ObservationNormalizer(SPEC)

@@ -7,9 +7,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 import torch
+from msgspec.structs import replace
 from torch import Tensor
 
 from millrace.learner.algorithms.bodies.stacked_mlps import StackedMLPs
+from millrace.learner.algorithms.bounded_returns import BoundedReturns
 from millrace.learner.algorithms.replay.transitions import Transitions
 from millrace.protocol.arrays import Doubles
 from tests.learner.algorithms.bodies import plain_formula as plain
@@ -242,14 +244,27 @@ def test_the_critic_loss_of_xqc_and_its_gradient_are_those_of_the_formula() -> N
     torch.testing.assert_close(gradient(found, given.algorithm.net.critics), by_critics, **ROUNDING)
 
 
-def test_xqc_learns_from_rewards_whose_returns_are_within_the_bound_of_the_categories() -> None:
-    algorithm, plainly = made("xqc", return_bound=0.5), made("xqc", normalize_rewards=False)
+def test_xqc_learns_from_rewards_whose_values_are_within_the_bound_of_the_categories() -> None:
+    algorithm, plainly, expected = (
+        made("xqc", return_bound=0.5),
+        made("xqc", normalize_rewards=False),
+        BoundedReturns(0.99, 0.5),
+    )
     rows = batch(0)
-    for each in (algorithm, plainly):
+    for each in (algorithm, plainly, expected):
         each.count(rows)
-    assert np.array_equal(algorithm.scaled(rows.reward), algorithm.rewards.bounded(rows.reward, 0.5))
+    assert np.array_equal(algorithm.scaled(rows.reward), expected.scaled(rows.reward))
     assert np.array_equal(plainly.scaled(rows.reward), rows.reward)
-    assert not np.array_equal(algorithm.scaled(rows.reward), algorithm.rewards.scaled(rows.reward))
+
+
+@pytest.mark.parametrize(("goal_ends", "lasts"), [(None, 100.0), (0.05, 1.0)])
+def test_with_hindsight_the_reward_of_a_goal_may_last_unless_a_goal_ends_the_episode(
+    goal_ends: float | None, lasts: float
+) -> None:
+    algorithm = made("xqc", gamma=0.99)
+    algorithm.config = replace(algorithm.config, hindsight=0.8, goal_ends=goal_ends)
+    reward = np.array([0, 1], np.float32)
+    assert algorithm.scaled(reward)[1] == pytest.approx(1 / max(1, lasts / algorithm.config.return_bound))
 
 
 def test_the_temperature_of_xqc_begins_in_units_of_scaled_rewards() -> None:
