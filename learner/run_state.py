@@ -48,6 +48,8 @@ class RunState(msgspec.Struct, kw_only=True):
     version: Past = 0
     env_steps: Past = 0
     wall_s: Seconds = 0.0
+    stages: dict[str, Real] = {}
+    """The seconds in each stage, as in `Summary.stages`."""
     ledger: Ledger = msgspec.field(default_factory=Ledger)
     incarnations: list[Past] = []
     """The next incarnation of each lane."""

@@ -174,9 +174,11 @@ class RunFiles:
         spec = self._spec
         env_steps = self._state.env_steps
         past = self._hub.past()
+        snapshot = self._hub.snapshot()
         state = msgspec.structs.replace(
             self._state,
-            wall_s=self._tally.wall_s(self._hub.snapshot()),
+            wall_s=self._tally.wall_s(snapshot),
+            stages=self._tally.stages(snapshot),
             ledger=past.ledger,
             incarnations=list(past.incarnations),
             rounds=past.rounds,

@@ -52,6 +52,7 @@ class Tally:
         self._steps_per_update = spec.rollout_steps * config.envs
         self._update_s = 0.0
         self.wall_before_s = state.wall_s
+        self._stages_before = dict(state.stages)
         self.steps_before = state.env_steps
         self._started_s = time.monotonic()
 
@@ -107,11 +108,16 @@ class Tally:
         self._update_s += seconds - self.gathered_s
 
     def stages(self, snapshot: HubSnapshot) -> dict[str, float]:
-        """Seconds in each stage of the learner, and in each stage of all workers together, as of their last heartbeats."""
+        """Seconds in each stage of the learner, and in each stage of all workers together, as of their last heartbeats.
+
+        They include the time before a resume.
+        """
         other_s = snapshot.learn_s - self._update_s
-        stages = {"learner_wait": snapshot.wait_s, "learner_update": self._update_s, "learner_other": other_s}
-        stages |= {"learner_evaluate": snapshot.evaluate_s} if snapshot.evaluate_s else {}
-        return stages | {f"worker_{name}": s for name, s in snapshot.worker_stages.items()}
+        since = {"learner_wait": snapshot.wait_s, "learner_update": self._update_s, "learner_other": other_s}
+        since |= {"learner_evaluate": snapshot.evaluate_s} if snapshot.evaluate_s else {}
+        since |= {f"worker_{name}": seconds for name, seconds in snapshot.worker_stages.items()}
+        before = self._stages_before
+        return {name: before.get(name, 0.0) + since.get(name, 0.0) for name in since | before}
 
     def wall_s(self, snapshot: HubSnapshot) -> float:
         """Seconds of training so far, without evaluations but including the time before a resume."""

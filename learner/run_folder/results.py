@@ -194,8 +194,10 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     lags: dict[str, Natural] = {}
     """the number of rollouts that updates used, by lag, since this process started"""
     first_use_s: dict[str, Real] = {}
-    """by worker, the median of the seconds from publishing new weights to the arrival of the first rollout with them"""
-    stages: dict[str, Seconds] = {}
+    """by worker, the median of the seconds from publishing new weights to the arrival of the first rollout with them, since
+    this process started
+    """
+    stages: dict[str, Real] = {}
     """the seconds that the learner, and all workers together, spent in each stage, such as collecting and updating"""
     versions: dict[str, str] = {}
     """the versions of millrace and of the packages on which its results depend"""

@@ -149,8 +149,8 @@ class Cluster:
 
     def trains(self) -> None:
         """Wait until the learner has used a thousand more env steps."""
-        before = self.sees("millrace_env_steps_total", math.isfinite)
-        self.sees("millrace_env_steps_total", lambda steps: steps > before + 1_000)
+        before = self.sees("millrace_run_env_steps", math.isfinite)
+        self.sees("millrace_run_env_steps", lambda steps: steps > before + 1_000)
 
     def said(self) -> str:
         """The last lines of the learner's log."""

@@ -12,10 +12,12 @@ import torch
 
 from millrace.learner.algorithms.ppo import PPO
 from millrace.learner.between_updates.crowded_cores import CrowdedCores
+from millrace.learner.between_updates.tally import Tally
 from millrace.learner.config.config import Config
 from millrace.learner.config.hyperparameters import PPOConfig
 from millrace.learner.config.layers import resolve
 from millrace.learner.resume_checks import unless_finished
+from millrace.learner.rollouts.hub import HubSnapshot
 from millrace.learner.rollouts.ledger import Ledger
 from millrace.learner.rollouts.opponent_pool import PoolState, Snapshot
 from millrace.learner.rollouts.rollout_dealer import AcceptedRollout
@@ -36,6 +38,23 @@ from tests.support.in_process.described import run_spec
 def ppo(config: Config) -> PPOConfig:
     assert isinstance(config.algorithm, PPOConfig)
     return config.algorithm
+
+
+def test_the_seconds_of_stages_go_on_after_a_resume() -> None:
+    state = RunState(stages={"learner_wait": 10.0, "learner_evaluate": 4.0, "worker_step": 7.0})
+    tally = Tally(resolve("CartPole-v1"), fake_run_spec(), state)
+    tally.updated(1.5)
+    snapshot = HubSnapshot(
+        Ledger(), incarnations=[], lags=[], wait_s=2.0, learn_s=3.5, worker_stages={"step": 1.0, "act": 0.5}
+    )
+    assert tally.stages(snapshot) == {
+        "learner_wait": 12.0,
+        "learner_update": 1.5,
+        "learner_other": 2.0,
+        "learner_evaluate": 4.0,
+        "worker_step": 8.0,
+        "worker_act": 0.5,
+    }
 
 
 def test_an_update_gets_what_the_coordinator_says_of_each_rollout() -> None:

@@ -19,6 +19,7 @@ Flags = TypeVar("Flags", bound=LaunchFlags)
 METRICS_PORT = 9464
 SET_BY_LAUNCHER = ("bind", "advertise", "run-dir", "resume", "keys", "insecure", "launched-workers")
 """Flags of the learner that a launcher sets, so the user must not set them"""
+NO_TEXT_IN_YAML = ("true", "false", "null", "on", "off", "yes", "no", "y", "n")
 DNS_LABEL = re.compile(r"[a-z]([-a-z0-9]{0,38}[a-z0-9])?")
 
 
@@ -28,10 +29,11 @@ def read_flags(
     """The launcher's flags, and the user's flags for the learner. Raises `UsageError` if a flag is not valid."""
     own, rest = cut_at_dashes(argv)
     flags = parse_flags(kind, own, f"launch {launcher}")
-    if not DNS_LABEL.fullmatch(flags.name):
+    if not DNS_LABEL.fullmatch(flags.name) or flags.name in NO_TEXT_IN_YAML:
         raise UsageError(f"name {flags.name!r}: expected lowercase letters, digits and dashes, at most 40, as in my-run")
     for flag in rest:
-        if flag.partition("=")[0].removeprefix("--").replace("_", "-") in set_by_launcher:
+        name, _, _ = flag.partition("=")
+        if name.startswith("--") and name.removeprefix("--").replace("_", "-") in set_by_launcher:
             raise UsageError(f"launch {launcher}: {flag} is set by the launcher; leave it out")
     # This raises for wrong flags. It leaves out --resume, which the launcher sets.
     read_config("learner", [flags.env, "--bind", "tcp://0.0.0.0:5555", *rest])

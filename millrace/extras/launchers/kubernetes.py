@@ -175,6 +175,7 @@ spec:
         - name: worker  # no probe: its supervisor ends a worker whose step hangs; after a run it waits for the next learner
           image: {json.dumps(flags.worker_image)}
           imagePullPolicy: IfNotPresent
+          command: [millrace, worker]  # also of an image that begins otherwise, such as the learner's, which has PyTorch
           args: {_args(args)}
           env:
             - name: MILLRACE_TOKEN  # as text: the files of a Secret can be read by the pod's group
@@ -221,5 +222,5 @@ def _container(cpu: str, memory: str) -> str:
 
 
 def _args(args: Sequence[str]) -> str:
-    """A list of arguments in YAML. `$(` is escaped, because Kubernetes would replace `$(NAME)` with a variable."""
-    return json.dumps([arg.replace("$(", "$$(") for arg in args])
+    """A list of arguments in YAML. `$` is escaped: Kubernetes replaces `$(NAME)` with a variable, and `$$` with `$`."""
+    return json.dumps([arg.replace("$", "$$") for arg in args])

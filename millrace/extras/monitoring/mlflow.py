@@ -6,6 +6,7 @@ run of the `mlflow` module.
 
 from __future__ import annotations
 
+import re
 import time
 from typing import Any
 
@@ -14,6 +15,7 @@ from millrace.extras.monitoring.run_rows import RowCallback, flat_settings, run_
 
 MOST_PARAMETERS = 100  # largest number of parameters in one request
 MOST_CHARACTERS = 500  # largest length of a parameter's value
+NOT_ALLOWED = re.compile(r"[^/\w.\- :]")  # characters that MLflow refuses in the name of a metric
 RUN_TAG = "millrace.run"
 
 
@@ -67,5 +69,6 @@ class MlflowCallback(RowCallback):
 
     def _send(self, row: dict[str, float], progress: Progress) -> None:
         now_ms = int(time.time() * 1000)
-        metrics = [self._mlflow.entities.Metric(name, value, now_ms, progress.env_steps) for name, value in row.items()]
+        named = {NOT_ALLOWED.sub("_", name): value for name, value in row.items()}
+        metrics = [self._mlflow.entities.Metric(name, value, now_ms, progress.env_steps) for name, value in named.items()]
         self._client.log_batch(self._run, metrics=metrics)

@@ -1,8 +1,11 @@
 """Serves the learner's metrics to Prometheus at `/metrics`. Their names follow Prometheus's conventions.
 
 Rule: now and then, the training loop publishes a whole snapshot in one assignment. It never waits. The server's threads read
-    only the newest snapshot. Labels have few values: millrace's own, and at most `MAX_FACTS` names of `info_keys`, but never
-    names of workers, paths or keys.
+only the newest snapshot. Labels have few values: millrace's own, and at most `MAX_FACTS` names of `info_keys`, but never
+names of workers, paths or keys.
+
+Rule: counters count what this learner did. A resumed run continues from a checkpoint that may know less than Prometheus has
+seen, and Prometheus takes a counter that falls for one that has begun again at 0.
 """
 
 from __future__ import annotations
@@ -32,6 +35,7 @@ from prometheus_client.registry import Collector
 
 from millrace.learner.config.config import Config
 from millrace.learner.rollouts.hub import Hub, HubSnapshot
+from millrace.learner.run_folder.progress import Progress
 from millrace.learner.run_folder.results import FactMean
 from millrace.learner.run_folder.run_format import versions
 from millrace.protocol.address import WILDCARDS, is_local
@@ -65,7 +69,9 @@ class MetricsCollector(Collector):
         """`clock`: seconds since 1970. `observed`: the snapshot to show before the first call of `observe`."""
         self._clock = clock
         self._observed = observed
-        self._updates_before: int | None = None  # number of updates before this learner resumed the run
+        self._before: HubSnapshot | None = (
+            None  # the first snapshot: what the run had counted before this learner resumed it
+        )
         self._about = {"env": config.env, "algo": config.algo, "seed": str(config.seed)}
         self._wanted = config.lanes
 
@@ -75,8 +81,8 @@ class MetricsCollector(Collector):
         if self._observed is not None and 0.0 <= now - self._observed.at_s < EVERY_S:
             return
         snapshot = hub.snapshot()
-        if self._updates_before is None:
-            self._updates_before = snapshot.progress.updates
+        if self._before is None:
+            self._before = snapshot
         self._observed = Observed(now, snapshot)
 
     def describe(self) -> Iterator[Metric]:
@@ -93,15 +99,28 @@ class MetricsCollector(Collector):
         if (observed := self._observed) is not None:
             at_s, hub = observed
             yield GaugeMetricFamily("millrace_loop_timestamp_seconds", "When the learner's loop last listened.", at_s)
-            yield from _of_progress(hub, hub.progress.updates - (self._updates_before or 0))
-            yield from _of_ledger(hub.ledger.counts())
+            before = self._before or hub
+            counts = hub.ledger.counts()
+            counted = _since(before.ledger.counts(), counts)
+            yield from _of_progress(hub, before.progress)
+            yield from _of_ledger(counts, counted)
             yield from _of_workers(hub)
-            yield from _of_link(hub)
+            yield from _of_link(hub, counted)
 
 
-def _of_progress(hub: HubSnapshot, updates: int) -> Iterator[Metric]:
+def _since(before: Mapping[str, float], now: Mapping[str, float]) -> dict[str, float]:
+    """What was counted since `before`, by name."""
+    return {name: max(0.0, number - before.get(name, 0.0)) for name, number in now.items()}
+
+
+def _of_progress(hub: HubSnapshot, before: Progress) -> Iterator[Metric]:
     done = hub.progress
-    yield CounterMetricFamily("millrace_env_steps", "Env steps that updates have used, since the run began.", done.env_steps)
+    stage_s = _since(before.stages, done.stages)
+    steps = done.env_steps - before.env_steps
+    yield CounterMetricFamily("millrace_env_steps", "Env steps that updates of this learner have used.", steps)
+    yield GaugeMetricFamily(
+        "millrace_run_env_steps", "Env steps that updates have used since the run began.", done.env_steps
+    )
     yield GaugeMetricFamily("millrace_target_env_steps", "Env steps to train for.", done.total_steps)
     yield GaugeMetricFamily("millrace_env_steps_per_second", "Mean since this learner began.", done.steps_per_s)
     yield GaugeMetricFamily("millrace_weights_version", "Updates that made the newest weights; -1 before any.", hub.version)
@@ -116,15 +135,15 @@ def _of_progress(hub: HubSnapshot, updates: int) -> Iterator[Metric]:
     yield SummaryMetricFamily(
         "millrace_update_seconds",
         "Updates by this learner and the time they took.",
-        count_value=updates,
-        sum_value=done.stages.get("learner_update", 0.0),
+        count_value=done.updates - before.updates,
+        sum_value=stage_s.get("learner_update", 0.0),
     )
     stages = CounterMetricFamily(
         "millrace_stage_seconds", "Time in each stage: of the learner, of all workers together.", labels=("side", "stage")
     )
     for side, names in STAGES.items():
         for name in names:
-            stages.add_metric((side, name), done.stages.get(f"{side}_{name}", 0.0))
+            stages.add_metric((side, name), stage_s.get(f"{side}_{name}", 0.0))
     yield stages
 
 
@@ -147,14 +166,15 @@ def _of_facts(facts: Mapping[str, FactMean]) -> Iterator[Metric]:
     yield from (means, missing) if facts else ()
 
 
-def _of_ledger(ledger: Mapping[str, int]) -> Iterator[Metric]:
-    yield CounterMetricFamily("millrace_tickets_issued", "Tickets dealt, since the run began.", ledger["issued"])
-    yield _by_reason("millrace_tickets", "Tickets by how they ended.", {name: ledger[name] for name in TICKET_ENDS})
+def _of_ledger(ledger: Mapping[str, int], counted: Mapping[str, float]) -> Iterator[Metric]:
+    """`counted`: the counts of this learner alone."""
+    yield CounterMetricFamily("millrace_tickets_issued", "Tickets dealt by this learner.", counted["issued"])
+    yield _by_reason("millrace_tickets", "Tickets by how they ended.", {name: counted[name] for name in TICKET_ENDS})
     yield GaugeMetricFamily("millrace_tickets_outstanding", "Tickets neither used nor given up.", ledger["outstanding"])
     yield CounterMetricFamily(
-        "millrace_transitions_received", "Transitions that reached the learner.", ledger["transitions_received"]
+        "millrace_transitions_received", "Transitions that reached this learner.", counted["transitions_received"]
     )
-    ends = {name: ledger[f"transitions_{name}"] for name in TRANSITION_ENDS}
+    ends = {name: counted[f"transitions_{name}"] for name in TRANSITION_ENDS}
     yield _by_reason("millrace_transitions", "Transitions by how they ended.", ends)
     yield GaugeMetricFamily("millrace_transitions_waiting", "Transitions not yet used.", ledger["transitions_waiting"])
 
@@ -176,19 +196,18 @@ def _of_workers(hub: HubSnapshot) -> Iterator[Metric]:
     )
 
 
-def _of_link(hub: HubSnapshot) -> Iterator[Metric]:
+def _of_link(hub: HubSnapshot, counted: Mapping[str, float]) -> Iterator[Metric]:
     for name, (messages, size) in (("received", hub.received), ("sent", hub.sent)):
         yield CounterMetricFamily(f"millrace_{name}_messages", f"Messages {name} by this learner.", messages)
         yield CounterMetricFamily(f"millrace_{name}_bytes", f"Bytes of the messages {name}.", size)
-    ledger = hub.ledger.counts()
-    refused = {"unreadable": ledger["messages_bad"], "key": hub.refused_messages}
+    refused = {"unreadable": counted["messages_bad"], "key": hub.refused_messages}
     yield _by_reason("millrace_refused_messages", "Messages that were not used, by reason.", refused)
     late = "Actions that arrived too late for a program that owns its loop."
-    yield CounterMetricFamily("millrace_late_actions", late, ledger["late_actions"])
+    yield CounterMetricFamily("millrace_late_actions", late, counted["late_actions"])
     yield CounterMetricFamily("millrace_refused_handshakes", "Connections that were not let in.", hub.refused_handshakes)
 
 
-def _by_reason(name: str, text: str, counts: Mapping[str, int]) -> CounterMetricFamily:
+def _by_reason(name: str, text: str, counts: Mapping[str, float]) -> CounterMetricFamily:
     family = CounterMetricFamily(name, text, labels=("reason",))
     for reason, count in counts.items():
         family.add_metric((reason,), count)

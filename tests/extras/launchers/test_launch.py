@@ -58,6 +58,7 @@ def launched(capsys: pytest.CaptureFixture[str], *argv: str) -> str:
         (["kubernetes"], "missing"),
         (["kubernetes", "CartPole-v1", "--workers", "0"], "workers: expected int >= 1, got 0"),
         (["kubernetes", "CartPole-v1", "--name", "My_Run"], "expected lowercase letters, digits and dashes"),
+        (["kubernetes", "CartPole-v1", "--name", "true"], "expected lowercase letters, digits and dashes"),
         (["kubernetes", "CartPole-v1", "--", "--lerning-rate", "1"], "unknown flag --lerning-rate"),
         (["kubernetes", "CartPole-v1", "--", "--bind=tcp://*:1"], "--bind=tcp://*:1 is set by the launcher"),
         (["kubernetes", "CartPole-v1", "--", "--metrics-bind", "*:1"], "--metrics-bind is set by the launcher"),
@@ -192,8 +193,19 @@ def test_a_workers_pod_has_the_token_and_not_the_learners_key(cluster: dict[str,
 
 
 def test_kubernetes_expands_no_variable_in_our_arguments(capsys: pytest.CaptureFixture[str]) -> None:
-    text = launched(capsys, *DEFAULTS, "--env-kwargs", "render_mode", '$(HOME)\u2028é: {"x"}')
-    assert container(documents(text)["Job"])["args"][-5] == '$$(HOME)\u2028é: {"x"}'
+    text = launched(capsys, *DEFAULTS, "--env-kwargs", "render_mode", '$(HOME)\u2028é: {"x"} a$$b')
+    assert container(documents(text)["Job"])["args"][-5] == '$$(HOME)\u2028é: {"x"} a$$$$b'
+
+
+def test_a_workers_pod_says_what_it_runs_because_the_image_with_pytorch_is_the_learners(
+    cluster: dict[str, dict[str, Any]],
+) -> None:
+    assert container(cluster["Deployment"])["command"] == ["millrace", "worker"]
+
+
+def test_a_value_that_reads_like_a_flag_of_the_launcher_is_none(capsys: pytest.CaptureFixture[str]) -> None:
+    text = launched(capsys, *DEFAULTS, "--env-kwargs", "keys", "3", "--info-keys", "resume")
+    assert {"keys", "resume"} <= {*container(documents(text)["Job"])["args"]}
 
 
 def of_the_page() -> dict[str, dict[str, Any]]:

@@ -108,6 +108,7 @@ def test_before_the_learner_has_begun_it_tells_what_it_is_and_how_many_workers_i
 
 def test_the_numbers_are_those_of_the_coordinator_and_the_ledger(scraped: Scraped) -> None:
     learning, hub = scraped.learner, scraped.hub
+    scraped.metrics()
     for name in (A, B, C):
         learning.joins(name)
     learning.publish(0)
@@ -188,6 +189,18 @@ def test_progress_is_that_of_the_last_update_and_updates_are_this_learners_own(s
     assert found["millrace_stage_seconds_total", (("side", "learner"), ("stage", "wait"))] == 3.0
     assert found["millrace_stage_seconds_total", (("side", "worker"), ("stage", "step"))] == 2.0
     assert found["millrace_loop_timestamp_seconds", ()] == scraped.now
+
+
+def test_counters_begin_at_zero_when_a_run_is_resumed(scraped: Scraped) -> None:
+    """The checkpoint may know fewer steps than were scraped, and Prometheus would count the smaller number as new steps."""
+    scraped.hub.report_progress(msgspec.structs.replace(PROGRESS, env_steps=700, stages={"learner_wait": 2.0}))
+    scraped.learner.coordinator.rollouts.ledger.transitions_received = 800
+    before = scraped.metrics()
+    assert before["millrace_env_steps_total", ()] == before["millrace_transitions_received_total", ()] == 0
+    scraped.hub.report_progress(PROGRESS)
+    found = scraped.metrics()
+    assert (found["millrace_env_steps_total", ()], found["millrace_run_env_steps", ()]) == (300, 1_000)
+    assert found["millrace_stage_seconds_total", (("side", "learner"), ("stage", "wait"))] == 1.0
 
 
 def test_what_workers_call_themselves_and_their_stages_is_no_label(scraped: Scraped) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -146,8 +147,14 @@ class FakeMlflow:
         self.experiments: dict[str, str] = {}
         self.runs: dict[str, Any] = {}
         self.entities = SimpleNamespace(
-            Param=lambda key, value: (key, value), Metric=lambda key, value, at_ms, step: (key, value, step)
+            Param=lambda key, value: (key, value), Metric=lambda key, value, at_ms, step: (self.allowed(key), value, step)
         )
+
+    @staticmethod
+    def allowed(name: str) -> str:
+        """The name, which consists of the characters that MLflow allows."""
+        assert re.fullmatch(r"[/\w.\- :]+", name)
+        return name
 
     def MlflowClient(self, tracking_uri: str | None) -> FakeMlflow:  # the name in MLflow
         self.uri = tracking_uri
@@ -201,6 +208,19 @@ def test_mlflow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert len(fake.runs) == 1, "a resumed run goes on in the same MLflow run"
     updates = [value for name, value, _ in made.data.metrics if name == "time/iterations"]
     assert updates == list(range(1, len(updates) + 1))
+
+
+def test_names_that_mlflow_does_not_allow_are_changed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Logs(millrace.Callback):
+        def on_update(self, progress: Progress) -> None:
+            progress.log("success (%)", 1.0)
+
+    fake = FakeMlflow()
+    monkeypatch.setitem(sys.modules, "mlflow", fake)
+    callbacks = [Logs(), MlflowCallback(every_s=0.0)]
+    millrace.train(ENV, run_dir=str(tmp_path), callbacks=callbacks, **SMALL)
+    (made,) = fake.runs.values()
+    assert {name for name, *_ in made.data.metrics if "success" in name} == {"custom/success ___"}
 
 
 @pytest.mark.parametrize(("make", "name"), [(WandbCallback, "wandb"), (MlflowCallback, "mlflow")])
