@@ -22,6 +22,7 @@ from millrace.learner.run_folder.results import SUMMARY_FILE
 from millrace.learner.run_folder.run_format import CONFIG_FILE, RUN_FILE, is_run_folder
 from millrace.learner.run_folder.run_lock import LOCK_FILE
 from millrace.learner.run_lines import RunLine, find_runs, read_line
+from millrace.protocol.arrays import Doubles
 from millrace.protocol.bounds import escaped
 from millrace.protocol.errors import UsageError
 
@@ -36,6 +37,8 @@ class RunContent(NamedTuple):
 
     report: ReportedRun
     rows: list[dict[str, Any]]
+    evaluations: Doubles
+    """see `MetricsTail.evaluations`"""
 
 
 class KnownRuns:
@@ -90,7 +93,7 @@ class KnownRuns:
             except OSError as error:
                 raise UsageError(f"run {run}: {METRICS_FILE} cannot be read: {reason(error)}") from error
             rows = tail.rows
-            content = RunContent(read_run(run, rows), rows)
+            content = RunContent(read_run(run, rows), rows, tail.evaluations)
         self._read[run] = changed, content  # added at the end, so the first run is the least recently requested one
         while len(self._read) > MOST_KEPT:
             oldest = next(iter(self._read))

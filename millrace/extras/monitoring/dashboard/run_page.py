@@ -24,7 +24,7 @@ from millrace.extras.monitoring.report.reported_runs import ReportedRun
 from millrace.learner.members.held_up import in_words
 from millrace.learner.run_folder.json_log import LoggedLine
 from millrace.learner.run_folder.progress import ENV_STEPS_KEY, RETURN_KEY
-from millrace.learner.run_folder.results import EVALUATION_KEY, EVALUATION_LENGTH_KEY, Best
+from millrace.learner.run_folder.results import EVALUATION_KEY, Best
 from millrace.learner.run_folder.sentences import (
     bottleneck,
     duration,
@@ -274,27 +274,25 @@ def _segments(samples: Sequence[LaneSample], kinds: Sequence[str]) -> list[Segme
     return segments
 
 
-def evaluations(rows: Sequence[Mapping[str, Any]], kept: Best | None = None) -> str:
+def evaluations(made: Doubles, kept: Best | None = None) -> str:
     """The table of the newest evaluations, with a sentence about the best one.
 
-    `kept`: the best evaluation in the summary of a run that has ended. It may be the evaluation of the final policy, which
-    isn't in `rows`.
+    `made`: see `MetricsTail.evaluations`. `kept`: the best evaluation in the summary of a run that has ended. It may be the
+    evaluation of the final policy, which isn't in `made`.
     """
-    returns, lengths = (points(rows, key) for key in (EVALUATION_KEY, EVALUATION_LENGTH_KEY))
-    if not len(returns):
+    if not len(made):
         return ""
-    best = len(returns) - 1 - int(returns[::-1, 1].argmax())  # the newest of equally good evaluations, as in the run itself
-    at, highest = returns[best] if kept is None else (kept.env_steps, kept.chosen_by)
-    length_at = dict(lengths.tolist())
-    which = f"The best of {len(returns)}" if kept is None else "The best of all, that at the end included,"
+    best = len(made) - 1 - int(made[::-1, 1].argmax())  # the newest of equally good evaluations, as in the run itself
+    at, highest = made[best, :2] if kept is None else (kept.env_steps, kept.chosen_by)
+    which = f"The best of {len(made):,}" if kept is None else "The best of all, that at the end included,"
     about = f"{which} was at {at:,.0f} env steps, with a mean return of {return_text(highest)}."
     lines = [
         f'<tr><th scope="row" class="number">{steps:,.0f}</th><td class="number">{return_text(value)}</td>'
-        f'<td class="number">{length_at.get(steps, math.nan):,.1f}</td><td>{"the best" if steps == at else ""}</td></tr>'
-        for steps, value in returns
+        f'<td class="number">{length:,.1f}</td><td>{"the best" if steps == at else ""}</td></tr>'
+        for steps, value, length in made[: -MOST_LINES - 1 : -1]
     ]
     heads = "".join(f'<th scope="col" class="number">{name}</th>' for name in ("Env steps", "Return", "Episode length"))
-    table = f"<table><thead><tr>{heads}<th></th></tr></thead><tbody>{''.join(lines[: -MOST_LINES - 1 : -1])}</tbody></table>"
+    table = f"<table><thead><tr>{heads}<th></th></tr></thead><tbody>{''.join(lines)}</tbody></table>"
     return section("Evaluations", about, f'<div class="scroll">{table}</div>', "evaluations")
 
 

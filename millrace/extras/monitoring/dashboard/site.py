@@ -96,7 +96,7 @@ class Site:
             run_page.curve(content.rows, Choice.of(request.query)),
             run_page.who_waits(seen),
             run_page.workers(seen),
-            run_page.evaluations(content.rows, None if line.summary is None else line.summary.best),
+            run_page.evaluations(content.evaluations, None if line.summary is None else line.summary.best),
             sections.videos(report, _addresses(home, run)),
             sections.images(report, _addresses(home, run)),
             history(report),

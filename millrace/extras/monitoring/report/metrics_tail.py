@@ -1,24 +1,27 @@
 """Reads a growing metrics.jsonl, each time from where the last read ended, and keeps a bounded number of its rows.
 
 Rule: of a long file, it keeps rows at equal intervals, rows with an evaluation (all of them as long as they are few), and
-the newest row. The newest row is read again each time, because a run may add numbers to it. If the file was replaced, for
+the newest row. Of all evaluations it keeps three numbers, so that the best one is known. The newest row is read again each time, because a run may add numbers to it. If the file was replaced, for
 example by a resume, it is read from the beginning.
 """
 
 from __future__ import annotations
 
 import errno
+import math
 import os
-from collections.abc import Iterator
+from array import array
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from millrace.learner.run_folder.metrics_log import METRICS_FILE, MOST_LINE_BYTES, decoded_row
+from millrace.learner.run_folder.progress import ENV_STEPS_KEY
 from millrace.learner.run_folder.regular_files import MOST_BYTES, open_regular
-from millrace.learner.run_folder.results import EVALUATION_KEY
-from millrace.protocol.arrays import Ints
+from millrace.learner.run_folder.results import EVALUATED_AT_KEY, EVALUATION_KEY, EVALUATION_LENGTH_KEY
+from millrace.protocol.arrays import Doubles, Ints
 
 MOST_ROWS = 256  # of a long file, at least this many rows are kept, and at most twice as many: a chart has 500 points
 CHUNK_BYTES = 1 << 22
@@ -44,6 +47,13 @@ class MetricsTail:
             lines[self._all.count] = self._newest
         return [row for _, line in sorted(lines.items()) if (row := decoded_row(line)) is not None]
 
+    @property
+    def evaluations(self) -> Doubles:
+        """All evaluations, in order: [K, 3] env steps of the evaluated policy, mean return, mean episode length or NaN."""
+        newest = None if self._newest is None else decoded_row(self._newest)
+        numbers = self._evaluated + array("d", [] if newest is None else _evaluation(newest))
+        return np.array(numbers).reshape(-1, 3)
+
     def read(self) -> bool:
         """Read the rows that were added since the last read. Returns whether the file has changed. Raises OSError."""
         with os.fdopen(open_regular(self._path), "rb") as file:
@@ -68,6 +78,7 @@ class MetricsTail:
         self._newest = None
         self._all = _Thinned(self._most)
         self._evaluations = _Thinned(self._most)
+        self._evaluated = array("d")  # three numbers for each evaluation
 
     def _add(self, text: bytes) -> bytes:
         """Add the lines of this text, except the newest whole line, which may change. Returns the text from that line on."""
@@ -81,7 +92,10 @@ class MetricsTail:
         first = self._all.count
         spans = np.column_stack([begins[:-2], ends[:-1]])
         lines = np.unique(np.searchsorted(ends, [*_places(text, OF_AN_EVALUATION)]))
-        self._evaluations.add(text, first, spans, lines[lines < len(spans)])
+        evaluations = lines[lines < len(spans)]
+        for begin, end in spans[evaluations].tolist():
+            self._evaluated.extend(_evaluation(decoded_row(text[begin:end]) or {}))
+        self._evaluations.add(text, first, spans, evaluations)
         self._all.add(text, first, spans, np.arange(len(spans)))
         self._offset += int(begins[-2])
         return text[begins[-2] :]
@@ -112,6 +126,15 @@ class _Thinned:
         for i in which[-before % self._every :: self._every].tolist():
             begin, end = spans[i]
             self.lines[first + i] = text[begin:end]
+
+
+def _evaluation(row: Mapping[str, Any]) -> Sequence[float]:
+    """The env steps, return and episode length of the row's evaluation; empty if it has none."""
+    at, returned = row.get(EVALUATED_AT_KEY, row.get(ENV_STEPS_KEY)), row.get(EVALUATION_KEY)
+    if at is None or returned is None:
+        return ()
+    length = row.get(EVALUATION_LENGTH_KEY)
+    return at, returned, math.nan if length is None else length
 
 
 def _places(text: bytes, part: bytes) -> Iterator[int]:

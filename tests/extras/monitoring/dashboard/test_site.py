@@ -144,11 +144,8 @@ def test_the_command_for_one_more_worker_is_words_that_a_shell_leaves_alone(addr
 
 
 def test_the_newest_evaluations_are_a_table_that_marks_the_best() -> None:
-    rows = [
-        {"time/total_timesteps": 10 * i, "eval/mean_reward": 9.0 if i == 4 else float(i % 4), "eval/mean_ep_length": 7.0}
-        for i in range(30)
-    ]
-    rows[29] |= {"eval/env_steps": 285}
+    rows = np.array([(10 * i, 9.0 if i == 4 else i % 4, 7.0) for i in range(30)])
+    rows[29, 0] = 285
     said = Safe(run_page.evaluations(rows)).text
     assert "The best of 30 was at 40 env steps, with a mean return of 9.0." in said
     assert "285 1.0 7.0 280 0.0 7.0" in said
@@ -158,12 +155,11 @@ def test_the_newest_evaluations_are_a_table_that_marks_the_best() -> None:
     of_all = Safe(run_page.evaluations(rows[:6], Best(env_steps=60, chosen_by=9.5, evaluation=again))).text
     assert "The best of all, that at the end included, was at 60 env steps, with a mean return of 9.5." in of_all
     assert "7.0 the best" not in of_all
-    assert run_page.evaluations([{"time/total_timesteps": 10}]) == ""
+    assert run_page.evaluations(np.empty((0, 3))) == ""
 
 
 def test_of_equally_good_evaluations_the_newest_is_the_best_as_in_the_run() -> None:
-    returns = {10: 1.0, 20: 9.0, 30: 9.0, 40: 8.0}
-    rows = [{"time/total_timesteps": at, "eval/mean_reward": found} for at, found in returns.items()]
+    rows = np.array([(10, 1.0, 7.0), (20, 9.0, 7.0), (30, 9.0, 7.0), (40, 8.0, 7.0)])
     assert "The best of 4 was at 30 env steps, with a mean return of 9.0." in Safe(run_page.evaluations(rows)).text
 
 

@@ -6,6 +6,7 @@ import tracemalloc
 from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from millrace.extras.monitoring.report.metrics_tail import MetricsTail
@@ -83,6 +84,32 @@ def test_of_many_rows_a_bounded_number_is_kept_at_equal_distances(tmp_path: Path
     assert 10 <= len(kept) <= 20
     assert {b - a for a, b in pairwise(kept)} == {64}
     assert {*evaluated, 999} <= {*steps(tail)}
+
+
+def test_all_evaluations_are_known_however_many_there_are(tmp_path: Path) -> None:
+    """The best one may not be among the rows that are kept."""
+    tail = MetricsTail(tmp_path, most=10)
+    for part in (range(600), range(600, 1000)):
+        rows = [{ENV_STEPS_KEY: i, "eval/mean_reward": float(i == 502), "eval/mean_ep_length": 7.0} for i in part]
+        rows[-1] |= {"eval/env_steps": part[-1] - 5}
+        with (tmp_path / METRICS_FILE).open("a") as file:
+            file.writelines(json.dumps(row) + "\n" for row in [*rows, {ENV_STEPS_KEY: part[-1]}])
+        tail.read()
+    found = tail.evaluations
+    assert found.shape == (1000, 3)
+    assert found[found[:, 1].argmax()].tolist() == [502, 1, 7]
+    assert found[[599, 999], 0].tolist() == [594, 994]
+
+
+def test_the_newest_evaluation_counts_once_even_if_its_row_changes(tmp_path: Path) -> None:
+    tail = MetricsTail(tmp_path)
+    write(tmp_path, range(1, 3), evaluated=(2,))
+    tail.read()
+    assert tail.evaluations[:, 0].tolist() == [2]
+    assert np.isnan(tail.evaluations[0, 2])
+    write(tmp_path, range(3, 4), evaluated=(3,))
+    tail.read()
+    assert tail.evaluations[:, 0].tolist() == [2, 3]
 
 
 def test_a_file_that_is_no_table_is_refused_before_it_fills_the_memory(tmp_path: Path) -> None:
