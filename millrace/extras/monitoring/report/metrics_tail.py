@@ -1,8 +1,8 @@
 """Reads a growing metrics.jsonl, each time from where the last read ended, and keeps a bounded number of its rows.
 
 Rule: of a long file, it keeps rows at equal intervals, rows with an evaluation (all of them as long as they are few), and
-the newest row. Of all evaluations it keeps three numbers, so that the best one is known. The newest row is read again each time, because a run may add numbers to it. If the file was replaced, for
-example by a resume, it is read from the beginning.
+the newest row. Of all evaluations it keeps three numbers, so that the best one is known. The newest row is read again each
+time, because a run may add numbers to it. If the file was replaced, for example by a resume, it is read from the beginning.
 """
 
 from __future__ import annotations
