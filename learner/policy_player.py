@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from millrace.learner.config.rollout_config import RolloutConfig
+from millrace.learner.config.rollout_config import SEAT_ID, WITH_STATE, RolloutConfig
 from millrace.learner.members.describe_coordinator import Unknown
 from millrace.learner.members.lobby import Lobby
 from millrace.learner.open_hub import open_hub
@@ -65,7 +65,9 @@ def saved_policy(
     """
     card, parameters, buffers = RunFolder.open_policy(run).read_policy(which)
     refuse_modules_in(run, (*([card.env] if env is None else []), *(card.wrappers if wrappers is None else [])))
-    outer = card.wrappers if wrappers is None else wrappers
+    # The wrappers that other settings add belong to the policy, whose observations have their parts.
+    of_settings = [wrapper for wrapper in card.wrappers if wrapper in (SEAT_ID, WITH_STATE)]
+    outer = card.wrappers if wrappers is None else [*wrappers, *of_settings]
     spec = EnvSpec.of(card.env if env is None else env, card.env_kwargs, outer, card.eval_env_kwargs)
     return SavedPolicy(card.policy, spec, parameters, buffers, card.facts, card.masked, card.seats, card.teams)
 

@@ -89,7 +89,6 @@ class SeatedEnv(gymnasium.Env[SeatStep, Sequence[Any]]):
         self.seat_of = {agent: number for number, agent in enumerate(self.agents)}
         self._gone = set[Any]()  # agents whose part of the episode has ended
         self._tells_seats, shows_state = (getattr(env, name, False) for name in ("tells_seats", "shows_state"))
-        self._state_space = _state_space(env, name) if shows_state else None
         observation, self.action_space = (
             _common([kind(agent) for agent in self.agents], self.seats, what, name, padded)
             for kind, what, padded in (
@@ -97,6 +96,13 @@ class SeatedEnv(gymnasium.Env[SeatStep, Sequence[Any]]):
                 (env.action_space, "action", "pad_action_space_v0"),
             )
         )
+        own = set(observation.spaces) if isinstance(observation, spaces.Dict) else set[str]()
+        # If the observation has a part of this name, `critic_keys` means that part.
+        self._state_space = _state_space(env, name) if shows_state and STATE not in own else None
+        if self._tells_seats and SEAT in own:
+            raise UsageError(
+                f"environment {name}: seat_id: its observations have a part {SEAT!r} of their own; leave it out"
+            )
         more: dict[str, gymnasium.Space[Any]] = {SEAT: spaces.Discrete(len(self.seats))} if self._tells_seats else {}
         if self._state_space is not None:
             more[STATE] = self._state_space
@@ -118,6 +124,14 @@ class SeatedEnv(gymnasium.Env[SeatStep, Sequence[Any]]):
         if self._state_space is not None:
             named[STATE] = np.array(self.env.state() if state is None else state)
         return named
+
+    def _state_before(self, seen: Any, terminated: bool) -> Any:
+        """The environment's state in a seat's last observation if the seat is terminated; None if it has to be asked for.
+
+        Nothing is learned from the state after the end, and some environments have none, because they have removed the
+        agent's parts.
+        """
+        return seen[STATE] if terminated and self._state_space is not None else None
 
     def _nothing(self) -> SeatStep:
         """A `SeatStep` in which nothing has happened yet, to be filled."""
@@ -164,8 +178,11 @@ class SeatedEnv(gymnasium.Env[SeatStep, Sequence[Any]]):
     def owner(self, name: str) -> Any:
         """The outermost PettingZoo wrapper that itself has this attribute; the environment if no wrapper has it."""
         owner = self.env
-        while name not in dir(owner) and hasattr(owner, "env"):
-            owner = owner.env
+        while name not in dir(owner):
+            inner = getattr(owner, "env", None) or getattr(owner, "aec_env", None)  # the latter of `parallel_wrapper_fn`
+            if inner is None:
+                break
+            owner = inner
         return owner
 
     def has_wrapper_attr(self, name: str) -> bool:
@@ -239,13 +256,13 @@ class ParallelSeats(SeatedEnv):
             seat = self.seat_of[agent]
             info = infos.get(agent, _NO_INFO)
             complete[seat] = True
-            reward[seat] = float(rewards[agent])
+            reward[seat] = _number(rewards[agent])
             told[seat] = info if type(info) is dict else _info(agent, info)
             terminates[seat] = bool(terminated[agent])
             truncates[seat] = bool(truncated[agent])
             # If the agent is terminated, its last observation may be missing: nothing is learned from it.
             if not terminates[seat] or observations.get(agent) is not None:
-                seen[seat] = self._seen(seat, observations[agent])
+                seen[seat] = self._seen(seat, observations[agent], state=self._state_before(seen[seat], terminates[seat]))
             if terminates[seat] or truncates[seat]:
                 self._gone.add(agent)
             elif agent in here:
@@ -253,7 +270,7 @@ class ParallelSeats(SeatedEnv):
             else:
                 raise WrongAnswer(f"agent {agent} left, expected it to be terminated or truncated in its last step")
         for agent in rewards.keys() - given.keys():
-            outside[self.seat_of[agent]] = float(rewards[agent])
+            outside[self.seat_of[agent]] = _number(rewards[agent])
         here -= self._gone
         for agent in here - given.keys():
             self._shows(step, agent, observations[agent], infos.get(agent))
@@ -310,16 +327,17 @@ class TurnSeats(SeatedEnv):
             try:
                 if self._waits[seat]:
                     step.complete[seat] = True
-                    step.reward[seat] = float(reward)
+                    step.reward[seat] = _number(reward)
                     step.terminated[seat] = bool(terminated)
                     step.truncated[seat] = bool(truncated)
                 else:
-                    step.outside[seat] = float(reward)
+                    step.outside[seat] = _number(reward)
             except RETURNED_WRONGLY:
                 _check_numbers(agent, reward=reward, terminated=terminated, truncated=truncated)
                 raise
             if observation is not None:  # copied, because it is kept until the seat has the move again
-                step.observations[seat] = self._seen(seat, deepcopy(observation))
+                state = self._state_before(step.observations[seat], terminated)
+                step.observations[seat] = self._seen(seat, deepcopy(observation), state=state)
             elif not terminated and (self._waits[seat] or not truncated):  # needed to act, or to bootstrap
                 raise WrongAnswer(f"agent {agent}: expected an observation unless it is terminated, got None")
             self._waits[seat] = False
@@ -396,6 +414,11 @@ def with_state(env: Any) -> Any:
     return env
 
 
+def _number(value: Any) -> float:
+    """A reward as a number. As in gymnasium, an array with one element counts as one."""
+    return float(value.item() if isinstance(value, np.ndarray) else value)
+
+
 def _state_space(env: Any, name: str) -> gymnasium.Space[Any]:
     """The space of `env.state()`.
 
@@ -406,6 +429,8 @@ def _state_space(env: Any, name: str) -> gymnasium.Space[Any]:
         if space is not None:
             return space
         env.reset()
+        if not callable(env.state):
+            raise AttributeError("state")
         state = np.asarray(env.state())
     except (NotImplementedError, AttributeError) as error:
         raise UsageError(f"environment {name}: critic_keys state: expected a method state(), got none") from error

@@ -141,7 +141,13 @@ def test_each_agent_can_be_told_which_one_it_is(tmp_path: Path, env: str) -> Non
         ("observation", "box", ()),
         ("seat", "discrete", (2,)),
     ]
-    assert millrace.evaluate(run, episodes=1).facts["return_long"].mean == sum(CHAIN_REWARD["long"])
+    for wrappers in (None, [same]):  # other wrappers don't take the agent's number away
+        evaluation = millrace.evaluate(run, episodes=1, wrappers=wrappers)
+        assert evaluation.facts["return_long"].mean == sum(CHAIN_REWARD["long"])
+
+
+def same(env: Any) -> Any:
+    return env
 
 
 @pytest.mark.parametrize(
