@@ -33,9 +33,9 @@ from prometheus_client.metrics_core import (
 )
 from prometheus_client.registry import Collector
 
+from millrace import Progress
 from millrace.learner.config.config import Config
 from millrace.learner.rollouts.hub import Hub, HubSnapshot
-from millrace.learner.run_folder.progress import Progress
 from millrace.learner.run_folder.results import FactMean
 from millrace.learner.run_folder.run_format import versions
 from millrace.protocol.address import WILDCARDS, is_local
