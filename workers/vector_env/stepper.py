@@ -148,15 +148,16 @@ class Stepper:
         return infos
 
     def _lane_for(self, number: int, incarnation: int, pulse: Pulse) -> SteppedLane:
-        """The lane in this incarnation. If it doesn't exist, it is made."""
-        if (lane := self.lanes.here(number, incarnation)) is not None:
-            return lane
-        began = perf_counter()
-        kind = SeatedLane if self._spec.seats else SteppedLane
-        lane = self.lanes.open(number, lambda: kind(self._spec, number, incarnation, self._rows(number), pulse))
+        """The lane in this incarnation, for an order that arrived as a message. If the lane doesn't exist, it is made."""
+        lane = self.lanes.here(number, incarnation)
+        if lane is None:
+            began = perf_counter()
+            kind = SeatedLane if self._spec.seats else SteppedLane
+            lane = self.lanes.open(number, lambda: kind(self._spec, number, incarnation, self._rows(number), pulse))
+            self.stages["open"] += perf_counter() - began
         if self._memory is not None:
+            # A lane has one order at a time, so a step in the memory is finished or was abandoned before this order.
             lane.executed = self._memory.ordered(number)
-        self.stages["open"] += perf_counter() - began
         return lane
 
     def _rows(self, lane: int) -> ResultRows:

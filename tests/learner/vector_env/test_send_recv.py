@@ -323,6 +323,20 @@ def test_what_was_abandoned_does_not_come_back(shared: bool) -> None:
         assert observation[:, 0].tolist() == [1.0, 1.0, 1.0], "the first observations of new episodes"
 
 
+@BOTH_WAYS
+def test_a_step_that_was_abandoned_before_its_worker_saw_it_is_not_made_after_a_reset(shared: bool) -> None:
+    with made(copies=1, lanes=1, workers=1, shared=shared) as (env, link):
+        env.reset(seed=1)
+        link.frozen = {"w0"}
+        env.begin_step([0], zeros([0]))
+        env.abandon()
+        env.reset_async(seed=1)
+        link.frozen = set()  # the worker now gets both orders
+        env.reset_wait()
+        observation, reward, *_ = env.step(zeros([0]))
+        assert (observation.tolist(), reward.tolist()) == ([[pytest.approx(0.8)]], [1.0]), "of one step"
+
+
 def test_the_answer_to_an_order_for_which_nobody_waits_any_more_is_not_taken_for_a_later_one() -> None:
     def stop() -> None:
         raise InterruptedError("stop")
