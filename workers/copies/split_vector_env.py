@@ -12,23 +12,42 @@ from contextlib import contextmanager
 from functools import partial
 from typing import Any, Protocol, TypeVar
 
+import gymnasium
 import numpy as np
-from gymnasium.vector import VectorEnv
 
-from millrace.protocol.arrays import Array
+from millrace.protocol.arrays import Array, Bools
 from millrace.protocol.envs.action_masks import without_mask
 from millrace.protocol.envs.spaces import make_batched, make_flatten
 from millrace.protocol.errors import EnvironmentFailed, NoWorkers, WorkerLost
+from millrace.protocol.policy.masks import MASK
 from millrace.protocol.specs import RunSpec
 from millrace.protocol.wire.plain_values import unpack
 from millrace.workers.copies.env_copies import EnvCopies, Leaves, StepResult
 from millrace.workers.copies.env_errors import CopyFailed, environment_failed
 from millrace.workers.copies.env_loop import Pulse
-from millrace.workers.copies.episode_facts import Facts, facts_of_copies, of_ended
+from millrace.workers.copies.episode_facts import Facts, facts_of_info
 from millrace.workers.copies.mask_reader import MaskReader
 
 METHODS = ("close", "render", "reset", "step")  # every environment has these methods
 Result = TypeVar("Result")
+
+
+class HasInfosByRow(Protocol):
+    """A vector environment with gymnasium's methods that also has the infos as each copy returned them."""
+
+    num_envs: int
+    single_observation_space: gymnasium.Space[Any]
+    single_action_space: gymnasium.Space[Any]
+    merge_infos: bool
+    """whether to return infos, merged as gymnasium does"""
+    infos_by_row: dict[int, dict[str, Any]]
+    """the infos of the last step or reset that are not empty, by copy"""
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        """Begin episodes, in the copies that `options["reset_mask"]` selects."""
+
+    def step(self, actions: Any) -> Any:
+        """Step every copy."""
 
 
 class StepsSomeLanes(Protocol):
@@ -51,7 +70,7 @@ class SplitVectorEnv:
 
     def __init__(
         self,
-        env: VectorEnv[Any, Any, Any],
+        env: HasInfosByRow,
         lanes: int,
         before_wait: Callable[[Pulse], None] = lambda pulse: None,
         some: StepsSomeLanes | None = None,
@@ -65,6 +84,7 @@ class SplitVectorEnv:
         for evaluation. `facts` are the names of the numbers in `info` that describe an episode. If `masked`, read masks of
         the allowed actions.
         """
+        env.merge_infos = False  # in merged infos, all copies would have the same dtype and shape
         self.env = env
         self.in_parts = 1 if some is None else min(lanes, 2)
         """number of parts in which the lanes are stepped"""
@@ -163,21 +183,31 @@ class SplitVectorEnv:
 
     def _read_result(self, returned: Any, copies: slice | list[int]) -> StepResult:
         """The result of a step of these copies. It has a row for each copy of the vector environment."""
-        observation, reward, terminated, truncated, infos = returned
-        if self._assigned and "worker_lost" in infos:
+        observation, reward, terminated, truncated, _ = returned
+        infos = self.env.infos_by_row
+        count = self.env.num_envs
+        lost = None
+        if lost_rows := [n for n, info in infos.items() if info.get("worker_lost") is True]:
+            lost = np.zeros(count, bool)
+            lost[lost_rows] = True
             self._missing.update(self._assigned)
         facts: Facts = {}
         if self.facts:
-            ended = np.zeros(self.env.num_envs, bool)
+            ended = np.zeros(count, bool)
             ended[copies] = terminated[copies] | truncated[copies]
-            if ended.any():
-                facts = of_ended(facts_of_copies(self.facts, infos, self.env.num_envs), ended)
+            facts = {n: facts_of_info(self.facts, infos.get(n, {}), n) for n in np.flatnonzero(ended).tolist()}
         leaves: Leaves = self._read(observation)
         if self._masks is not None:
-            waits = np.ones(self.env.num_envs, bool)  # copies that were not stepped have no new mask
+            waits = np.ones(count, bool)  # copies that were not stepped have no new mask
             waits[copies] = False
-            leaves = [*leaves, self._masks.read_all(observation, infos, terminated | waits, truncated)]
-        return StepResult(leaves, reward, terminated, truncated, infos.get("worker_lost"), facts)
+            leaves = [*leaves, self._read_masks(self._masks, observation, terminated | waits, truncated)]
+        return StepResult(leaves, reward, terminated, truncated, lost, facts)
+
+    def _read_masks(self, masks: MaskReader, observation: Any, terminated: Bools, truncated: Bools) -> Bools:
+        """The masks [num_envs, choices] after a step or a reset; see `MaskReader.read_all`."""
+        infos = self.env.infos_by_row
+        of_copies = [infos.get(n, {}).get(MASK) for n in range(self.env.num_envs)]
+        return masks.read_all(observation, {MASK: of_copies}, terminated, truncated)
 
     def abandon(self) -> None:
         """Stop waiting for steps in progress, because a rollout was dropped."""
@@ -205,10 +235,10 @@ class SplitVectorEnv:
         all_seeds: list[Any] = [None] * self.env.num_envs
         all_seeds[copies] = seeds
         options = {"reset_mask": mask}
-        observation, infos = self._wait(lambda: self.env.reset(seed=all_seeds, options=options), pulse)  # type: ignore[arg-type]
+        observation, _ = self._wait(lambda: self.env.reset(seed=all_seeds, options=options), pulse)
         leaves: Leaves = self._read(observation)
         if self._masks is not None:
-            leaves = [*leaves, self._masks.read_all(observation, infos, ~mask, np.zeros_like(mask))]
+            leaves = [*leaves, self._read_masks(self._masks, observation, ~mask, np.zeros_like(mask))]
         return [leaf[copies] for leaf in leaves]
 
     def assign(self, copies: slice, name: str, packed: bytes, pulse: Pulse) -> None:

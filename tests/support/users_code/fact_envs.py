@@ -44,3 +44,17 @@ class Facts(gymnasium.Env[Any, Any]):
 
 
 gymnasium.register("Facts-v0", f"{__name__}:Facts")
+
+
+class Unlike(Facts):
+    """Its infos can't be merged with those of another copy: a key has values of different types and shapes."""
+
+    def step(self, action: int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        observation, reward, terminated, truncated, _ = super().step(action)
+        ended = terminated or truncated
+        contacts = np.zeros(self.np_random.integers(1, 4))
+        info = {"score": self.t + 0.75 if ended else 0, "event": "end" if ended else 0, "contacts": contacts}
+        return observation, reward, terminated, truncated, info
+
+
+gymnasium.register("Unlike-v0", f"{__name__}:Unlike")

@@ -28,6 +28,7 @@ from millrace.workers.copies.split_vector_env import SplitVectorEnv
 from millrace.workers.evaluate.evaluator import Evaluator
 from tests.support.conversation.example_messages import example
 from tests.support.in_process.collectors import collect, no_pulse, random_collector, random_policy
+from tests.support.in_process.infos_by_row import InfosByRow
 from tests.support.users_code.mask_envs import SIZES, InInfo, InObservation, Mixed, Parts
 
 ENVS: dict[str, Any] = {"InInfo": InInfo, "Parts": Parts, "Mixed": Mixed, "InObservation": InObservation}
@@ -47,7 +48,7 @@ def vectorized(run: RunSpec, lane: int, pulse: Any) -> VectorCopies:
 
 
 def split(run: RunSpec, lanes: int) -> tuple[SplitVectorEnv, Collector]:
-    vector = SyncVectorEnv([run.env.make] * run.copies * lanes)
+    vector = InfosByRow([run.env.make] * run.copies * lanes)
     vector.reset()  # it cannot reset some copies before all of them
     env = SplitVectorEnv(vector, lanes, masked=True)
     return env, Collector(run, random_policy(run.policy), env.open_lane, env)
@@ -163,14 +164,14 @@ class NoChoice(InInfo):
 
 def test_a_wrong_mask_of_a_split_vector_environment_is_of_a_copy_of_its_lane() -> None:
     run = masked_run("InInfo", N=2)
-    vector = SyncVectorEnv([InInfo, InInfo, InInfo, NoChoice])
+    vector = InfosByRow([InInfo, InInfo, InInfo, NoChoice])
     vector.reset()
     env = SplitVectorEnv(vector, 2, masked=True)
     with pytest.raises(EnvironmentFailed, match="lane 1, copy 1, first reset: action_mask: expected"):
         collect(Collector(run, random_policy(run.policy), env.open_lane, env), run, lanes=range(2))
 
 
-class StepsAtTheEnd(SyncVectorEnv[Any, Any]):
+class StepsAtTheEnd(InfosByRow):
     """Begins no step before it is waited for, and steps all copies then."""
 
     calls = None

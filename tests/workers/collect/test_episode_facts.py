@@ -12,6 +12,7 @@ import pytest
 from gymnasium.vector import SyncVectorEnv
 
 from millrace.extras.envs.vector_copies import VectorCopies
+from millrace.learner.vector_env.settings import VectorEnvSettings
 from millrace.protocol.errors import EnvironmentFailed
 from millrace.protocol.messages import Evaluate
 from millrace.protocol.rollout import Rollout
@@ -23,6 +24,7 @@ from millrace.workers.copies.episode_facts import facts_of_copies, facts_of_info
 from millrace.workers.copies.split_vector_env import SplitVectorEnv
 from millrace.workers.evaluate.evaluator import Evaluator
 from tests.support.conversation.example_messages import example
+from tests.support.in_process.any_order import any_order
 from tests.support.in_process.collectors import (
     collect,
     no_pulse,
@@ -30,6 +32,7 @@ from tests.support.in_process.collectors import (
     random_policy,
     run_of,
 )
+from tests.support.in_process.infos_by_row import InfosByRow
 from tests.support.users_code.fact_envs import Facts
 
 NAMES = ("is_success", "distance", "speed")
@@ -82,7 +85,7 @@ def test_a_vector_environment_gives_the_facts_of_the_loop() -> None:
 
 
 def test_a_split_vector_environment_gives_the_facts_of_the_loop() -> None:
-    env = SyncVectorEnv([RUN.env.make] * 6)
+    env = InfosByRow([RUN.env.make] * 6)
     env.reset()
     split = SplitVectorEnv(env, 2, facts=NAMES)
     collector = Collector(RUN, random_policy(RUN.policy), split.open_lane, split)
@@ -91,6 +94,17 @@ def test_a_split_vector_environment_gives_the_facts_of_the_loop() -> None:
     ):
         assert same(facts(one), facts(other))
     env.close()
+
+
+def test_facts_of_a_vector_environment_do_not_depend_on_the_infos_of_other_copies() -> None:
+    name = "tests.support.users_code.fact_envs:Unlike-v0"
+    run = msgspec.structs.replace(run_of(name, T=20), facts=("score",))
+    expected = [facts(rollout) for rollout in collect(random_collector(run), run, lanes=range(2))]
+    with any_order(VectorEnvSettings(name, 4, lanes=2), 2, shared=True) as (env, _):
+        split = SplitVectorEnv(env, 2, some=env, facts=run.facts)
+        collector = Collector(run, random_policy(run.policy), split.open_lane, split)
+        assert [facts(rollout) for rollout in collect(collector, run, lanes=range(2))] == expected
+    assert expected[0][0] == (3.75,), "not rounded to the dtype of the 0 in other infos"
 
 
 def test_evaluation_episodes_have_facts_too() -> None:

@@ -10,7 +10,6 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from gymnasium.vector import SyncVectorEnv
 
 from millrace.extras.datasets.episodes import EpisodeAssembler
 from millrace.learner.vector_env.settings import VectorEnvSettings
@@ -27,6 +26,7 @@ from millrace.workers.copies.env_loop import Pulse
 from millrace.workers.copies.split_vector_env import SplitVectorEnv
 from tests.support.in_process.any_order import any_order
 from tests.support.in_process.collectors import TOY, bits, collect, no_pulse, random_collector, random_policy, run_of
+from tests.support.in_process.infos_by_row import InfosByRow
 
 LANES = 3
 RUNS = {
@@ -40,7 +40,7 @@ RUNS = {
 
 @contextmanager
 def split_collector(run: RunSpec) -> Iterator[Collector]:
-    env = SyncVectorEnv([run.env.make] * (LANES * run.copies))
+    env = InfosByRow([run.env.make] * (LANES * run.copies))
     env.reset()  # SyncVectorEnv, unlike ZmqVectorEnv, takes a mask only after a first reset
     split = SplitVectorEnv(env, LANES)
     yield Collector(run, random_policy(run.policy), split.open_lane, split)
@@ -80,7 +80,7 @@ def test_lanes_are_collected_in_any_order_but_only_all_together() -> None:
             collect(split, run, 1, lanes=(0, 2))
 
 
-class WithoutWorkers(SyncVectorEnv):
+class WithoutWorkers(InfosByRow):
     def step(self, actions: Any) -> Any:
         raise NoWorkers("waited 1 s for 1 worker")
 
@@ -98,7 +98,7 @@ def test_that_no_worker_is_left_is_raised_once_to_whoever_asks() -> None:
     env.close()
 
 
-class LosesTwoCopies(SyncVectorEnv):
+class LosesTwoCopies(InfosByRow):
     """Loses the first two copies in its step number `at`, as a vector environment over worker processes would."""
 
     def __init__(self, makes: Any, at: int) -> None:
@@ -114,7 +114,8 @@ class LosesTwoCopies(SyncVectorEnv):
         lost = np.arange(self.num_envs) < 2
         obs[lost], reward[lost], terminated[lost], truncated[lost] = before[lost], 0.0, False, True
         self._autoreset_envs = terminated | truncated
-        return obs, reward, terminated, truncated, {"worker_lost": lost, "_worker_lost": lost}
+        self.infos_by_row = {n: {"worker_lost": True} for n in range(2)}
+        return obs, reward, terminated, truncated, {}
 
 
 @pytest.mark.parametrize("at", range(9))
@@ -222,7 +223,7 @@ def test_a_dropped_rollout_abandons_the_steps_under_way() -> None:
     run = RUNS["discrete"]
     abandoned = []
 
-    class Abandons(SyncVectorEnv):
+    class Abandons(InfosByRow):
         calls = None
 
         def begin_step(self, lanes: Sequence[int], actions: Any) -> None:
