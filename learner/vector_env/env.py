@@ -180,7 +180,8 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
     def end_step(self, lanes: Sequence[int]) -> GymnasiumStep:
         """Wait for the step of these lanes. Returns what `step` returns, but only the rows of these lanes are meaningful.
 
-        Raises what `step` raises. After an error, no lane is awaited any more.
+        Raises what `step` raises, and `NoAsyncCallError` for lanes whose step is not under way. After an error, these lanes
+        are no longer awaited; others are.
         """
         self._check_idle("end_step", of_sent=True)
         return self._rows(self._send_recv.recv_some(lanes))
@@ -188,7 +189,7 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
     def abandon(self) -> None:
         """Stop waiting for all lanes. The results of the orders that were sent are dropped."""
         if self.outstanding:
-            self._send_recv.abandon()
+            self._send_recv.abandon(self._layout.lanes)
         self._state = AsyncState.DEFAULT
 
     # ---------------------------------------------------------------- lanes that do not wait for each other

@@ -189,16 +189,20 @@ class SendRecv:
         """Wait until every lane is ready, and take them. Raises what `recv` raises, after giving up on all lanes."""
         sent = self._sent
         timeout_s = self.timeout_s if timeout_s is None else timeout_s
-        self._wait_until(
-            lambda: sent.all_ready, timeout_s, look_first=bool(self._parts.lost_lanes.unreported), together=True
-        )
+        look_first = bool(self._parts.lost_lanes.unreported)
+        self._wait_until(lambda: sent.all_ready, timeout_s, self._parts.layout.lanes, look_first=look_first, together=True)
         return sent.take()
 
     def recv_some(self, lanes: Sequence[int]) -> Ready:
-        """Like `recv_all`, but waits for these lanes only, and takes no others. After an error, it gives up on all lanes."""
+        """Wait until these lanes are ready, and take them. Raises what `recv` raises, after giving up on these lanes only.
+
+        Raises `NoAsyncCallError` for lanes that were sent nothing, or that were given up afterwards.
+        """
         sent = self._sent
+        if idle := [lane for lane in lanes if lane not in sent.sent]:
+            raise NoAsyncCallError(f"lanes {idle} are not under way: expected an order to them first", "send")
         # Look first: a result may have arrived while other lanes were waited for, and then no worker wakes this process.
-        self._wait_until(lambda: sent.are_ready(lanes), self.timeout_s, look_first=True, together=False)
+        self._wait_until(lambda: sent.are_ready(lanes), self.timeout_s, lanes, look_first=True, together=False)
         return sent.take_some(lanes)
 
     def look(self, timeout_s: float) -> None:
@@ -212,19 +216,23 @@ class SendRecv:
             self._give_up_late(timeout_s)
             self._handle_losses()
 
-    def abandon(self) -> None:
-        """Stop waiting for all lanes. Lanes that were lost meanwhile count as reported."""
-        steps = [lane for lane in self._sent.under_way if self._sent.sent[lane].asked is Asked.STEP]
-        self._to_raise.clear()
-        self._parts.hub.forget(self._sent.clear())
+    def abandon(self, lanes: Sequence[int]) -> None:
+        """Stop waiting for these lanes. Those whose step was under way count as reported if they were lost meanwhile."""
+        sent = self._sent
+        steps = [lane for lane in sent.under_way if lane in lanes and sent.sent[lane].asked is Asked.STEP]
+        for lane in lanes:
+            self._to_raise.pop(lane, None)
+        self._parts.hub.forget(sent.give_up(lanes))
         lost_lanes = self._parts.lost_lanes
         lost_lanes.add(self._parts.hub.coordinator.take_lost())
         lost_lanes.report([lane for lane in steps if lane in lost_lanes.unreported])
 
     # ---------------------------------------------------------------- inside
 
-    def _wait_until(self, ready: Callable[[], bool], timeout_s: float, *, look_first: bool, together: bool) -> None:
-        """Wait until `ready`. Raises what `recv` raises, after giving up on all lanes."""
+    def _wait_until(
+        self, ready: Callable[[], bool], timeout_s: float, lanes: Sequence[int], *, look_first: bool, together: bool
+    ) -> None:
+        """Wait until these lanes are `ready`. Raises what `recv` raises, after giving up on them."""
         try:
             if look_first:
                 self.look(timeout_s)
@@ -233,7 +241,7 @@ class SendRecv:
                 self.look(timeout_s)
             self._raise_losses()
         except BaseException:
-            self.abandon()
+            self.abandon(lanes)
             raise
 
     def _check_back(self, lanes: Iterable[int]) -> None:

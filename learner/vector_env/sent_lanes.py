@@ -158,12 +158,12 @@ class SentLanes:
         """Forget a lane that does not come back, because the caller gets an error that names it."""
         del self.sent[lane]
 
-    def clear(self) -> list[int]:
-        """Forget all lanes. Returns those that were under way."""
-        dropped = self.under_way
-        self.sent = {}
-        self._results = {}
-        self._losses = {}
+    def give_up(self, lanes: Iterable[int]) -> list[int]:
+        """Forget these lanes and their results. Returns the lanes that were under way."""
+        self.take_some(lanes)
+        dropped = self.among(lanes)
+        for lane in dropped:
+            self.drop(lane)
         return dropped
 
     def overdue(self, now: float, timeout_s: float) -> list[int]:

@@ -310,6 +310,37 @@ def test_attributes_are_set_while_other_lanes_step(shared: bool) -> None:
 
 
 @BOTH_WAYS
+def test_a_worker_lost_in_a_call_costs_lanes_that_step_meanwhile_nothing(shared: bool) -> None:
+    with made(shared=shared) as (env, link):
+        env.reset(seed=1)
+        link.frozen = {"w0", "w2"}
+        env.begin_step([2], zeros(range(3)))
+        gone = iter([lambda: link.leave("w0")])
+        env.hub.while_waiting = lambda: next(gone, lambda: None)()
+        with pytest.raises(WorkerLost, match=r"worker w0 \(host\) left: killed: lane 0 \(copies 0 to 0\) is lost"):
+            env.calls.call([0, 1], "render_mode", (), {})
+        assert env.outstanding == [2]
+        env.begin_step([0, 1], zeros(range(3)))
+        link.frozen = set()
+        observation, reward, _, truncated, infos = env.end_step([2])
+        assert (observation[2, 0], reward[2], truncated[2], infos) == (np.float32(0.8), 1.0, False, {})
+        observation, reward, _, truncated, infos = env.end_step([0, 1])
+        assert (reward[:2].tolist(), truncated[:2].tolist()) == ([0.0, 1.0], [True, False])
+        assert infos["worker_lost"].tolist() == [True, False, False]
+
+
+def test_a_step_ends_only_once_it_has_begun() -> None:
+    with made() as (env, _):
+        env.reset(seed=1)
+        env.begin_step([0, 1], zeros(range(3)))
+        with pytest.raises(NoAsyncCallError, match=r"lanes \[2\] are not under way: expected an order to them first"):
+            env.end_step([1, 2])
+        env.end_step([0, 1])
+        with pytest.raises(NoAsyncCallError, match=r"lanes \[0\] are not under way"):
+            env.end_step([0])
+
+
+@BOTH_WAYS
 def test_what_was_abandoned_does_not_come_back(shared: bool) -> None:
     with made(shared=shared) as (env, link):
         env.reset(seed=1)

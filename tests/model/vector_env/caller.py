@@ -134,7 +134,7 @@ class Caller:
             self.told |= {self.parts.layout.lane_of(n) for n in ready.losses}
             self.at += 1
         except (NoWorkers, WorkerLost) as error:
-            self.send_recv.abandon()
+            self.send_recv.abandon(self.parts.layout.lanes)
             self.told |= self.parts.lost_lanes.awaiting_reset  # by the error
             self.at += isinstance(error, WorkerLost) and self.operations[self.at] == "call"  # others are tried again
         self.waits = False
