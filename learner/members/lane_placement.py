@@ -88,7 +88,7 @@ class LanePlacement(Generic[L]):
         members = sorted(may_have_lanes, key=lambda member: member.join_number)
         if members:
             self.assign([self._lanes[number] for number in sorted(self._unplaced)], members)
-        return self.even_out(members)
+        return self._even_out(members)
 
     def assign(self, lanes: Iterable[L], members: Iterable[Member]) -> None:
         """Give each of these lanes to the worker that has the fewest lanes at that point."""
@@ -99,7 +99,7 @@ class LanePlacement(Generic[L]):
             self._give(lane, member)
             heapq.heapreplace(fewest_first, (count + 1, tie_break, n, member))
 
-    def even_out(self, members: Sequence[Member]) -> list[Outgoing]:
+    def _even_out(self, members: Sequence[Member]) -> list[Outgoing]:
         """Move lanes from the workers with the most to those with the fewest, until a lane must wait for its tickets."""
         self._stop_waiting()
         out: list[Outgoing] = []

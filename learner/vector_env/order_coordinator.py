@@ -1,9 +1,11 @@
 """The learner's half of a vector environment's conversation with its workers. Pure: messages and `now` in, messages out.
 
 Rule: an order goes to one lane, and a lane has one order at a time; lanes do not wait for each other. Either the order is
-answered, or its lane is lost with its worker. A lost lane starts again on new env copies, in its next incarnation. If a
-Heartbeat shows that an order was lost on the way, the order is sent again. Steps through shared memory don't count as orders
-here. If the infos of such a step are too long for the shared memory, they arrive as a message.
+answered, or its lane is lost with its worker. A lost lane starts again on new env copies, in its next incarnation. A lane
+leaves its worker only if the worker is lost: elsewhere it would have new env copies, without the random states and
+attributes of the old ones. If a Heartbeat shows that an order was lost on the way, the order is sent again. Steps through
+shared memory don't count as orders here. If the infos of such a step are too long for the shared memory, they arrive as a
+message.
 """
 
 from __future__ import annotations
@@ -104,10 +106,6 @@ class OrderCoordinator(Coordinator[Member]):
         if candidates:
             self._placement.assign([self.lanes[lane]], candidates)
         return bool(candidates)
-
-    def rebalance(self) -> list[Outgoing]:
-        """Move lanes from the workers with the most to those with the fewest. All lanes must be about to be reset."""
-        return self._placement.even_out(self.membership.active())
 
     def owner(self, lane: int) -> Member | None:
         """The worker to which the lane is assigned, or None."""

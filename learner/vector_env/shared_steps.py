@@ -61,10 +61,6 @@ class SharedSteps:
         if lane in self.under_way and not self.is_done(lane):
             del self.under_way[lane]
 
-    def lanes_move(self) -> None:
-        """Forget which worker has which lane, because lanes may move to other workers."""
-        self.pipes.clear()
-
     def spin(self, *, together: bool) -> bool:
         """Spin for a short time until all lanes that are under way are done or, unless `together`, until one of them is.
 

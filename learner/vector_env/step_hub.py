@@ -163,6 +163,10 @@ class StepHub:
         if self._waiting_orders or self.coordinator.orders or self.now() > self._listen_due_s:
             self._turn(0.0)
 
+    def listen(self) -> None:
+        """Read the messages that have arrived, and notice which workers are gone."""
+        self._turn(0.0)
+
     def wait(self, timeout_s: float, *, together: bool) -> None:
         """Wait, at most for a short time, until a lane may have a result or, if `together`, until all may have one.
 
@@ -201,13 +205,6 @@ class StepHub:
         if (member := self.coordinator.owner(lane)) is not None:
             log.warning("worker %s: %s", member.hello.worker, why)
             self._server.send(self.coordinator.reject_message(member.peer, why, self.now()))
-
-    def rebalance(self) -> None:
-        """Even out the lanes of the workers. Call this only when all lanes are about to be reset."""
-        self._turn(0.0)
-        if self.shared is not None:
-            self.shared.lanes_move()
-        self._server.send(self.coordinator.rebalance())
 
     def wait_for(self, workers: int, timeout_s: float) -> None:
         """Wait until this number of `workers` have joined. Raises `NoWorkers` after `timeout_s`."""

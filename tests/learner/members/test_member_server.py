@@ -171,7 +171,7 @@ def test_a_vector_environment_raises_the_error_of_an_environment_once_with_its_t
     hub = step_hub(link, "a")
     session = hub.coordinator.members[b"a"].session
     link.inbox.append((b"a", example(Failure, session=session, error="boom", traceback="its traceback", lane=0)))
-    hub.rebalance()
+    hub.listen()
     with pytest.raises(EnvironmentFailed, match=r"^worker a \(host\): boom$") as raised:
         hub.raise_failure()
     assert raised.value.detail == "its traceback"
@@ -185,11 +185,11 @@ def test_a_vector_environment_raises_no_failure_of_a_spare_worker() -> None:
         assert hub.coordinator.place(lane, patient=True)
     session = hub.coordinator.members[b"spare"].session
     link.inbox.append((b"spare", example(Failure, session=session, error="boom", lane=0)))
-    hub.rebalance()
+    hub.listen()
     hub.raise_failure()
     session = hub.coordinator.members[b"b"].session
     link.inbox.append((b"b", example(Failure, session=session, error="boom", lane=0)))
-    hub.rebalance()
+    hub.listen()
     with pytest.raises(EnvironmentFailed, match=r"^worker b "):
         hub.raise_failure()
 

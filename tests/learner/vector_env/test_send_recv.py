@@ -698,6 +698,14 @@ def test_a_loss_of_which_an_interrupted_step_did_not_tell_is_over_when_all_are_r
         assert env.step(zeros([0, 1]))[1].tolist() == [1.0, 1.0]
 
 
+def test_a_loss_between_two_calls_is_over_when_all_are_reset() -> None:
+    with made(on_worker_loss="raise") as (env, link):
+        env.reset(seed=1)
+        link.leave("w1")
+        env.reset()
+        assert env.step(zeros(range(3)))[1].tolist() == [1.0] * 3
+
+
 def test_an_order_that_waited_for_a_worker_is_not_sent_once_nobody_waits_for_it() -> None:
     with made(copies=1, lanes=1, workers=1) as (env, link):
         link.leave("w0")
@@ -737,12 +745,14 @@ def test_each_copy_has_its_own_options_also_if_not_all_are_reset() -> None:
         assert (order.copies, unpack(order.options.data)) == ((1,), [{"of": 1}])
 
 
-def test_a_reset_of_all_copies_moves_lanes_to_newcomers() -> None:
-    with made(copies=2, lanes=2, workers=1) as (env, link):
+def test_a_reset_of_all_copies_keeps_their_attributes_and_random_generators_although_a_worker_has_none() -> None:
+    with made(INFORMS, copies=2, lanes=2, workers=1) as (env, link):
         env.reset(seed=1)
+        env.set_attr("level", 7)
         link.join("w9")
         env.reset()
-        assert len({lane.owner for lane in env.hub.coordinator.lanes}) == 2
+        assert env.get_attr("level") == (7, 7)
+        assert env.np_random_seed == (1, 2)
 
 
 def test_a_copy_that_is_reset_without_a_seed_keeps_its_own_for_its_replacement() -> None:
