@@ -32,12 +32,6 @@ class InheritedByWorkers:
         """The file descriptors that this worker inherits."""
         return InheritedDescriptors(self.memory_fd, self.to_workers[worker].read_fd, self.to_learner.write_fd)
 
-    def close(self) -> None:
-        """Close all file descriptors. The memory itself is freed once its last view is gone."""
-        os.close(self.memory_fd)
-        for pipe in (*self.to_workers.values(), self.to_learner):
-            pipe.close()
-
 
 @dataclass(frozen=True)
 class Crew:

@@ -247,10 +247,15 @@ class VectorEnvPool:
         settings = self._settings
         if not (settings.shared_memory and SUPPORTED and self.expected) or settings.transport == "inproc":
             return None
-        pipes = {f"w{n}": WakePipe() for n in range(self.expected)}
-        inherited = InheritedByWorkers(new_memory(), pipes, WakePipe())
-        self._resources.callback(inherited.close)
-        return inherited
+        memory_fd = new_memory()
+        self._resources.callback(os.close, memory_fd)  # the memory itself is freed once its last view is gone
+        to_workers = {f"w{n}": self._new_pipe() for n in range(self.expected)}
+        return InheritedByWorkers(memory_fd, to_workers, self._new_pipe())
+
+    def _new_pipe(self) -> WakePipe:
+        pipe = WakePipe()
+        self._resources.callback(pipe.close)
+        return pipe
 
     def _shared_steps(self, spec: StepSpec) -> SharedSteps | None:
         inherited = self._inherited
