@@ -67,8 +67,14 @@ class CopyCalls:
         return self.describe(range(self._parts.layout.count))
 
     def _answers(self, orders: Mapping[int, MakeOrder]) -> dict[int, Returned]:
-        self._send_recv.call(orders)
-        results = self._send_recv.recv_some(list(orders)).results  # only these lanes, because others may be stepping
+        lanes = list(orders)
+        self._send_recv.check_back(lanes)
+        try:
+            self._send_recv.call(orders)
+            results = self._send_recv.recv_some(lanes).results  # only these lanes, because others may be stepping
+        except BaseException:  # such as Ctrl-C
+            self._send_recv.abandon(lanes)
+            raise
         return {lane: result for lane, result in results.items() if isinstance(result, Returned)}
 
 

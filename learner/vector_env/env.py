@@ -98,6 +98,7 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         self._close_once = weakref.finalize(self, _call_in_process, os.getpid(), on_close)
 
     # ---------------------------------------------------------------- reset and step
+    # Rule: after an error or Ctrl-C, these methods await no lane to which they sent an order, so that `reset` is possible.
 
     def reset(self, *, seed: int | Sequence[int | None] | None = None, options: Options = None) -> tuple[Any, Infos]:
         """Begin episodes in all copies, or in those that `options["reset_mask"]` selects. Returns observations and infos.
@@ -107,8 +108,12 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         together; raises `UsageError` if only some of them are.
         """
         self._check_idle("reset")
-        self.reset_async(seed, options)
-        return self.reset_wait()
+        try:
+            self.reset_async(seed, options)
+            return self.reset_wait()
+        except BaseException:
+            self.abandon()
+            raise
 
     def reset_async(
         self,
@@ -126,8 +131,13 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         self._check_idle("reset_async", of_sent=True)
         copies, seeds, options = reset_arguments(env_ids, seed, options, self._layout.count)
         alone = not self.outstanding
-        self._send_recv.reset(copies, seeds, options)
-        self._state = AsyncState.WAITING_RESET if alone else AsyncState.DEFAULT
+        try:
+            self._send_recv.reset(copies, seeds, options)
+            self._state = AsyncState.WAITING_RESET if alone else AsyncState.DEFAULT
+        except BaseException:
+            if alone:
+                self.abandon()
+            raise
 
     def reset_wait(self, timeout: float | None = None) -> tuple[Any, Infos]:
         """Wait for the pending reset. Returns what `reset` returns.
@@ -153,14 +163,23 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         Raises `UsageError` for copies that must be reset first, `TypeError` and `ValueError` for wrong actions,
         `EnvironmentFailed`, `NoWorkers`, and, with `on_worker_loss="raise"`, `WorkerLost`.
         """
-        self.step_async(actions)
-        return self.step_wait()
+        self._check_idle("step_async")
+        try:
+            self._step(self._layout.lanes, actions, together=True)
+            return self._rows(self._send_recv.recv_all())
+        except BaseException:
+            self.abandon()
+            raise
 
     def step_async(self, actions: Any) -> None:
         """Begin a step of every copy; `step_wait` returns the results."""
         self._check_idle("step_async")
-        self._step(self._layout.lanes, actions, together=True)
-        self._state = AsyncState.WAITING_STEP
+        try:
+            self._step(self._layout.lanes, actions, together=True)
+            self._state = AsyncState.WAITING_STEP
+        except BaseException:
+            self.abandon()
+            raise
 
     def step_wait(self, timeout: float | None = None) -> GymnasiumStep:
         """Wait for the pending step. Returns what `step` returns.
@@ -309,8 +328,13 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
             raise ClosedEnvironmentError(f"{awaited.value}_wait after close()")
         if self._state is not awaited:
             raise NoAsyncCallError(f"{awaited.value}_wait without {awaited.value}_async before it", awaited.value)
-        self._state = AsyncState.DEFAULT
-        return self._rows(self._send_recv.recv_all(timeout_s))
+        try:
+            ready = self._send_recv.recv_all(timeout_s)
+            self._state = AsyncState.DEFAULT
+        except BaseException:
+            self.abandon()
+            raise
+        return self._rows(ready)
 
     def _rows(self, ready: Ready, copies: list[int] | None = None) -> GymnasiumStep:
         """The results of these copies, or of all copies if None, after they have come back."""

@@ -92,7 +92,7 @@ class SendRecv:
         hub = self._parts.hub
         layout.check(copies)
         by_lane = layout.by_lane(sorted(copies))
-        self._check_back(by_lane)
+        self.check_back(by_lane)
         self._check_whole(by_lane)
         resets = {lane: self._asked_reset(lane, chosen, seeds, options) for lane, chosen in by_lane.items()}
         whole = [lane for lane, chosen in by_lane.items() if len(chosen) == layout.size(lane)]
@@ -103,9 +103,13 @@ class SendRecv:
         parts.lost_lanes.add(hub.coordinator.take_lost())
         parts.lost_lanes.forget(whole)
         now = self._watched.look(hub.now())
-        for lane, reset in resets.items():
-            self._sent.send([lane], Sent(reset, now))
-            hub.send_order(lane, reset.order())
+        try:
+            for lane, reset in resets.items():
+                self._sent.send([lane], Sent(reset, now))
+                hub.send_order(lane, reset.order())
+        except BaseException:  # such as Ctrl-C
+            self.abandon(list(resets))
+            raise
 
     def step(
         self,
@@ -121,46 +125,35 @@ class SendRecv:
         selects a lane's rows in these arrays. `together` says that `recv_all` will take the results.
 
         Raises `UsageError` for copies that must be reset first, and, with `on_worker_loss="raise"`, `WorkerLost` for copies
-        that were lost. If it raises, nothing is sent.
+        that were lost. If it raises one of these, nothing is sent.
         """
-        parts = self._parts
         hub = self._parts.hub
         lost_lanes = self._parts.lost_lanes
-        self._check_back(lanes)
+        self.check_back(lanes)
         lost_lanes.add(hub.coordinator.take_lost())
         self._check_steppable(lanes)
         now = self._watched.look(hub.now())
-        (arrays, fit) = actions
-        shared = []
-        unreported = lost_lanes.unreported
-        awaiting_reset = lost_lanes.awaiting_reset
-        self._sent.send(lanes, Sent(Asked.STEP, now))
-        for lane in lanes:
-            if lane in unreported:
-                continue  # this step reports the loss in place of a result
-            if lane in awaiting_reset:  # as in NextStep mode, the step after a truncation resets
-                hub.send_order(lane, parts.reset_of_new_copies(lane).order())
-            elif fit and hub.can_share(lane):
-                shared.append(lane)
-            else:
-                hub.send_order(lane, step_order([array[at[lane]] for array in arrays]))
-        if shared:
-            assert hub.shared is not None
-            for memory, values in zip(hub.shared.memory.actions, arrays, strict=True):
-                if at is parts.layout.rows and len(shared) == len(at):
-                    memory[:] = values
-                    continue
-                for lane in shared:
-                    memory[parts.layout.rows[lane]] = values[at[lane]]
-            hub.send_steps(shared, together=together)
+        try:
+            self._sent.send(lanes, Sent(Asked.STEP, now))
+            self._order_steps(lanes, actions, at, together=together)
+        except BaseException:  # such as Ctrl-C
+            self.abandon(lanes)
+            raise
 
     def call(self, orders: Mapping[int, MakeOrder]) -> None:
-        """Send each of these lanes its own order. The copies continue their episodes."""
-        self._check_back(orders)
+        """Send each of these lanes, which have come back, its own order. The copies continue their episodes."""
         now = self._watched.look(self._parts.hub.now())
         self._sent.send(orders, Sent(Asked.CALL, now))
         for lane, make in orders.items():
             self._parts.hub.send_order(lane, make)
+
+    def check_back(self, lanes: Iterable[int]) -> None:
+        """Raise `AlreadyPendingCallError` if one of these lanes has not come back."""
+        if out := self._sent.among(lanes):
+            copies = self._parts.layout.copies_of(out)
+            raise AlreadyPendingCallError(
+                f"copies {copies} have not come back: expected recv() to return them first", "send"
+            )
 
     # ---------------------------------------------------------------- in
 
@@ -229,6 +222,40 @@ class SendRecv:
 
     # ---------------------------------------------------------------- inside
 
+    def _order_steps(
+        self,
+        lanes: Sequence[int],
+        actions: tuple[list[Array], bool],
+        at: Mapping[int, Any] | Sequence[Any],
+        *,
+        together: bool,
+    ) -> None:
+        """Order these lanes to step; see `step`."""
+        parts = self._parts
+        hub = self._parts.hub
+        (arrays, fit) = actions
+        shared = []
+        unreported = parts.lost_lanes.unreported
+        awaiting_reset = parts.lost_lanes.awaiting_reset
+        for lane in lanes:
+            if lane in unreported:
+                continue  # this step reports the loss in place of a result
+            if lane in awaiting_reset:  # as in NextStep mode, the step after a truncation resets
+                hub.send_order(lane, parts.reset_of_new_copies(lane).order())
+            elif fit and hub.can_share(lane):
+                shared.append(lane)
+            else:
+                hub.send_order(lane, step_order([array[at[lane]] for array in arrays]))
+        if shared:
+            assert hub.shared is not None
+            for memory, values in zip(hub.shared.memory.actions, arrays, strict=True):
+                if at is parts.layout.rows and len(shared) == len(at):
+                    memory[:] = values
+                    continue
+                for lane in shared:
+                    memory[parts.layout.rows[lane]] = values[at[lane]]
+            hub.send_steps(shared, together=together)
+
     def _wait_until(
         self, ready: Callable[[], bool], timeout_s: float, lanes: Sequence[int], *, look_first: bool, together: bool
     ) -> None:
@@ -243,13 +270,6 @@ class SendRecv:
         except BaseException:
             self.abandon(lanes)
             raise
-
-    def _check_back(self, lanes: Iterable[int]) -> None:
-        if out := self._sent.among(lanes):
-            copies = self._parts.layout.copies_of(out)
-            raise AlreadyPendingCallError(
-                f"copies {copies} have not come back: expected recv() to return them first", "send"
-            )
 
     def _check_whole(self, copies: Mapping[int, Sequence[int]]) -> None:
         layout = self._parts.layout

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import inspect
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
+from types import FrameType
 from typing import Any
 
 import gymnasium
@@ -17,6 +19,8 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 import millrace
+from millrace.learner.vector_env import calls, send_recv
+from millrace.learner.vector_env import env as env_module
 from millrace.learner.vector_env.batch_layout import BatchLayout
 from millrace.learner.vector_env.env import ZmqVectorEnv
 from millrace.learner.vector_env.lane_orders import packed, step_order
@@ -900,6 +904,63 @@ def test_a_step_after_an_interrupted_reset_has_its_own_results(shared: bool) -> 
         for left in 0.8, 0.6:
             observation, reward, *_ = env.step([0])
             assert (observation.tolist(), reward.tolist()) == ([[pytest.approx(left)]], [1.0])
+
+
+def interrupted(call: Callable[[], object], at: int) -> bool:
+    """Call this, and raise KeyboardInterrupt before line number `at` that it executes in the files of the caller's side.
+
+    Returns whether there was such a line.
+    """
+    lines = iter(range(at))
+
+    def trace(frame: FrameType, event: str, _: object) -> Any:
+        if frame.f_code.co_filename not in FILES:
+            return None
+        if event == "line" and next(lines, None) is None:
+            raise KeyboardInterrupt
+        return trace
+
+    before = sys.gettrace()
+    sys.settrace(trace)
+    try:
+        call()
+    except KeyboardInterrupt:
+        return True
+    finally:
+        sys.settrace(before)
+    return False
+
+
+FILES = {module.__file__ for module in (calls, env_module, send_recv)}
+CALLS: dict[str, Callable[[ZmqVectorEnv], object]] = {
+    "step": lambda env: env.step(zeros(range(4))),
+    "step_async": lambda env: env.step_async(zeros(range(4))),
+    "reset": lambda env: env.reset(seed=2),
+    "reset_async": lambda env: env.reset_async(seed=2),
+    "send": lambda env: env.send(zeros(range(4))),
+    "call": lambda env: env.call("render_mode"),
+}
+
+
+@BOTH_WAYS
+@pytest.mark.parametrize("name", CALLS)
+def test_an_interrupt_at_any_line_leaves_an_environment_that_can_be_reset_and_loses_no_worker(
+    name: str, shared: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("millrace.learner.vector_env.step_hub.POLL_S", 0.001)
+    with made(copies=4, lanes=2, workers=2, shared=shared) as (env, _):
+        env.reset(seed=1)
+        lines = 0
+        while interrupted(lambda: CALLS[name](env), lines):
+            lines += 1
+            while env.outstanding:  # `send` had returned to the caller's file
+                assert name == "send"
+                env.recv()
+            assert env.reset(seed=1)[0][:, 0].tolist() == [1.0] * 4
+            observation, reward, _, truncated, infos = env.step(zeros(range(4)))
+            assert observation[:, 0].tolist() == [pytest.approx(0.8)] * 4
+            assert (reward.tolist(), truncated.tolist(), infos) == ([1.0] * 4, [False] * 4, {})
+        assert lines > 10
 
 
 # ---------------------------------------------------------------- the pure parts
