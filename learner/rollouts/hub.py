@@ -234,7 +234,7 @@ class Hub:
         return taken
 
     def not_used(self, taken: list[AcceptedRollout]) -> None:
-        """Count the rollouts that `gather` last returned as lost, because their update failed."""
+        """Put back the rollouts that `gather` returned last, because their update was undone."""
         self.coordinator.rollouts.not_used(taken)
         self.lag_statistics.not_used(self._lags)
 

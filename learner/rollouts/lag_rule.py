@@ -39,6 +39,11 @@ class Rounds:
         del self._versions[self.next]
         self.next += 1
 
+    def reopen(self, version: int) -> None:
+        """Open the round that was closed last, in which this version acts, because its rollouts were put back."""
+        self.next -= 1
+        self._versions = {self.next: version} | self._versions
+
     def version(self, number: int) -> int:
         """The version that acts in this round, which must be open."""
         return self._versions[number]

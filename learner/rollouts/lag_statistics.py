@@ -47,7 +47,7 @@ class LagStatistics:
         self.lags.update(lags)
 
     def not_used(self, lags: Iterable[int]) -> None:
-        """Take back the lags of rollouts whose update failed."""
+        """Take back the lags of rollouts whose update was undone."""
         self.lags.subtract(lags)
         self.lags = +self.lags  # drops counts that are 0 now
 

@@ -1,9 +1,9 @@
 """The learner's record of a lane's past, accumulated from its rollouts. Pure.
 
-Rule: a history is a fold over the rollouts of a lane in the order of their rounds, whoever collected them, and whether or
-not an update used them. It keeps only what a worker needs to continue where the rollouts end (`protocol/lane_past.py`): how
-the newest episode of each copy began, and the actions since. An episode cannot be replayed if it is longer than the limit,
-or if it isn't known how it began. If the lane is lost, the copy of such an episode starts afresh.
+Rule: a history is a fold over the rollouts of a lane in the order of their rounds, whoever collected them. It keeps only
+what a worker needs to continue where the rollouts end (`protocol/lane_past.py`): how the newest episode of each copy began,
+and the actions since. An episode cannot be replayed if it is longer than the limit, or if it isn't known how it began. If
+the lane is lost, the copy of such an episode starts afresh.
 """
 
 from __future__ import annotations

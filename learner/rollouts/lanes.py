@@ -40,6 +40,8 @@ class TicketedLane(PlacedLane):
     """Incarnation and sequence number of the rollout that was taken last; None if none was taken since the learner began."""
     history: LaneHistory | None = None
     """History of the rollouts that were taken; None if none was taken since the run began."""
+    before_taken: tuple[tuple[int, int] | None, LaneHistory | None] = (None, None)
+    """`newest_taken` and `history` before the newest rollout was taken, in case its update is undone."""
     failures: int = 0
     """How many times its environment has failed since its last rollout arrived."""
     failed_at_once: bool = True
@@ -100,6 +102,7 @@ class TicketedLane(PlacedLane):
         sequence = rollout.sequence
         continues = self.newest_taken == (incarnation, sequence - 1)
         begins = sequence == 0 and not (from_past and rollout.memory)
+        self.before_taken = (self.newest_taken, None if self.history is None else self.history.copy())
         if self.history is None:
             self.history = histories.begin()
         if _misses_one(self.newest_taken, incarnation, rollout):
@@ -107,6 +110,10 @@ class TicketedLane(PlacedLane):
         self.newest_taken = (incarnation, sequence)
         anew = self.history.add(rollout, attributes)
         return anew if (continues or sequence == 0) and not begins else np.ones_like(anew)
+
+    def put_back(self) -> None:
+        """Undo the newest `take`."""
+        self.newest_taken, self.history = self.before_taken
 
     def lost(self, *, failed: bool) -> None:
         """Record that the lane's worker was lost while collecting or, if `failed`, because its environment failed."""

@@ -27,14 +27,14 @@ class Ledger(msgspec.Struct, kw_only=True):
     used: Past = 0
     """tickets whose rollout was used by an update"""
     lost: Past = 0
-    """tickets whose worker was lost, left or sent an unusable rollout (a new ticket was dealt), or whose update failed"""
+    """tickets whose worker was lost, left or sent an unusable rollout (a new ticket was dealt)"""
 
     transitions_received: Past = 0
     transitions_used: Past = 0
     transitions_duplicate: Past = 0
     """transitions of rollouts that arrived a second time"""
     transitions_late: Past = 0
-    """transitions of rollouts from a session that had ended, or for an update that failed"""
+    """transitions of rollouts from a session that had ended"""
     transitions_invalid: Past = 0
     """transitions of rollouts that broke the row format or did not fit the run"""
 

@@ -102,12 +102,16 @@ class RolloutDealer:
         return [self._marked(arrived) for arrived in taken]
 
     def not_used(self, taken: list[AcceptedRollout]) -> None:
-        """Count the rollouts that `take` returned as lost, because no update used them."""
+        """Put back the rollouts that `take` returned last, because their update was undone.
+
+        The state is the one before `take`: these rollouts wait, and the next update uses their round.
+        """
+        self.rounds.reopen(taken[0].rollout.version)
+        self.ready[self.rounds.next] = {arrived.rollout.lane: arrived for arrived in taken}
+        for lane in self.lanes:
+            lane.put_back()
         self.ledger.used -= len(taken)
-        self.ledger.lost += len(taken)
-        env_steps = sum(arrived.rollout.env_steps for arrived in taken)
-        self.ledger.transitions_used -= env_steps
-        self.ledger.transitions_late += env_steps
+        self.ledger.transitions_used -= sum(arrived.rollout.env_steps for arrived in taken)
 
     def awaited(self) -> list[Ticket]:
         """The tickets for the next update that workers hold."""

@@ -74,10 +74,11 @@ NOT_SAVED: dict[type, set[str]] = {
     | {"in_env_code_s", "speed", "first_step_s", "ended_steps", "supervisor"},
     TicketedLane: {
         "newest_taken",
+        "before_taken",
         "failures",
         "losses",
         "failed_at_once",
-    },  # it marks rollouts as fresh; no worker is lost three times here
+    },  # they mark rollouts as fresh; no update is undone here, and no worker is lost three times
     Ticket: set(),
     LanePlacement: {"_tie_break"},
     Rounds: {"max_lag"},

@@ -71,14 +71,14 @@ METRICS: dict[str, dict[str, Meaning]] = {
         "ledger/used": Meaning(TICKETS, "Tickets whose rollout an update used.", "tickets used"),
         "ledger/outstanding": Meaning(TICKETS, "Tickets that are neither used nor given up.", "tickets outstanding"),
         "ledger/lost": Meaning(
-            TICKETS, "Their worker was lost, left or sent an unusable rollout, or their update failed.", "tickets lost"
+            TICKETS, "Their worker was lost, left or sent an unusable rollout.", "tickets lost"
         ),
         "ledger/transitions_received": Meaning(TRANSITIONS, "Env steps that reached the learner."),
         "ledger/transitions_used": Meaning(TRANSITIONS, "Env steps that updates used."),
         "ledger/transitions_waiting": Meaning(TRANSITIONS, "Env steps that wait for an update."),
         "ledger/transitions_duplicate": Meaning(TRANSITIONS, "Env steps that arrived a second time. They were dropped."),
         "ledger/transitions_late": Meaning(
-            TRANSITIONS, "Env steps from a worker that had been given up, or of an update that failed. They were dropped."
+            TRANSITIONS, "Env steps from a worker that had been given up. They were dropped."
         ),
         "ledger/transitions_invalid": Meaning(
             TRANSITIONS, "Env steps of rollouts that broke the row format or did not fit the run. They were dropped."

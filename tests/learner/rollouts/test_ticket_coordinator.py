@@ -30,8 +30,10 @@ from millrace.learner.rollouts.lag_rule import Rounds
 from millrace.learner.rollouts.lane_history import LaneHistories
 from millrace.learner.rollouts.lanes import TicketedLane
 from millrace.learner.rollouts.ledger import Ledger
+from millrace.learner.rollouts.past_rollouts import packed
 from millrace.learner.rollouts.rollout_dealer import RolloutDealer
 from millrace.learner.rollouts.ticket_coordinator import MOST_NOTES, STRIKES, TicketCoordinator
+from millrace.protocol.lane_past import EpisodeBegin
 from millrace.protocol.messages import (
     PROTOCOL_VERSION,
     Collect,
@@ -60,7 +62,15 @@ from millrace.protocol.specs import OwnPolicySpec
 from millrace.protocol.wire.codec import decode_to_worker, encode
 from tests.support.conversation.every_message import to_learner
 from tests.support.conversation.example_messages import example
-from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS, fake_rollout, process_ends, run_spec, spoiled
+from tests.support.conversation.fake_ends import (
+    BUFFERS,
+    PARAMETERS,
+    fake_memory,
+    fake_rollout,
+    process_ends,
+    run_spec,
+    spoiled,
+)
 from tests.support.conversation.rules import check_ledger
 
 M = TypeVar("M")
@@ -1101,16 +1111,45 @@ def test_every_transition_that_arrived_is_used_or_counted_under_a_reason() -> No
     assert counts["transitions_waiting"] == 0
 
 
-def test_rollouts_of_an_update_that_was_not_made_are_lost_and_their_transitions_late() -> None:
-    learner = Learner(lanes=2)
-    learner.joins(A)
-    learner.deliver_all()
+@pytest.mark.parametrize("max_lag", [0, 1])
+def test_after_an_update_was_undone_all_is_as_before_its_rollouts_were_taken(max_lag: int) -> None:
+    """An episode of each lane runs all the time. With lag, a rollout of the next round comes during the update."""
+    learner = Learner(lanes=2, max_lag=max_lag)
     rollouts = learner.coordinator.rollouts
-    rollouts.not_used(rollouts.take() or [])
+    rollouts.histories = LaneHistories(copies=1, most_steps=100)
+
+    def deliver(number: int, lanes: int = 2) -> None:
+        for ticket in [each for each in rollouts.held.values() if each.round == number and each.lane < lanes]:
+            begun = (EpisodeBegin(0, 0, b""),) if number == 0 else ()
+            rollout = msgspec.structs.replace(learner.rollout_of(ticket.number), begun=begun, memory=fake_memory(number))
+            learner.says(ticket.peer, rollout)
+
+    learner.joins(A)
+    for number in range(2):
+        deliver(number)
+        learner.take()
+        learner.publish(number + 1)
+    deliver(2)
+    before = saved(learner)
+    taken = rollouts.take() or []
+    deliver(3, lanes=1)
+    assert saved(learner) != before
+    rollouts.not_used(taken)
     learner.balanced([])
-    counts = rollouts.ledger.counts()
-    named = ("used", "lost", "outstanding", "transitions_used", "transitions_late", "transitions_waiting")
-    assert [counts[name] for name in named] == [0, 2, 0, 0, 2, 0]
+    assert saved(learner) == before
+    assert [len(past.action) for past in rollouts.pasts()] == [2, 2]
+    assert rollouts.ledger.lost == 0
+    process_ends(learner.coordinator, "a", "killed")
+    learner.joins(B)
+    dealt = [(each.lane, each.round, len(each.past.action)) for each in rollouts.held.values() if each.past]
+    assert dealt == [(1, 3, 3)] * max_lag, "the rollout that was put back is part of the past"
+    assert [arrived.fresh for arrived in rollouts.take() or []] == [[False]] * 2
+
+
+def saved(learner: Learner) -> object:
+    """What a checkpoint has of rounds and lanes."""
+    past = learner.coordinator.past()
+    return past.rounds, packed(past.lanes).tobytes(), packed(past.acting).tobytes()
 
 
 def test_incarnations_for_a_checkpoint_name_no_life_that_was_dealt_a_ticket() -> None:

@@ -186,6 +186,7 @@ class Replay:
                 self._rules.taken(result)
         if method == "not_used":
             self._rules.used -= {arrived.rollout.ticket for arrived in self._taken}
+            waiting = [*waiting, *self._taken]
         before = {arrived.rollout.ticket for arrived in waiting}
         now = waiting_rollouts(self.parts["TicketCoordinator"])
         self._rules.check([arrived for arrived in now if arrived.rollout.ticket not in before])

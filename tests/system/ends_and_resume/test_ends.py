@@ -159,7 +159,7 @@ def test_an_update_that_fails_in_the_middle_is_taken_back(tmp_path: Path, monkey
     assert policy_of(whole) == policy_of(broken)
     assert caught.value.__notes__ == how_to_go_on(broken)
     accounted(summary(broken), lanes=2, rows=16)
-    assert summary(broken)["ledger"]["lost"] == 2, "the rollouts of the update that failed"
+    assert summary(broken)["ledger"]["outstanding"] == 2, "the rollouts of the update that failed"
     resumed = run(tmp_path / "broken", resume=broken, seed=4)
     accounted(summary(resumed), lanes=2, rows=16)
     assert summary(resumed)["stop_reason"] == "all steps done"

@@ -19,6 +19,7 @@ import pytest
 import millrace.learner.interrupts
 from millrace.launch.training import train
 from millrace.learner.algorithm_check.same_bits import first_difference
+from millrace.learner.algorithms import Algorithm, algorithm_class
 from millrace.learner.algorithms.ppo import PPO
 from millrace.learner.config.layers import resolve
 from millrace.learner.interrupts import Interrupts
@@ -28,6 +29,7 @@ from millrace.learner.run_folder import checkpoint
 from millrace.learner.run_folder.metrics_log import read_rows
 from millrace.learner.run_folder.progress import Progress
 from millrace.learner.run_folder.run_folder import Interrupted
+from millrace.protocol.rollout import Batch
 from tests.system.stage.processes import START_S, Stage, crowding
 from tests.system.stage.run_folders import folder_of, policy_of, summary
 
@@ -213,6 +215,33 @@ def test_at_a_lag_a_resumed_run_equals_one_that_went_on(tmp_path: Path, variant:
     assert_equal(run(tmp_path / "whole", **settings), folder)
 
 
+@pytest.mark.parametrize("max_lag", [0, 1])
+@pytest.mark.parametrize("variant", ["ppo, lstm", "dqn, prioritized"])
+def test_a_run_that_is_resumed_after_an_update_was_undone_equals_one_that_went_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, variant: str, max_lag: int
+) -> None:
+    """It is interrupted at the end of the fourth update. The newest checkpoint is that of the second."""
+    settings = {**VARIANTS[variant], "max_lag": max_lag}
+    reference = run(tmp_path / "whole", **settings)
+    kind = algorithm_class(settings["algo"])
+    update, updates = kind.update, list[object]()
+
+    def interrupted(self: Algorithm, batch: Batch, pulse: Callable[[], None]) -> dict[str, float]:
+        metrics = update(self, batch, pulse)
+        updates.append(batch)
+        if len(updates) == 4:
+            raise KeyboardInterrupt
+        return metrics
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(kind, "update", interrupted)
+        run(tmp_path / "resumed", **settings)
+    folder = folder_of(tmp_path / "resumed")
+    assert checkpoint.newest(folder)[0].state["past"]["version"] == 3
+    run(tmp_path / "resumed", resume=folder, **settings)
+    assert_equal(reference, folder)
+
+
 def test_the_best_policy_is_that_of_the_checkpoint(tmp_path: Path) -> None:
     """A run goes on from an older checkpoint than the newest. The policy that was the best later is not its best."""
     settings = {**VARIANTS["ppo"], "lost_lanes": "restart", "learning_rate": 0.05}
@@ -299,8 +328,7 @@ def test_an_update_that_does_not_fit_is_taken_back(tmp_path: Path, monkeypatch: 
     (whole, _), (broken, _) = (checkpoint.newest(one) for one in (folder_of(tmp_path / "whole"), folder))
     assert first_difference(whole.state["algorithm"], broken.state["algorithm"]) is None
     assert broken.state["past"]["version"] == 3
-    ledger = summary(folder)["ledger"]
-    assert ledger["lost"] == LANES, "the rollouts of the update that was taken back"
+    assert summary(folder)["ledger"]["outstanding"] == LANES, "the rollouts of the update that was taken back"
 
 
 def test_without_a_grace_time_an_update_takes_what_it_takes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
