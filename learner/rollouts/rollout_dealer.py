@@ -76,6 +76,8 @@ class RolloutDealer:
         """the attributes of env copies, packed, by the version of the weights with which they were sent; versions without
         attributes may be missing
         """
+        self._first_round = rounds.next
+        self._steps_before = self.ledger.transitions_used  # before the run was resumed
         self._absent = list(incarnations[lanes:])  # incarnations of lanes that the run had earlier, and may have again
         self._absent_pasts = [past for past in self.histories.pasts if past.lane >= lanes]
         self._to_deal = set[int]()  # lanes for which open rounds have no ticket
@@ -204,10 +206,15 @@ class RolloutDealer:
         self.ready.setdefault(ticket.round, {})[ticket.lane] = accepted
         return True
 
-    def rounds_by(self, number: int) -> int:
-        """The largest number of rounds that an episode can have lasted by the end of this ticket's rollout."""
+    def longest_episode(self, number: int, rollout_steps: int) -> int:
+        """The largest number of steps that an episode can have by the end of this ticket's rollout of `rollout_steps`.
+
+        Rollouts before a resume may have been longer, and only the number of all their env steps is known.
+        """
         ticket = self.held.get(number)
-        return self.rounds.next + self.rounds.max_lag + 1 if ticket is None else ticket.round + 1
+        last = self.rounds.next + self.rounds.max_lag if ticket is None else ticket.round
+        before = max(self._steps_before, self._first_round * rollout_steps)
+        return before + (last + 1 - self._first_round) * rollout_steps
 
     def worker_lost(self, member: Member) -> None:
         """Count the failures and losses of a lost member's lanes. Lanes that fail too often aren't replayed."""

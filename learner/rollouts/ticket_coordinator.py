@@ -227,8 +227,8 @@ class TicketCoordinator(Coordinator[CollectingMember]):
     def _take_rollout(self, member: CollectingMember, rollout: Rollout) -> list[Outgoing]:
         """Accept a rollout, unless it had arrived before. If it can't be used, it is counted, and its ticket is lost."""
         try:
-            most_steps = self.rollouts.rounds_by(rollout.ticket) * self.run.rollout_steps
-            self._check_rows(rollout, self.run, most_steps)
+            longest = self.rollouts.longest_episode(rollout.ticket, self.run.rollout_steps)
+            self._check_rows(rollout, self.run, longest)
             accepted = self.rollouts.take_in(member, rollout)
         except BadRollout as error:
             return self._reject(member, rollout, f"rollout of ticket {rollout.ticket}: {error}")

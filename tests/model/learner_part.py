@@ -56,7 +56,7 @@ SAVED: dict[type, set[str]] = {
 """What of each object is saved."""
 NOT_SAVED: dict[type, set[str]] = {
     TicketCoordinator: {"run", "worker_timeout_s", "evaluation", "_notes", "_check_rows"},
-    RolloutDealer: {"_absent", "_absent_pasts", "opponents", "histories", "attributes"},
+    RolloutDealer: {"_absent", "_absent_pasts", "opponents", "histories", "attributes", "_first_round", "_steps_before"},
     SentWeights: set(),
     WeightsHeld: {"by_supervisor", "named"},
     Membership: {"events", "draining", "progress", "_run", "_member_class", "_on_removed", "is_spare", "has_policy_code"}

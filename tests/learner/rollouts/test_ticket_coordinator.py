@@ -58,6 +58,7 @@ from millrace.protocol.messages import (
     Weights,
     Welcome,
 )
+from millrace.protocol.rollout import Episode
 from millrace.protocol.specs import OwnPolicySpec
 from millrace.protocol.wire.codec import decode_to_worker, encode
 from tests.support.conversation.every_message import to_learner
@@ -89,12 +90,13 @@ class Learner:
         ledger: Ledger | None = None,
         incarnations: Sequence[int] = (),
         publish: bool = True,
+        rounds: Rounds | None = None,
         **run: object,
     ) -> None:
         """`run`: what differs from the smallest run."""
         self.coordinator = TicketCoordinator(
             run_spec(lanes, **run),
-            RolloutDealer(lanes, Rounds(max_lag), ledger=ledger, incarnations=incarnations),
+            RolloutDealer(lanes, rounds or Rounds(max_lag), ledger=ledger, incarnations=incarnations),
             worker_timeout_s=TIMEOUT_S,
             first_session=100,
         )
@@ -479,6 +481,17 @@ def test_a_rollout_that_does_not_fit_its_ticket_is_not_used_and_dealt_again(chan
     assert (learner.coordinator.rollouts.ready, ledger.transitions_invalid, ledger.lost) == ({}, 1, 1)
     assert permits(outs) == [example(Permit, ticket=other + 1, sequence=2, round=1)]
     assert learner.coordinator.members[A].strikes == 1
+
+
+@pytest.mark.parametrize(("length", "accepted"), [(301, True), (302, False)])
+def test_an_episode_may_be_as_long_as_all_env_steps_before_a_resume_and_those_since(length: int, accepted: bool) -> None:
+    """Three rollouts of 100 env steps were used, and rollouts have one env step now."""
+    used = Ledger(issued=3, used=3, transitions_received=300, transitions_used=300)
+    learner = Learner(lanes=1, ledger=used, rounds=Rounds(0, next_round=3))
+    learner.joins(A)
+    ended = {"terminated": np.ones((1, 1), bool), "episodes": (Episode(1.0, length, 1.0),)}
+    learner.says(A, msgspec.structs.replace(learner.rollout_of(3), **ended))
+    assert (learner.coordinator.rollouts.take() is not None) == accepted
 
 
 def test_a_rollout_of_another_workers_ticket_is_not_used_and_costs_that_worker_nothing() -> None:
