@@ -14,7 +14,8 @@ it failed or could not be continued.
 
 from __future__ import annotations
 
-from typing import Annotated
+from collections.abc import Mapping
+from typing import Annotated, Self
 
 import msgspec
 import numpy as np
@@ -67,13 +68,30 @@ class LastEpisode(msgspec.Struct, frozen=True, array_like=True):
         return self.random is not None and not (self.saved or self.over)
 
 
-class AttributesFrom(msgspec.Struct, frozen=True, array_like=True):
-    """Attributes that were set on the env copies before a row (`Weights.env_attributes`)."""
+class AttributeChanges(msgspec.Struct, frozen=True, array_like=True):
+    """Attributes that were set on the env copies (`Weights.env_attributes`), each time before a row.
 
-    row: Natural
-    """index of that row in `LanePast.action`"""
+    There may be any number of changes. They share three arrays, because a message has at most 256 frames.
+    """
+
+    rows: Array
+    """[C] int64, ascending: the indices of these rows in `LanePast.action`"""
+    ends: Array
+    """[C] int64: for each row, where its attributes end in `packed`; they begin at the previous end"""
     packed: Array
-    """[bytes] uint8, as in `Weights.env_attributes`"""
+    """[bytes] uint8: the attributes of all these rows, one after another, each as in `Weights.env_attributes`"""
+
+    @classmethod
+    def of(cls, by_row: Mapping[int, bytes]) -> Self:
+        """The attributes that were set before these rows."""
+        ends = np.cumsum([len(packed) for packed in by_row.values()], dtype=np.int64)
+        return cls(np.array([*by_row], np.int64), ends, np.frombuffer(b"".join(by_row.values()), np.uint8))
+
+    def by_row(self) -> dict[int, bytes]:
+        """The attributes, packed, by the row before which they were set."""
+        ends: list[int] = self.ends.tolist()
+        packed = self.packed.tobytes()
+        return {row: packed[begin:end] for row, begin, end in zip(self.rows.tolist(), [0, *ends], ends, strict=False)}
 
 
 class LanePast(msgspec.Struct, frozen=True, array_like=True):
@@ -84,8 +102,8 @@ class LanePast(msgspec.Struct, frozen=True, array_like=True):
     """one for each env copy"""
     action: Array
     """[K, N · A, *action], as in rollouts: the actions of the K rows since the earliest episode in `copies` began"""
-    attributes: tuple[AttributesFrom, ...]
-    """ascending by row; no attributes were set before the first of these rows"""
+    attributes: AttributeChanges
+    """no attributes were set before the first of its rows"""
     obs: tuple[Array, ...]
     """the observations after the last row: one array [N · A, *leaf] for each leaf, then the mask if there are masks"""
     memory: tuple[Array, ...]
@@ -95,7 +113,8 @@ class LanePast(msgspec.Struct, frozen=True, array_like=True):
     def unknown(cls, lane: int, copies: int) -> LanePast:
         """The past of a lane whose copies were started once and can't be continued, so that all of them are replaced."""
         nothing = np.zeros(0, np.float32)
-        return cls(lane, (LastEpisode(0, None, 0, False),) * copies, nothing, attributes=(), obs=(), memory=())
+        unknown = (LastEpisode(0, None, 0, False),) * copies
+        return cls(lane, unknown, nothing, AttributeChanges.of({}), obs=(), memory=())
 
     @property
     def repeated_steps(self) -> int:

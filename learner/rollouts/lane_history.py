@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from millrace.protocol.arrays import Array, Bools
-from millrace.protocol.lane_past import AttributesFrom, EpisodeBegin, LanePast, LastEpisode
+from millrace.protocol.lane_past import AttributeChanges, EpisodeBegin, LanePast, LastEpisode
 from millrace.protocol.rollout import Rollout
 
 
@@ -100,7 +100,7 @@ class LaneHistory:
             lane=lane,
             copies=tuple(self._shifted(last, start) for last in self.copies),
             action=action,
-            attributes=tuple(_changes(self.rows, start)),
+            attributes=AttributeChanges.of(_changes(self.rows, start)),
             obs=self.obs,
             memory=self.memory,
         )
@@ -116,12 +116,10 @@ class LaneHistory:
             memory=past.memory,
             no_rows=past.action[:0],
         )
-        none_yet = AttributesFrom(0, np.zeros(0, np.uint8))
-        begins = [none_yet, *past.attributes]
-        ends = [*(each.row for each in past.attributes), len(past.action)]
-        for each, end in zip(begins, ends, strict=True):
-            if each.row < end:
-                found.rows.append(_OfRound(each.row, past.action[each.row : end], each.packed.tobytes()))
+        changes = {0: b""} | past.attributes.by_row()
+        for (row, attributes), end in zip(changes.items(), [*list(changes)[1:], len(past.action)], strict=True):
+            if row < end:
+                found.rows.append(_OfRound(row, past.action[row:end], attributes))
         found._forget_long_ones(known=True)
         return found
 
@@ -184,13 +182,14 @@ def _resets(rollout: Rollout) -> Bools:
     return np.concatenate([~rollout.valid, over])
 
 
-def _changes(kept: Iterable[_OfRound], start: int) -> Iterable[AttributesFrom]:
-    """Yield the rows at which the attributes change, counted from `start`, with the new attributes."""
+def _changes(kept: Iterable[_OfRound], start: int) -> dict[int, bytes]:
+    """The rows at which the attributes change, counted from `start`, with the new attributes."""
+    found: dict[int, bytes] = {}
     before = b""
     for rows in kept:
         if rows.attributes != before:
-            before = rows.attributes
-            yield AttributesFrom(rows.first - start, np.frombuffer(before, np.uint8))
+            before = found[rows.first - start] = rows.attributes
+    return found
 
 
 @dataclass(frozen=True)

@@ -62,7 +62,7 @@ RECORDS: tuple[type, ...] = (
     messages.Permit,
     lane_past.LanePast,
     lane_past.LastEpisode,
-    lane_past.AttributesFrom,
+    lane_past.AttributeChanges,
     messages.Received,
     messages.LaneIncarnation,
     messages.WorkerActivity,

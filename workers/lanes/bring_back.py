@@ -93,7 +93,7 @@ class _Repeated:
     def repeat(self) -> None:
         """Begin the episodes as they began before, and replay their actions. Raises `CopyFailed` if a copy raises."""
         past = self._past
-        attributes = {each.row: each.packed.tobytes() for each in past.attributes}
+        attributes = past.attributes.by_row()
         taken = action_converter_of(self._run.policy)(past.action)
         self._lane.set_attributes(attributes.get(0, b""), self._pulse)
         self._seed(self.continued)

@@ -530,8 +530,7 @@ def starts_a_lane_again(learner: Learner) -> Script[None]:
     before = yield from session.collect()
     permit = session.permit(incarnation=2)
     if learner.hello is not None and learner.hello.continues:  # tell the client that this isn't the first incarnation
-        unknown = (LastEpisode(0, None, 0, False),) * session.run.copies
-        permit = replace(permit, past=LanePast(0, unknown, before.action[:0], (), (), ()))
+        permit = replace(permit, past=LanePast.unknown(0, session.run.copies))
     after = yield from session.collect(permit)
     if _repeats(before, after):
         got = f"the same observations and actions as in incarnation 0, for {STEPS} steps"
@@ -555,11 +554,10 @@ def _past_of(rollouts: Sequence[Rollout]) -> LanePast:
         first = K if over else 1 + int(max(np.flatnonzero(of_copy), default=-1))
         copies.append((begun.copy, LastEpisode(begun.start, begun.random, first, over)))
     mask = () if last.mask is None else (last.mask,)
-    return LanePast(
-        lane=0,
+    return replace(
+        LanePast.unknown(0, len(copies)),
         copies=tuple(episode for _, episode in sorted(copies, key=lambda each: each[0])),
         action=np.concatenate([each.action for each in rollouts]),
-        attributes=(),
         obs=tuple(leaf[-1] for leaf in (*last.obs, *mask)),
         memory=last.memory,
     )

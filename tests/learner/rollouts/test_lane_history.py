@@ -17,8 +17,10 @@ from millrace.learner.rollouts.past_rollouts import packed, unpacked
 from millrace.protocol.bounds import LARGEST
 from millrace.protocol.errors import BadRollout
 from millrace.protocol.lane_past import EpisodeBegin, LanePast, LastEpisode
+from millrace.protocol.messages import Collect, Permit
 from millrace.protocol.rollout import Rollout
 from millrace.protocol.rows.rollout_checks import validate
+from millrace.protocol.wire.codec import decode_to_worker, encode
 from tests.support.conversation.fake_ends import fake_rollout, run_spec
 
 A, B, C = bytes([1]), bytes([2]), bytes([3])  # random numbers
@@ -136,7 +138,22 @@ def test_attributes_change_where_they_changed() -> None:
     history = LaneHistory.of_nothing(2, 100)
     for number, attributes in enumerate([b"", b"", b"a", b"a", b"b"]):
         history.add(rollout(["..", ".."], started(0, 0) if number == 0 else (), number), attributes)
-    assert [(each.row, each.packed.tobytes()) for each in history.past(0).attributes] == [(4, b"a"), (8, b"b")]
+    assert history.past(0).attributes.by_row() == {4: b"a", 8: b"b"}
+
+
+def test_a_past_in_which_attributes_often_changed_can_be_sent() -> None:
+    """The number of arrays in a message is limited."""
+    history = LaneHistory.of_nothing(2, 1000)
+    for number in range(300):
+        history.add(rollout(["..", ".."], started(0, 0) if number == 0 else (), number), b"%d" % number)
+    past = history.past(0)
+    order = Collect(1, 0, (Permit(5, 0, 1, 0, 300, None, past),), (), keep=())
+    decoded = decode_to_worker(list(encode(order)))
+    assert isinstance(decoded, Collect)
+    sent = decoded.permits[0].past
+    assert sent is not None
+    assert sent.attributes.by_row() == {2 * number: b"%d" % number for number in range(300)}
+    assert told(LaneHistory.of(sent, 1000).past(0)) == told(past)
 
 
 ENDS = st.lists(st.booleans(), min_size=3, max_size=3)
@@ -181,8 +198,8 @@ def read(past: LanePast) -> LanePast:
 def told(past: LanePast) -> Any:
     """Of each copy, how its episode began, its actions, and the attributes of each."""
     of_row = [b""] * len(past.action)
-    for each in past.attributes:
-        of_row[each.row :] = [each.packed.tobytes()] * (len(of_row) - each.row)
+    for row, packed_attributes in past.attributes.by_row().items():
+        of_row[row:] = [packed_attributes] * (len(of_row) - row)
     copies = []
     for n, last in enumerate(past.copies):
         known = last.random is not None
@@ -224,7 +241,9 @@ NO_ARRAYS = [7, "a", [], ["<f4", [2]], ["<f4", [2], b"1"], ["O", [1], b"12345678
 
 @pytest.mark.parametrize("array", NO_ARRAYS)
 def test_an_array_that_is_none_is_refused(array: Any) -> None:
-    record = [[0, [], array, [], [], []]]
+    empty = ["<i8", [0], b""]
+    assert unpacked(LanePast, np.frombuffer(msgspec.msgpack.encode([[0, [], empty, [empty] * 3, [], []]]), np.uint8))
+    record = [[0, [], array, [empty] * 3, [], []]]
     with pytest.raises((ValueError, msgspec.ValidationError)):
         unpacked(LanePast, np.frombuffer(msgspec.msgpack.encode(record), np.uint8))
 
