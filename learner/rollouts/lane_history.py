@@ -136,7 +136,10 @@ class LaneHistory:
             return LastEpisode(start, random, self.count + T, True)
         if resets.any():
             return LastEpisode(start, random, self.count + int(np.flatnonzero(resets)[-1]) + 1, False)
-        return last if began is None else LastEpisode(start, random, self.count, False)
+        if began is not None:
+            return LastEpisode(start, random, self.count, False)
+        # The rows before a saved state were dropped. So unless a newer state was saved, the episode can't be continued.
+        return LastEpisode(start, None, self.count, False) if last.saved else last
 
     def _saved(self, n: int) -> None:
         """Record that the rows of copy n aren't needed, because `memory` has its state after the last row."""

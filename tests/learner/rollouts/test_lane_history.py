@@ -134,6 +134,18 @@ def test_the_numbers_of_starts_do_not_run_out() -> None:
         validate(replace(most, begun=(EpisodeBegin(0, LARGEST // 2 + 1, b""),)), run_spec(), 1)
 
 
+def test_an_episode_whose_state_is_no_longer_saved_cannot_be_continued_and_later_ones_are_repeated() -> None:
+    first = rollout(["...", "..."], started(0, 0))
+    history = folded(replace(first, saved=(0, 1)))
+    assert history.past(0).copies == (LastEpisode(0, b"", 0, False, saved=True),) * 2
+    history.add(rollout(["...", "er."], (EpisodeBegin(1, 0, A),), 1), b"")
+    past = history.past(0)
+    assert past.copies == (LastEpisode(0, None, 0, False), LastEpisode(0, A, 2, False))
+    assert (past.new_episodes, past.repeated_steps) == (1, 1)
+    history.add(replace(rollout(["...", "..."], (), 2), saved=(0, 1)), b"")
+    assert history.past(0).new_episodes == 0
+
+
 def test_attributes_change_where_they_changed() -> None:
     history = LaneHistory.of_nothing(2, 100)
     for number, attributes in enumerate([b"", b"", b"a", b"a", b"b"]):
