@@ -50,6 +50,7 @@ class Evaluations:
 
         If the run was resumed without `eval_workers`, this also waits for the evaluation and returns its metrics.
         `env_attributes` are those of the newest weights. They are sent along if these weights are the ones to evaluate.
+        If older weights to evaluate still act in an open round, the hub has their attributes.
         """
         if (pending := self._state.pending) is None:
             return None

@@ -101,8 +101,11 @@ class TicketCoordinator(Coordinator[CollectingMember]):
     ) -> None:
         """Set the newest weights, which later orders name. Then call `begin_update` or `begin_evaluation`.
 
-        `env_steps` is the number of env steps of training so far; with None, the weights never become an opponent.
+        `env_steps` is the number of env steps of training so far; with None, the weights never become an opponent. Without
+        `env_attributes`, weights that are published again keep those that they have.
         """
+        if env_attributes is None and version in self.weights.kept:
+            env_attributes = self.weights.kept[version].env_attributes
         if self.rollouts.opponents is not None and env_steps is not None:
             self.rollouts.opponents.made(version, env_steps)
         self.version = version

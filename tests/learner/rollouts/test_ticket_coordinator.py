@@ -1165,6 +1165,19 @@ def saved(learner: Learner) -> object:
     return past.rounds, packed(past.lanes).tobytes(), packed(past.acting).tobytes()
 
 
+def test_weights_that_still_act_keep_their_attributes_when_they_are_published_again_to_be_evaluated() -> None:
+    """A run is resumed whose weights 2 act in round 3, and were being evaluated alongside training."""
+    learner = Learner(lanes=1, publish=False, rounds=Rounds(1, 3, {3: 2}))
+    coordinator = learner.coordinator
+    coordinator.keep(Weights(2, PARAMETERS, BUFFERS, np.array([7], np.uint8)))
+    coordinator.publish(2, PARAMETERS, BUFFERS)
+    coordinator.publish(3, PARAMETERS, BUFFERS, env_attributes=np.array([8], np.uint8))
+    coordinator.begin_update()
+    sent = {each.version: each.env_attributes for _, each in learner.joins(A) if isinstance(each, Weights)}
+    assert [(version, None if each is None else each.tolist()) for version, each in sent.items()] == [(2, [7]), (3, [8])]
+    assert coordinator.rollouts.attributes == {2: bytes([7]), 3: bytes([8])}
+
+
 def test_incarnations_for_a_checkpoint_name_no_life_that_was_dealt_a_ticket() -> None:
     learner = Learner(lanes=2, publish=False)
     learner.joins(A)
