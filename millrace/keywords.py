@@ -115,7 +115,8 @@ class RolloutKeywords(TypedDict, total=False):
     restart_episodes: int
     """Number of episodes after which each env copy is closed and created again, including in evaluations, for simulators
     that grow or slow down the longer they run. The new copy continues with the seed and the random numbers of the old
-    one, so results don't change if the environment is deterministic given its seed. 0: never.
+    one, and with its saved state if it has save_state, so results don't change if the environment is deterministic
+    given its seed. 0: never.
     """
     no_workers_timeout_s: float
     """Write a checkpoint and end the run if there has been no worker for this many seconds. A run whose workers are all

@@ -149,7 +149,8 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     restart_episodes: Free[Natural] = 0
     """Number of episodes after which each env copy is closed and created again, including in evaluations, for simulators
     that grow or slow down the longer they run. The new copy continues with the seed and the random numbers of the old one,
-    so results don't change if the environment is deterministic given its seed. 0: never.
+    and with its saved state if it has save_state, so results don't change if the environment is deterministic given its
+    seed. 0: never.
     """
     no_workers_timeout_s: Free[Positive] = 600.0
     """Write a checkpoint and end the run if there has been no worker for this many seconds. A run whose workers are all

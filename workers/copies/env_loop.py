@@ -5,13 +5,14 @@ resets that copy. SameStep: the step that ends an episode resets the copy, and r
 the new info, as `final_obs` and `final_info`. Disabled: the caller resets.
 
 Rule: a copy that is recreated after some episodes (`restart_episodes`) continues exactly as it would have otherwise: the new
-environment is reset with the seed with which the copy began, gets the random state of the old environment, and is reset
-again.
+environment is reset with the seed with which the copy began, gets the random state of the old environment, and the state
+that it has saved if it can do so, and is reset again.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from copy import deepcopy
 from dataclasses import replace
 from itertools import repeat
@@ -38,6 +39,7 @@ from millrace.workers.activity import (
 )
 from millrace.workers.copies.env_errors import CopyFailed
 from millrace.workers.copies.random_state import pack, repeatable, set_state, state_of
+from millrace.workers.copies.saved_state import CannotSave, SavedCopy, load, save, saver
 from millrace.workers.copy_slots import Dress, as_made, close_copy, make_copy
 
 Autoreset = Literal["NextStep", "SameStep", "Disabled"]
@@ -233,6 +235,7 @@ class EnvLoop:
         state = state_of(self._inner[n])
         if seed is None and state is None:
             return  # without a seed and a random state, a new environment couldn't continue like this one
+        saved = self._saved(n) if seed is None else None
         close_copy(self.envs[n])
         env = self.envs[n] = self._made(n)
         self._step_functions[n] = env.step
@@ -241,7 +244,19 @@ class EnvLoop:
         if seed is None:
             with self._activity.during(RESETTING):
                 env.reset(seed=self._seeds[n])
-            set_state(self._inner[n], pack(state) or b"")
+            if saved is None:
+                set_state(self._inner[n], pack(state) or b"")
+            else:
+                with self._activity.during(self.stepping):
+                    load(env, saved)
+
+    def _saved(self, n: int) -> SavedCopy | None:
+        """The saved state of copy n; None if its environment can't save it."""
+        if saver(self.envs[n]) is None:
+            return None
+        with suppress(CannotSave), self._activity.during(self.stepping):
+            return save(self.envs[n])
+        return None
 
     def random_state(self, copy: int) -> dict[str, Any] | None:
         """The current state of the copy's random generator; None if it can't be read."""

@@ -104,6 +104,41 @@ def test_a_new_copy_goes_on_as_the_old_one_with_its_attributes(episodes: int) ->
     assert len({tuple(each) for each in kept}) == len(kept), "episodes cannot be told from each other"
 
 
+class Grows(OneStep):
+    """Its level rises with each episode, and is part of the state that it can save."""
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        self.level += 1
+        return super().reset(seed=seed)
+
+    def save_state(self) -> bytes:
+        return bytes([int(self.level)])
+
+    def load_state(self, state: bytes) -> None:
+        (self.level,) = state
+
+
+class ReturnsNoBytes(Grows):
+    """Its state can't be saved."""
+
+    def save_state(self) -> Any:
+        return None
+
+
+@pytest.mark.parametrize("episodes", [1, 2])
+def test_a_new_copy_has_the_state_that_the_old_one_saved(episodes: int) -> None:
+    made: list[OneStep] = []
+    assert played(copies_of(made, episodes, Grows), 5) == played(copies_of([], 0, Grows), 5)
+    assert len(made) > 2
+
+
+def test_a_copy_whose_state_cannot_be_saved_is_made_anew_with_its_random_numbers_alone() -> None:
+    made: list[OneStep] = []
+    shown = played(copies_of(made, 1, ReturnsNoBytes), 2)
+    assert [row[0] for row in shown] == [row[0] for row in played(copies_of([], 0, OneStep), 2)]
+    assert len(made) == 6
+
+
 def test_a_copy_whose_random_numbers_cannot_be_read_stays_and_whoever_trains_is_told() -> None:
     made: list[OneStep] = []
     copies = copies_of(made, 1, Unreadable)
