@@ -85,10 +85,10 @@ class LaneHistory:
     def start_anew(self, attempts: int, *, from_past: bool = True) -> None:
         """Let all copies start afresh after this many failed attempts to continue. No start number is used twice.
 
-        `from_past` says whether the first attempt began from this history. If so, only some of the copies started afresh in
-        that attempt.
+        `from_past` says whether one of them began from this history. If so, only some of the copies started afresh in that
+        attempt.
         """
-        tried = [last.start + (from_past and not last.goes_on) for last in self.copies]  # the first attempt's start numbers
+        tried = [last.start + (from_past and not last.goes_on) for last in self.copies]  # the start numbers of that attempt
         self.copies = [LastEpisode(number + attempts - 1, None, self.count, False) for number in tried]
         self.rows.clear()
 

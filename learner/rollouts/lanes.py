@@ -44,8 +44,10 @@ class TicketedLane(PlacedLane):
     """`newest_taken` and `history` before the newest rollout was taken, in case its update is undone."""
     failures: int = 0
     """How many times its environment has failed since its last rollout arrived."""
-    failed_at_once: bool = True
-    """Whether the first of the `failures` and `losses` happened before any rollout of the incarnation arrived."""
+    continued_in_vain: bool = False
+    """Whether an attempt to continue the lane was lost since its last rollout arrived. In this attempt, copies that couldn't
+    be continued have used the next start number.
+    """
     losses: int = 0
     """How many times its worker was lost while collecting, since its last rollout arrived."""
 
@@ -87,9 +89,9 @@ class TicketedLane(PlacedLane):
                 history.forget()
             history.add(rollout, attributes)
             newest = incarnation, rollout.sequence
-        if attempts := self.failures + self.losses // MOST_ATTEMPTS:
+        if attempts := self._attempts:
             history = history or histories.begin()
-            history.start_anew(attempts, from_past=self.failed_at_once)
+            history.start_anew(attempts, from_past=self.continued_in_vain)
         return None if history is None else history.past(self.number)
 
     def take(
@@ -118,7 +120,9 @@ class TicketedLane(PlacedLane):
     def lost(self, *, failed: bool) -> None:
         """Record that the lane's worker was lost while collecting or, if `failed`, because its environment failed."""
         if not self.failures and not self.losses:
-            self.failed_at_once = not self.next_sequence
+            self.continued_in_vain = False
+        if not self._attempts and not self.next_sequence:
+            self.continued_in_vain = True
         self.losses += not failed
         self.failures += failed
 
@@ -126,6 +130,11 @@ class TicketedLane(PlacedLane):
         """Reset the counts of failures and losses, because a rollout was accepted."""
         self.failures = 0
         self.losses = 0
+
+    @property
+    def _attempts(self) -> int:
+        """How many attempts the copies have had for which they start afresh; 0 while attempts continue the lane."""
+        return self.failures + self.losses // MOST_ATTEMPTS
 
     def arrived(self, sequence: int) -> None:
         """Record that the rollout with this sequence number has arrived."""

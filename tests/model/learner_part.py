@@ -77,7 +77,7 @@ NOT_SAVED: dict[type, set[str]] = {
         "before_taken",
         "failures",
         "losses",
-        "failed_at_once",
+        "continued_in_vain",
     },  # they mark rollouts as fresh; no update is undone here, and no worker is lost three times
     Ticket: set(),
     LanePlacement: {"_tie_break"},

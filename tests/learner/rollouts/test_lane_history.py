@@ -320,7 +320,28 @@ def test_each_failure_and_each_three_losses_take_the_next_number(taken: bool) ->
 def test_a_copy_that_could_not_be_continued_does_not_get_the_number_of_its_first_attempt_again() -> None:
     lane = TicketedLane(0)
     lane.take(0, rollout(["..", ".."], started(4, 6), known=False), b"", HISTORIES, from_past=False)
-    lane.failures = 1  # of an attempt that began under 5 and 7
+    lane.lost(failed=True)  # of an attempt that began under 5 and 7
+    assert next_starts(lane) == [6, 8]
+
+
+def test_such_a_number_is_not_used_again_if_a_worker_was_lost_before_after_a_rollout() -> None:
+    lane = TicketedLane(0, next_sequence=1)
+    lane.take(0, rollout(["..", ".."], started(4, 6), known=False), b"", HISTORIES, from_past=False)
+    lane.lost(failed=False)
+    assert next_starts(lane) == [5, 7]
+    lane.next_sequence = 0
+    lane.lost(failed=True)  # of the attempt that began under 5 and 7
+    assert next_starts(lane) == [6, 8]
+    lane.lost(failed=True)
+    assert next_starts(lane) == [7, 9]
+    lane.went_on()
+    lane.next_sequence = 1
+    lane.lost(failed=True)
+    assert next_starts(lane) == [5, 7], "the history tells of the newest numbers"
+
+
+def next_starts(lane: TicketedLane) -> list[int]:
+    """The start numbers of the next attempt, of copies that can't be continued."""
     past = lane.past(HISTORIES, ())
     assert past is not None
-    assert [last.start + 1 for last in past.copies] == [6, 8]
+    return [last.start + 1 for last in past.copies]
