@@ -25,14 +25,8 @@ from gymnasium.envs.registration import VectorizeMode
 from gymnasium.vector import VectorEnv
 
 from millrace.protocol.bounds import one_line
-from millrace.protocol.envs.found_names import MAIN, found_by_others, in_main, last_part, name_of
-from millrace.protocol.envs.make_env import (
-    made_by_callable,
-    made_by_id,
-    made_without_checker,
-    names_a_function,
-    why_not_made,
-)
+from millrace.protocol.envs.found_names import MAIN, found_by_others, in_main, last_part, name_of, names_a_function
+from millrace.protocol.envs.make_env import made_by_callable, made_by_id, made_without_checker, why_not_made
 from millrace.protocol.envs.seats import has_seats, seated
 from millrace.protocol.envs.unknown_ids import (
     ids_of_gymnasium,

@@ -17,7 +17,7 @@ from typing import Any
 from millrace.protocol.bounds import one_line
 from millrace.protocol.envs.advice.files_as_modules import module_of_file
 from millrace.protocol.envs.advice.missing_modules import what_to_install
-from millrace.protocol.envs.found_names import attribute
+from millrace.protocol.envs.found_names import attribute, names_a_module
 from millrace.protocol.errors import UsageError, did_you_mean, first_line
 
 
@@ -53,7 +53,7 @@ def import_own(module: str, what: str) -> ModuleType:
 
 
 def refuse_modules_in(folder: Path, names: Iterable[str]) -> None:
-    """Raise `UsageError` if one of these names, `module:name`, would be imported from this run folder.
+    """Raise `UsageError` if one of these names, `module:name` or `package.module_v1`, would be imported from the run folder.
 
     A run folder may come from a stranger, and its files name modules that are imported. So a module is never imported from
     the folder itself.
@@ -67,7 +67,8 @@ def refuse_modules_in(folder: Path, names: Iterable[str]) -> None:
     for name in names:
         module, colon, _ = name.partition(":")
         first, *_ = parts = module.split(".")
-        for entry in entries if colon and first else ():
+        imported = bool(colon and first) or names_a_module(name)
+        for entry in entries if imported else ():
             if entry.is_relative_to(inside):
                 is_inside = entry.is_dir() and any(path.name.partition(".")[0] == first for path in entry.iterdir())
             else:

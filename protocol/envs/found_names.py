@@ -8,6 +8,7 @@ defined in a function, or an object.
 from __future__ import annotations
 
 import importlib.util
+import re
 import sys
 
 MAIN = "__main__"
@@ -49,6 +50,23 @@ def last_part(name: str) -> str:
     """The name without its module, outer classes and arguments: `Clip` for `mine:Outer.Clip(0.5)` and for `<Clip>`."""
     name = name.strip("<>").partition("(")[0].rpartition(":")[2]
     return name if "/" in name else name.rpartition(".")[2]
+
+
+def names_a_function(env_id: str) -> bool:
+    """Whether this names a function or a class: `module:name`, where the name has no version.
+
+    `package.module_v1` counts as well (see `names_a_module`).
+    """
+    _, colon, name = env_id.partition(":")
+    return all(word.isidentifier() for word in name.split(".")) if colon else names_a_module(env_id)
+
+
+def names_a_module(env_id: str) -> bool:
+    """Whether this is `package.module_v1`.
+
+    PettingZoo's environments are modules with such names, and have a function `parallel_env` or `env`.
+    """
+    return re.fullmatch(r"[^\W\d]\w*(\.\w+)*\.\w+_v\d+", env_id) is not None
 
 
 def attribute(module: object, qualname: str) -> object:

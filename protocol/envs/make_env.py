@@ -5,7 +5,6 @@ from __future__ import annotations
 import difflib
 import importlib
 import pkgutil
-import re
 import sys
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -19,25 +18,11 @@ from millrace.protocol.envs.advice.files_as_modules import module_of_file
 from millrace.protocol.envs.advice.missing_modules import what_to_install
 from millrace.protocol.envs.advice.old_gym import instead_of_id, instead_of_object, is_of_old_gym
 from millrace.protocol.envs.advice.several_agents import what_it_lacks
-from millrace.protocol.envs.found_names import attribute
+from millrace.protocol.envs.found_names import attribute, names_a_function, names_a_module
 from millrace.protocol.envs.seats import has_seats
 from millrace.protocol.envs.unknown_ids import most_similar, what_to_write
 from millrace.protocol.envs.which_copy import FIRST_COPY, EnvCopy, being_made, takes_copy
 from millrace.protocol.errors import UsageError, first_line, joined, words_an_error
-
-
-def names_a_function(env_id: str) -> bool:
-    """Whether this names a function or a class: `module:name`, where the name has no version.
-
-    `package.module_v1` counts as well: PettingZoo's environments are modules with such names, and have a function
-    `parallel_env` or `env`.
-    """
-    _, colon, name = env_id.partition(":")
-    return all(word.isidentifier() for word in name.split(".")) if colon else _names_a_module(env_id)
-
-
-def _names_a_module(env_id: str) -> bool:
-    return re.fullmatch(r"[^\W\d]\w*(\.\w+)*\.\w+_v\d+", env_id) is not None
 
 
 @words_an_error
@@ -51,7 +36,7 @@ def _newer_or_older(module: str) -> str:
 def made_by_id(env_id: str, kwargs: dict[str, Any]) -> Any:
     """Make the environment with this id, or call the function or class with this name."""
     module_name, _, name = env_id.partition(":")
-    if _names_a_module(env_id):
+    if names_a_module(env_id):
         module = importlib.import_module(env_id)
         return made_by_callable(env_id, getattr(module, "parallel_env", None) or module.env, kwargs)
     if names_a_function(env_id):

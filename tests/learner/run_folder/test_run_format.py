@@ -70,7 +70,7 @@ def test_a_folder_without_a_format_is_no_run_folder(run: Path, read: Callable[[P
         ("", "run.package.evil"), ("link", "evil"),
     ],
 )  # fmt: skip
-@pytest.mark.parametrize("named", ["env", "wrappers", "algo", "callbacks"])
+@pytest.mark.parametrize("named", ["env", "module as env", "wrappers", "algo", "callbacks"])
 def test_a_module_in_a_run_folder_is_not_imported(
     run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, named: str, found_from: str, module: str
 ) -> None:
@@ -79,9 +79,12 @@ def test_a_module_in_a_run_folder_is_not_imported(
     (tmp_path / "link").symlink_to(run)
     (run / "package").mkdir()
     for folder in (run, run / "package"):
-        (folder / "evil.py").write_text("raise AssertionError('it was imported')")
+        for file in ("evil.py", "evil_v0.py"):
+            (folder / file).write_text("raise AssertionError('it was imported')")
     monkeypatch.syspath_prepend(str(tmp_path / found_from))
     name = f"{module}:Evil"
+    if named == "module as env":  # `make_env` imports a module of PettingZoo's form without a colon
+        named, name = "env", f"{module}_v0" if "." in module else f"{module}.evil_v0"
     text = (run / "config.toml").read_text()
     given = {"env": "CartPole-v1", "algo": "ppo", "wrappers": [], "callbacks": []} | {named: name}
     for key, old in {"env": '"CartPole-v1"', "algo": '"ppo"', "wrappers": "[]", "callbacks": "[]"}.items():
