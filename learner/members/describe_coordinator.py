@@ -7,7 +7,8 @@ environment that fails everywhere is discovered after a few attempts.
 
 Rule: the run uses the first description that can be read and is accepted; other workers compare their env copies with it
 when they open lanes. A worker that declines, or whose description is not accepted, is refused; once `decliners_to_end`
-different workers have been refused, the start fails with the reason. A worker whose environment fails may come back.
+different workers have been refused, the start fails with the reason. A worker whose environment fails may come back. If a
+worker that was not asked fails or declines, this doesn't count.
 """
 
 from __future__ import annotations
@@ -53,7 +54,7 @@ class DescribeCoordinator(Coordinator[Member]):
 
     def __init__(self, wait: WaitSpec, first_session: int, *, worker_timeout_s: float, decliners_to_end: int) -> None:
         """The start fails once `decliners_to_end` different workers cannot describe the environment; 0 means never."""
-        super().__init__(Membership(wait, Member, self._removed, first_session), worker_timeout_s)
+        super().__init__(Membership(wait, Member, self._removed, first_session, _was_not_asked), worker_timeout_s)
         self.described: DescribedEnv | None = None
         """The first usable description of the newest environment."""
         self.unsuitable: UsageError | None = None
@@ -138,7 +139,8 @@ class DescribeCoordinator(Coordinator[Member]):
         return []
 
     def _goodbye(self, member: Member, reason: str) -> list[Outgoing]:
-        if reason == TOLD_TO_STOP or reason.startswith(NO_SLOT) or self.described is not None:
+        must_leave = reason == TOLD_TO_STOP or reason.startswith(NO_SLOT)
+        if must_leave or self.described is not None or _was_not_asked(member):
             self.membership.leave(member, reason)
             return []
         return self._unsuitable(member, Goodbye, reason)
@@ -152,6 +154,10 @@ class DescribeCoordinator(Coordinator[Member]):
                 self.membership.take_events()  # the error contains the reason, so it need not be logged
                 self.unsuitable = UsageError(reason)
         return refusal
+
+
+def _was_not_asked(member: Member) -> bool:
+    return not member.tickets
 
 
 def _free_first(member: Member) -> tuple[bool, bool, int]:

@@ -45,8 +45,13 @@ L = TypeVar("L", bound=PlacedLane)
 
 
 def is_spare(member: Member, lanes: Iterable[PlacedLane]) -> bool:
-    """Whether the run doesn't need this worker: it could have lanes but has none, and every lane has a worker."""
-    return not (member.hello.evaluates or member.lanes) and all(lane.owner is not None for lane in lanes)
+    """Whether the run doesn't need this worker: it has no lane, and every lane has a worker.
+
+    A worker that only evaluates is needed while it plays an evaluation.
+    """
+    if member.hello.evaluates and not member.lanes:
+        return not member.tickets
+    return not member.lanes and all(lane.owner is not None for lane in lanes)
 
 
 class LanePlacement(Generic[L]):

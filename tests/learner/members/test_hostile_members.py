@@ -365,6 +365,24 @@ def test_a_spare_worker_cannot_end_the_run_with_failures() -> None:
         noisy.hub._turn(0.0)
 
 
+def test_a_worker_that_only_evaluates_ends_the_run_only_by_failures_in_evaluations() -> None:
+    noisy = Noisy(max_env_failures=1)
+
+    def fails(nonce: int) -> None:
+        noisy.hears("spare", msgspec.structs.replace(hello("spare", nonce), evaluates=True))
+        session = noisy.coordinator.members[b"spare"].session
+        noisy.hears("spare", example(Failure, session=session, error="boom", lane=0))
+
+    for nonce in range(10):
+        fails(nonce)
+    noisy.hub._turn(0.0)
+    noisy.hub.begin_evaluation(EvaluationPlan((1,), copies=1, most_steps=9), beside=True)
+    for nonce in range(10, 12):
+        fails(nonce)
+    with pytest.raises(EnvironmentFailed, match="boom; failure 2 in a row; max_env_failures allows 1 in a row"):
+        noisy.hub._turn(0.0)
+
+
 @pytest.mark.parametrize(("apart_s", "ends"), [(3590.0, True), (3600.0, False)])
 def test_failures_after_env_steps_end_the_run_if_there_are_too_many_within_an_hour(apart_s: float, ends: bool) -> None:
     noisy = Noisy(max_env_failures=1)  # of one env copy: two within the first hour

@@ -198,6 +198,7 @@ def test_claims_do_not_keep_an_evaluation_from_a_second_worker_and_only_an_answe
 
 def test_their_failures_count_and_only_their_own_episodes_end_their_row() -> None:
     learner = learner_with(A, E)
+    learner.begins(1, 2)
     count = FailureCount(allowed=1)
     for success, ends in [("e", False), ("a", False), ("", True)]:
         learner.coordinator.membership.take_events()
