@@ -2,8 +2,9 @@
 
 Rule: a pickle may contain only what torch.save writes for tensors and plain data. torch's loader for untrusted files
 (`weights_only`) doesn't run code from them, but it calls `bytearray` with any length, and copies a container or a string as
-many times as the file says, so a few bytes could fill the memory. This file interprets the pickle without making its
-objects.
+many times as the file says, so a few bytes could fill the memory. It also hashes the keys of dicts, which could take forever
+with tuples that contain a tuple twice, or with numbers that all have the same hash. This file interprets the pickle without
+making its objects.
 """
 
 from __future__ import annotations
@@ -14,15 +15,14 @@ from typing import NamedTuple
 VALUES = {"NONE", "NEWTRUE", "NEWFALSE", "BININT", "BININT1", "BININT2", "LONG1", "LONG4", "BINFLOAT", "BINUNICODE"}
 CONTAINERS = {"EMPTY_LIST", "EMPTY_DICT"}
 TUPLES = {"EMPTY_TUPLE": 0, "TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3}
-ADD = {"APPEND": 1, "SETITEM": 2}
-"""The allowed opcodes, by their names in pickletools, and how many items each pops from the stack. torch.save writes
-protocol 2."""
+"""Opcodes that make values, by their names in pickletools. torch.save writes protocol 2."""
 
 REBUILD = {f"torch._utils {name}" for name in ("_rebuild_tensor_v2", "_rebuild_tensor_v3", "_rebuild_parameter")}
 """Functions that make a view of a storage. torch checks the size of the view when it makes it."""
 HOOKS = "collections OrderedDict"  # the empty dict of a tensor's hooks
 BYTES = "_codecs encode"  # makes a bytes object, whose content the pickle holds as text
 CALLED = REBUILD | {HOOKS, BYTES}
+MOST_KEY = 1 << 60  # limit on the size of a number that is a key; larger numbers may all have the same hash
 TYPES = ("torch ", "torch.storage ")  # prefixes of the names of storage types and dtypes, which aren't called
 
 
@@ -57,15 +57,20 @@ def rehearse(content: bytes) -> None:
                 _gather(stack, len(stack) - TUPLES[name])
             case "TUPLE", _:
                 _gather(stack, marks.pop())
-            case "APPENDS" | "SETITEMS", _:
+            case "APPENDS", _:
                 del stack[marks.pop() :]
-            case name, _ if name in ADD:
-                del stack[-ADD[name] :]
+            case "APPEND", _:
+                stack.pop()
+            case "SETITEMS", _:
+                _set_items(stack, marks.pop())
+            case "SETITEM", _:
+                _set_items(stack, len(stack) - 2)
             case "BINPUT" | "LONG_BINPUT", int(note):
                 notes[note] = stack[-1]
             case "BINGET" | "LONG_BINGET", int(note):
                 stack.append(notes[note])
             case "BINPERSID", _:  # a storage, whose content torch reads from elsewhere in the file
+                _check_storage(stack[-1])
                 stack[-1] = None
             case "GLOBAL", str(name) if name in CALLED or name.startswith(TYPES):
                 stack.append(_Function(name))
@@ -84,6 +89,28 @@ def rehearse(content: bytes) -> None:
 def _gather(stack: list[object], first: int) -> None:
     """Replace the items on the stack, from this index on, with a tuple of them."""
     stack[first:] = [tuple(stack[first:])]
+
+
+def may_be_key(key: object) -> bool:
+    """Whether this may be the key of a dict."""
+    return type(key) is str or (type(key) is int and abs(key) < MOST_KEY)
+
+
+def _set_items(stack: list[object], first: int) -> None:
+    """Remove keys and values from the stack, from this index on. Raises `Unfit` for a key that isn't allowed."""
+    for key in stack[first::2]:
+        if not may_be_key(key):
+            raise Unfit("expected a pickle of tensors and plain data, got a key that is neither text nor a small number")
+    del stack[first:]
+
+
+def _check_storage(storage: object) -> None:
+    """Raise `Unfit` unless this names a storage as torch.save does. torch uses the third item as a key."""
+    match storage:
+        case "storage", _Function(), str(), str(), int():
+            pass
+        case _:
+            raise Unfit("expected a pickle of tensors and plain data, got a storage of another form")
 
 
 def _cost(called: object, arguments: object) -> int:

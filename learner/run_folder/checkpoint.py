@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from millrace.learner.rehearsed_pickle import rehearse
+from millrace.learner.rehearsed_pickle import may_be_key, rehearse
 from millrace.learner.run_folder.atomic_write import TEMPORARY, write_atomically
 from millrace.learner.run_folder.regular_files import open_regular, reason, regular_files, subfolder
 from millrace.protocol.errors import CheckpointError, UsageError
@@ -204,7 +204,11 @@ def _check_plain(value: object, where: str) -> None:
     match value:
         case dict():
             for key, inner in value.items():
-                _check_plain(key, f"{where} key")
+                if not may_be_key(key):
+                    raise UsageError(
+                        f"checkpoint: {where}: expected strings and small whole numbers as keys, got {key!r:.100}; "
+                        "fix state_dict"
+                    )
                 _check_plain(inner, f"{where}[{key!r}]")
         case list() | tuple():
             for index, inner in enumerate(value):

@@ -7,6 +7,7 @@ import pickle
 import resource
 import shutil
 import signal
+import zipfile
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -228,6 +229,40 @@ def test_the_pickle_that_torch_reads_is_the_one_that_is_rehearsed(tmp_path: Path
         checkpoint.load(path)
 
 
+def with_pickle(path: Path, content: bytes) -> None:
+    """Write a checkpoint with this pickle in place of torch's, without memory for any tensor."""
+    torch.save({}, path)
+    with zipfile.ZipFile(path) as archive:
+        entries = {entry.filename: archive.read(entry) for entry in archive.infolist()}
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, data in entries.items():
+            archive.writestr(name, content if name.endswith("data.pkl") else data)
+
+
+PAIRED = b"K\x01q\x00" + b"h\x00\x86q\x00" * 200
+"""Opcodes that pair a tuple with itself 200 times. Its hash takes 2^200 steps."""
+STORAGE = b"(X\x07\x00\x00\x00storagectorch\nFloatStorage\n%bX\x03\x00\x00\x00cpuK\x01tQ"
+
+
+@pytest.mark.parametrize(
+    "opcodes",
+    [
+        b"}" + PAIRED + b"K\x01s",
+        b"}(K\x01K\x01" + PAIRED + b"K\x01u",
+        b"}G" + bytes(8) + b"K\x01s",
+        b"}\x8a\x08" + (2**61 - 1).to_bytes(8, "little") + b"K\x01s",
+        STORAGE % PAIRED,
+        b"K\x01Q",
+    ],
+    ids=["key", "second key", "float", "number whose hash is 0", "storage", "storage without a tuple"],
+)
+def test_keys_that_take_long_to_find_are_refused(tmp_path: Path, opcodes: bytes) -> None:
+    path = tmp_path / "model.pt"
+    with_pickle(path, b"\x80\x02" + opcodes + b".")
+    with pytest.raises(CheckpointError, match=r"expected a pickle of tensors and plain data, got a (key|storage)"):
+        checkpoint.load(path)
+
+
 def test_all_that_a_state_may_hold_passes_the_rehearsal(tmp_path: Path) -> None:
     dtypes = [torch.float64, torch.bfloat16, torch.bool, torch.int64, torch.uint16, torch.complex64, torch.float8_e4m3fn]
     saved: dict[str, Any] = {
@@ -236,6 +271,7 @@ def test_all_that_a_state_may_hold_passes_the_rehearsal(tmp_path: Path) -> None:
         "plain": [(), (1,), (1, 2), (1, 2, 3), (1, 2, 3, 4), 2**70, -1, 300, 70_000, 0.5, True, False, None, "ä", [], {}],
         "bytes": [b"a", b"\xff" * 300, b"a"],
         "many": list(range(2000)),
+        "keys": {"ä": 0, "": 1, 0: 2, -1: 3, 2**60 - 1: 4, -(2**60) + 1: 5},
     }
     checkpoint.save(tmp_path, saved, 100, keep=1)
     found = checkpoint.newest(tmp_path)[0].state
@@ -298,3 +334,9 @@ def test_a_state_that_could_not_be_read_back_is_not_written(tmp_path: Path, stra
     with pytest.raises(UsageError, match=r"state\['inner'\]\[0\]: expected tensors and plain data, got"):
         checkpoint.save(tmp_path, {"inner": [stray]}, 100, keep=3)
     assert not (tmp_path / "checkpoints").exists()
+
+
+@pytest.mark.parametrize("key", [(1, 2), 0.5, None, True, 2**60, -(2**60)])
+def test_a_state_with_keys_that_could_not_be_read_back_is_not_written(tmp_path: Path, key: object) -> None:
+    with pytest.raises(UsageError, match=r"state\['inner'\]: expected strings and small whole numbers as keys, got"):
+        checkpoint.save(tmp_path, {"inner": {key: 1}}, 100, keep=3)
