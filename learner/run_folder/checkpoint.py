@@ -5,7 +5,7 @@ Rule: a checkpoint is written atomically; a resumed run uses the newest undamage
 `bit_generator.state`. torch's loader does not detect damaged data, so the checksums of the file (a zip archive) are verified
 first. The file must contain each element of a tensor: a tensor with a stride of 0 has only a few bytes in the file, but
 could grow to any size when copied. And the calls of the loader are checked in advance, because they could fill the memory
-(`learner/rehearsed_pickle.py`).
+(`learner/rehearsed_pickle.py`); the loader reads the pickle that was checked (`archive_directory.py`).
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from millrace.learner.rehearsed_pickle import may_be_key, rehearse
+from millrace.learner.run_folder.archive_directory import check_directory
 from millrace.learner.run_folder.atomic_write import TEMPORARY, write_atomically
 from millrace.learner.run_folder.regular_files import open_regular, reason, regular_files, subfolder
 from millrace.protocol.errors import CheckpointError, UsageError
@@ -133,6 +134,7 @@ def _read(path: Path) -> Checkpoint:
         with os.fdopen(open_regular(path), "rb") as file:
             if file.read(len(ZIP_BEGINS)) != ZIP_BEGINS:
                 raise _Unreadable("it isn't an archive that torch.save wrote")
+            check_directory(file)
             with zipfile.ZipFile(file) as archive:
                 if any(entry.compress_type != zipfile.ZIP_STORED for entry in archive.infolist()):
                     raise _Unreadable("it is compressed, which torch never does")  # decompressing it could fill the memory

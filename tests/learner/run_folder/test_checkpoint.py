@@ -7,7 +7,8 @@ import pickle
 import resource
 import shutil
 import signal
-import zipfile
+import struct
+import zlib
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -19,6 +20,7 @@ import pytest
 import torch
 
 from millrace.learner.run_folder import checkpoint
+from millrace.learner.run_folder.archive_directory import ENTRY
 from millrace.protocol.errors import CheckpointError, UsageError
 
 
@@ -230,13 +232,10 @@ def test_the_pickle_that_torch_reads_is_the_one_that_is_rehearsed(tmp_path: Path
 
 
 def with_pickle(path: Path, content: bytes) -> None:
-    """Write a checkpoint with this pickle in place of torch's, without memory for any tensor."""
-    torch.save({}, path)
-    with zipfile.ZipFile(path) as archive:
-        entries = {entry.filename: archive.read(entry) for entry in archive.infolist()}
-    with zipfile.ZipFile(path, "w") as archive:
-        for name, data in entries.items():
-            archive.writestr(name, content if name.endswith("data.pkl") else data)
+    """Write an archive with this pickle, as torch.save does."""
+    writer = torch._C.PyTorchFileWriter(str(path))
+    writer.write_record("data.pkl", content, len(content))
+    writer.write_end_of_file()
 
 
 PAIRED = b"K\x01q\x00" + b"h\x00\x86q\x00" * 200
@@ -260,6 +259,58 @@ def test_keys_that_take_long_to_find_are_refused(tmp_path: Path, opcodes: bytes)
     path = tmp_path / "model.pt"
     with_pickle(path, b"\x80\x02" + opcodes + b".")
     with pytest.raises(CheckpointError, match=r"expected a pickle of tensors and plain data, got a (key|storage)"):
+        checkpoint.load(path)
+
+
+def entry(name: bytes, data: bytes, offset: int, extra: bytes) -> bytes:
+    """An entry of an archive's directory."""
+    numbers = 0, 0, 0, 0, 0, 0, zlib.crc32(data), len(data), len(data), len(name), len(extra), 0, 0, 0, 0, offset
+    return ENTRY.pack(b"PK\1\2", *numbers) + name + extra
+
+
+def file_in_archive(name: bytes, data: bytes) -> bytes:
+    """A file as an archive contains it."""
+    numbers = 0, 0, 0, 0, 0, zlib.crc32(data), len(data), len(data), len(name), 0
+    return struct.pack("<4sHHHHHIIIHH", b"PK\3\4", *numbers) + name + data
+
+
+def end(count: int, size: int, start: int, record_at: int, comment: bytes = b"") -> bytes:
+    """The end of an archive, after its directory."""
+    record = struct.pack("<4sQHHIIQQQQ", b"PK\6\6", 44, 0, 45, 0, 0, count, count, size, start)
+    located = struct.pack("<4sIQI", b"PK\6\7", 0, record_at, 1)
+    return record + located + struct.pack("<4sHHHHIIH", b"PK\5\6", 0, 0, count, count, size, start, len(comment)) + comment
+
+
+def archive(how: str) -> bytes:
+    """An archive in which torch may find another pickle than Python."""
+    data = pickle.dumps({"format": 1, "env_steps": 1, "state": {}}, 2)
+    files = {b"a/data.pkl": data, b"a/other": data, b"a/version": b"3"}
+    content, entries = b"", list[bytes]()
+    for name, data in files.items():
+        renamed = b"up" + struct.pack("<HBI", 5 + 7, 1, zlib.crc32(name)) + b"a/other"
+        entries.append(entry(name, data, len(content), renamed if how == "renamed" and name == b"a/data.pkl" else b""))
+        content += file_in_archive(name, data)
+    if how == "two directories":  # one for each reader: the locator leads to the first record, the second is next to it
+        first = len(content)
+        content += b"".join(entries) + end(3, sum(map(len, entries)), first, 0)[:56]
+        start, rest = len(content), entries[1:]
+        return content + b"".join(rest) + end(2, sum(map(len, rest)), start, start - 56)
+    start = len(content)
+    content += b"".join(entries)
+    size = len(content) - start
+    content += b"?" if how == "a gap" else b""
+    return content + end(3, size, start, len(content), b"PK" if how == "a comment" else b"")
+
+
+@pytest.mark.parametrize("how", ["two directories", "renamed", "a gap", "a comment"])
+def test_an_archive_in_which_torch_may_find_another_pickle_than_the_rehearsed_one_is_refused(
+    tmp_path: Path, how: str
+) -> None:
+    path = tmp_path / "model.pt"
+    path.write_bytes(archive("as torch writes it"))
+    assert checkpoint.load(path).env_steps == 1
+    path.write_bytes(archive(how))
+    with pytest.raises(CheckpointError, match=r"its (directory|last bytes)"):
         checkpoint.load(path)
 
 
