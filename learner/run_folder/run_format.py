@@ -35,6 +35,7 @@ END = "# end\n"
 """The last line of config.toml; `HEAD` is the first. Without it, a file that was cut off could still be valid TOML."""
 MOST_CONFIG_BYTES = 1 << 18
 MOST_NESTED = 1_000_000  # limit of (lines) × (dots in a line): for each line, tomllib visits all parts of a table's name
+MOST_PREFIXES = 10_000_000  # limit of the sum of (dots in a line)²: of a key such as a.b.c, tomllib stores each prefix
 
 
 class RunFormat(msgspec.Struct, frozen=True, kw_only=True):
@@ -110,8 +111,8 @@ def parse_toml(text: str, where: str) -> dict[str, Any]:
     text = text.removeprefix("\ufeff")  # a byte order mark, which some editors write
     if text.startswith(HEAD) and not text.rstrip().endswith(END.strip()):
         raise UsageError(f"{where} is cut off: expected {END.strip()!r} as its last line; restore it, or start a new run")
-    lines = text.split("\n")
-    if len(lines) * max(line.count(".") for line in lines) > MOST_NESTED:
+    dots = [line.count(".") for line in text.split("\n")]
+    if len(dots) * max(dots) > MOST_NESTED or sum(each**2 for each in dots) > MOST_PREFIXES:
         raise UsageError(f"{where} has tables in tables in tables, or very long lines; expected the settings of a run")
     try:
         table = tomllib.loads(text)

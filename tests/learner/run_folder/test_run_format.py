@@ -15,7 +15,7 @@ from millrace.learner.config.layers import config_of_run, resolve
 from millrace.learner.run_folder.metrics_log import MetricsLog
 from millrace.learner.run_folder.progress import Progress
 from millrace.learner.run_folder.run_folder import RunFolder
-from millrace.learner.run_folder.run_format import CONFIG_FILE, RUN_FILE, RUN_FORMAT, check_format
+from millrace.learner.run_folder.run_format import CONFIG_FILE, RUN_FILE, RUN_FORMAT, check_format, parse_toml
 from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.envs.spaces import action_spec, observation_leaves
 from millrace.protocol.errors import RunError, UsageError
@@ -135,11 +135,17 @@ def test_settings_that_would_take_minutes_to_read_are_refused(run: Path) -> None
     nested = f"[{'.'.join(['a'] * 4_000)}]\n" + "".join(f"k{i} = 1\n" for i in range(1_000))
     for settings, why in (
         (nested, "has tables in tables in tables"),
+        (".".join(["a"] * 8_000) + " = 1\n", "has tables in tables in tables"),
+        ("".join(f"a{n}{'.a' * 330} = 1\n" for n in range(180)), "has tables in tables in tables"),
         ("x = 1\n" * 100_000, "expected at most 262,144 bytes"),
     ):
         (run / CONFIG_FILE).write_text(settings)
         with pytest.raises(UsageError, match=why):
             config_of_run(run)
+
+
+def test_settings_with_many_dots_are_read() -> None:
+    assert parse_toml("\n".join([f"x = [{', '.join(['0.25'] * 2_000)}]", *["# ..."] * 300]), "x")["x"] == [0.25] * 2_000
 
 
 def test_a_resumed_folder_gets_the_current_format(run: Path) -> None:
