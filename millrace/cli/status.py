@@ -23,7 +23,8 @@ from msgspec import Meta
 from millrace.flags.fields import Flag
 from millrace.flags.parse import parse_flags
 from millrace.learner.members.held_up import in_words
-from millrace.learner.run_folder.run_format import is_run_folder
+from millrace.learner.run_folder.regular_files import read, reason
+from millrace.learner.run_folder.run_format import MOST_CONFIG_BYTES, is_run_folder, parse_toml
 from millrace.learner.run_folder.run_lock import learner_of_run
 from millrace.learner.run_folder.sentences import (
     bottleneck,
@@ -38,7 +39,7 @@ from millrace.learner.run_folder.sentences import (
 from millrace.learner.run_lines import RunLine, in_sentences, read_line
 from millrace.protocol.errors import Refused, RunError, UsageError
 from millrace.protocol.keys.key_folder import KeyFolder
-from millrace.protocol.keys.keys import Token
+from millrace.protocol.keys.keys import ClientList, Token
 from millrace.protocol.keys.worker_token import TOKEN_VARIABLE, read_token
 from millrace.protocol.messages import Inquire, Status, WorkerStatus
 from millrace.protocol.wire.codec import encode
@@ -119,14 +120,22 @@ def whom_to_ask(where: str, token: Token | None, *, insecure: bool) -> tuple[str
 
 
 def token_of_learner(run: str, folder: Path) -> Token:
-    """A token from the learner's key folder. Raises `UsageError` if this machine has none."""
+    """A token from the learner's key folder. Raises `UsageError` if this machine has none.
+
+    The run names the folder, and may come from a stranger. So the folder must be outside the run, and is read with limits.
+    """
     keys = KeyFolder(folder)
+    path = None
     try:
-        path = keys.first_token(keys.allowed())
-    except OSError as error:
-        raise UsageError(
-            f"run {run}: key folder {folder} cannot be read: {error.strerror}; expected --token FILE"
-        ) from error
+        if Path(os.path.realpath(folder)).is_relative_to(os.path.realpath(run)):
+            raise UsageError(f"run {run}: its lock names a key folder inside the run folder; expected --token FILE")
+        text = read(keys.list_path, MOST_CONFIG_BYTES).decode()
+        parse_toml(text, f"list {keys.list_path}")  # raises if the next line would take long
+        path = keys.first_token(ClientList.from_toml(text, f"list {keys.list_path}"))
+    except FileNotFoundError:
+        pass
+    except (OSError, ValueError) as error:
+        raise UsageError(f"run {run}: key folder {folder} cannot be read: {reason(error)}; expected --token FILE") from error
     if path is None:
         raise UsageError(
             f"run {run}: its learner needs a key, and no token is in {folder} here: expected --token FILE (or "

@@ -13,7 +13,7 @@ import pytest
 from msgspec.structs import replace
 
 from millrace.cli.main import main
-from millrace.cli.status import status, whom_to_ask
+from millrace.cli.status import status, token_of_learner, whom_to_ask
 from millrace.learner.run_folder.lease import Listens, Owner, decoded
 from millrace.learner.run_folder.run_lock import LOCK_FILE, RunLock
 from millrace.protocol.errors import UsageError
@@ -93,9 +93,48 @@ def test_a_folder_without_a_token_is_one_line_that_does_not_suggest_to_go_withou
         whom_to_ask(str(run), None, insecure=False)
     assert "insecure" not in str(raised.value)
     assert "\n" not in str(raised.value)
-    write_lock(run, str(run / "not-here"), boot)
+    write_lock(run, str(keys.path / "not-here"), boot)
     with pytest.raises(UsageError, match="no token is in"):
         whom_to_ask(str(run), None, insecure=False)
+
+
+@pytest.mark.parametrize("content", ["large", "long key", "a link", "a FIFO", "not text", "a folder"])
+def test_a_list_that_would_take_long_to_read_is_refused(run: Path, keys: KeyFolder, content: str) -> None:
+    path = keys.list_path
+    path.rename(path.with_name("real"))
+    match content:
+        case "a link":
+            path.symlink_to("real")
+        case "a FIFO":
+            os.mkfifo(path)
+        case "a folder":
+            path.mkdir()
+        case "large":
+            path.write_text("# nothing\n" * 50_000)
+        case "not text":
+            path.write_bytes(b"\xff")
+        case _:
+            path.write_text(".".join(["a"] * 5_000) + " = 1\n")
+    write_lock(run, str(keys.path), "another kernel")
+    with pytest.raises(UsageError, match=r"cannot be read: |has tables in tables in tables") as raised:
+        whom_to_ask(str(run), None, insecure=False)
+    assert "\n" not in str(raised.value)
+
+
+def test_a_key_folder_inside_the_run_folder_is_refused(run: Path, keys: KeyFolder, tmp_path: Path) -> None:
+    """Whoever hands over a run folder would choose the key by which their program counts as the right learner."""
+    keys.path.rename(run / "keys")
+    (tmp_path / "link").symlink_to(run)
+    for folder in (run / "keys", run / "x" / ".." / "keys", tmp_path / "link" / "keys"):
+        write_lock(run, str(folder), "another kernel")
+        with pytest.raises(UsageError, match=r"names a key folder inside the run folder; expected --token FILE"):
+            whom_to_ask(str(run), None, insecure=False)
+
+
+@pytest.mark.parametrize("folder", ["x\0y", "x" * 300])
+def test_a_key_folder_that_cannot_exist_is_one_line(run: Path, folder: str) -> None:
+    with pytest.raises(UsageError, match="cannot be read"):
+        token_of_learner(str(run), Path(folder))
 
 
 @pytest.mark.skipif(os.getuid() == 0, reason="root may read every folder")
