@@ -52,7 +52,7 @@ from millrace.protocol.errors import BadMessage, NoWorkers
 from millrace.protocol.logs.long_wait import LongWait
 from millrace.protocol.messages import Hello, Inquire, Refuse, Status, ToLearner, ToWorker, Weights
 from millrace.protocol.wire.codec import Buffer, encode
-from millrace.protocol.wire.learner_link import LearnerLink
+from millrace.protocol.wire.learner_link import LearnerLink, RefusedMessage
 
 log = logging.getLogger("millrace.learner")
 
@@ -263,6 +263,8 @@ class MemberServer:
         """The answer to one message. An error costs the sender its membership, but never ends the run."""
         try:
             match message:
+                case RefusedMessage():
+                    return ()
                 case BadMessage():
                     self.member_log.warn_limited(peer, f"message from {name_for_people(peer)!r}: {message}")
                     return self._coordinator.reject_message(peer, str(message), now)

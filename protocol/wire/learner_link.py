@@ -35,6 +35,10 @@ MAX_MESSAGES = 10_000
 MAX_REMEMBERED_KEYS = 10_000
 
 
+class RefusedMessage(BadMessage):
+    """A message whose key is no longer allowed. The link has answered it."""
+
+
 class LearnerLink:
     """The learner's end: one port, many workers."""
 
@@ -99,8 +103,8 @@ class LearnerLink:
         return any(ready is self._socket for ready, _ in poller.poll(max(0, int(timeout_s * 1000))))
 
     def receive(self) -> Iterator[tuple[bytes, ToLearner | Inquire | BadMessage]]:
-        """Messages that have arrived, each with its sender; at most MAX_MESSAGES. In place of an unreadable message, yields
-        the error.
+        """Messages that have arrived, each with its sender; at most MAX_MESSAGES. In place of an unreadable or a refused
+        message, yields the error, so that the caller can stop when it has listened for long enough.
         """
         sender_keys: list[str] | None = None if self.keyring is None else []
         for _ in range(MAX_MESSAGES):  # so that a flood can't block the learner
@@ -111,7 +115,8 @@ class LearnerLink:
             peer = bytes(frames[0])
             if sender_keys is not None:
                 peer = self._peer(peer, sender_keys[0])
-                if self._refuse_key(peer):
+                if why := self._refuse_key(peer):
+                    yield peer, RefusedMessage(why)
                     continue
             try:
                 yield peer, decode_to_learner(frames[1:], self.packed_bytes_limit)
@@ -138,10 +143,8 @@ class LearnerLink:
             del self._last_keys[next(iter(self._last_keys))]
         return b"%s\0%s" % (routing_id, key.encode())
 
-    def _refuse_key(self, peer: bytes) -> bool:
-        """If the peer's key is no longer allowed, count its message and answer with a `Refuse`. Returns whether the
-        key was refused.
-        """
+    def _refuse_key(self, peer: bytes) -> str:
+        """If the peer's key is no longer allowed, count its message and answer with a `Refuse`. Returns why, or ''."""
         why = self.rejection_reason(peer)
         if why:
             self.refused_messages += 1
@@ -153,7 +156,7 @@ class LearnerLink:
                     why,
                     suppressed_note(kept_back),
                 )
-        return bool(why)
+        return why
 
     def send(self, peer: bytes, frames: Sequence[Buffer]) -> bool:
         """Send a message. Returns False if the peer is gone or its queue is full."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import itertools
 import logging
 import socket as plain
 import threading
@@ -14,6 +15,7 @@ from pathlib import Path
 import pytest
 import zmq
 
+from millrace.learner.members.member_server import MemberServer
 from millrace.learner.members.membership import REMEMBERED
 from millrace.learner.rollouts.hub import Hub, HubSettings
 from millrace.learner.rollouts.lag_rule import Rounds
@@ -47,6 +49,7 @@ from millrace.protocol.wire.learner_link import LearnerLink
 from millrace.protocol.wire.worker_link import WorkerLink
 from tests.support.conversation.example_messages import example
 from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS, run_spec
+from tests.support.in_process.fake_processes import FakeProcesses
 
 DEADLINE_S = 5.0  # within so long both sides must have said what is wrong
 NOW = datetime(2026, 11, 21, 10, tzinfo=UTC)
@@ -627,6 +630,26 @@ def test_who_is_revoked_is_cut_off_at_once_and_told(net: Net, tmp_path: Path, ca
     assert again.problem is not None
     assert again.problem.final
     assert any("was revoked" in line for line in lines(caplog, "millrace.authenticator"))
+
+
+def test_messages_of_a_revoked_key_take_no_longer_than_a_turn(net: Net, tmp_path: Path) -> None:
+    folder = KeyFolder(tmp_path / "keys")
+    lab = Token.from_text(folder.new("lab", NOW).read_text(), "")
+    learner = net.learner(Keyring(folder.server(), folder.allowed(), folder))
+    worker = net.worker(learner, lab, "w0")
+    worker.send(encode(Inquire()))
+    ((peer, _),) = heard(learner)
+    folder.revoke("lab", NOW)
+    until(lambda: learner.rejection_reason(peer) != "")
+    for _ in range(50):
+        worker.send(encode(Inquire()))
+    hub = hub_of(learner)
+    now = itertools.count()
+    server = MemberServer(learner, hub.coordinator, hub, FakeProcesses(), clock=lambda: float(next(now)))
+    server.receive(DEADLINE_S, turn_s=3.0)
+    assert learner.refused_messages <= 4
+    serve(hub, lambda: learner.refused_messages == 50)
+    assert not hub.coordinator.members
 
 
 def test_revoking_is_noticed_while_the_learner_learns(net: Net, tmp_path: Path) -> None:
