@@ -18,6 +18,7 @@ from millrace.protocol.env_spec import FACTORY, REGISTER_IT
 from millrace.protocol.errors import UsageError
 from millrace.protocol.keys.key_folder import Keyring
 from millrace.protocol.logs.notices import log_notice
+from millrace.protocol.machine.open_files import raise_limit
 from millrace.protocol.wire.learner_link import LearnerLink
 
 log = logging.getLogger("millrace.learner")
@@ -43,6 +44,7 @@ class Bound:
 
 def listen(where: Listening, resources: ExitStack, code: str = "") -> Bound:
     """Bind `where.bind` for workers that are started elsewhere. For `code` and errors, see `bind`."""
+    raise_limit()
     keyring = keyring_for(where, datetime.now(UTC).replace(microsecond=0))
     return bind(where.bind, keyring, resources, code, LINGER_ELSEWHERE_S)
 
