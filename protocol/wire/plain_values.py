@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 import sys
+from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
@@ -22,6 +23,7 @@ from millrace.protocol.errors import BadMessage, safe_repr
 DTYPE_KINDS = "biufcSUmM"
 MAX_DEPTH = 32
 MAX_REPR = 1000  # characters
+MOST_WITH_ONE_HASH = 64  # limit on the keys of a dict with the same hash, because Python compares each with all others
 
 _TUPLE, _PAIRS, _ARRAY, _SCALAR, _OBJECTS, _INT, _COMPLEX, _REPR = range(1, 9)
 
@@ -154,6 +156,8 @@ def _from_extension(code: int, data: bytes, inner: Callable[[bytes], Any]) -> An
             return tuple(inner(data))
         case 2:  # _PAIRS
             keys, values = inner(data)
+            if keys and max(Counter(map(hash, keys)).values()) > MOST_WITH_ONE_HASH:
+                raise BadMessage("plain value: expected a dict that has keys with different hashes")
             return dict(zip(keys, values, strict=True))
         case 3:  # _ARRAY
             dtype, shape, raw = inner(data)
