@@ -81,6 +81,7 @@ class Audience:
                 self.progress(),
                 rollouts=tuple(one.rollout for one in rollouts),
                 incarnations=tuple(one.incarnation for one in rollouts),
+                fresh=tuple(one.fresh for one in rollouts),
             )
             if not self._callbacks.on_rollouts(progress):
                 return False

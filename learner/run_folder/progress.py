@@ -10,6 +10,7 @@ from typing import Any, SupportsFloat
 
 from millrace.learner.run_folder.callback_requests import Requests
 from millrace.learner.run_folder.results import EvaluatedPolicy, Evaluation, FactMean, fact_metrics
+from millrace.protocol.arrays import Bools
 from millrace.protocol.errors import UsageError
 from millrace.protocol.progress import RunProgress
 from millrace.protocol.rollout import Episode, Rollout
@@ -17,7 +18,7 @@ from millrace.protocol.rollout import Episode, Rollout
 ENV_STEPS_KEY = "time/total_timesteps"
 UPDATES_KEY = "time/iterations"
 RETURN_KEY = "rollout/ep_rew_mean"
-NOT_SHOWN = ("at_s", "settings", "episodes", "rollouts", "incarnations", "requests")
+NOT_SHOWN = ("at_s", "settings", "episodes", "rollouts", "incarnations", "fresh", "requests")
 """Fields of `Progress` that a log of the progress leaves out."""
 Row = Mapping[str, float | None]
 
@@ -69,6 +70,10 @@ class Progress(RunProgress, frozen=True, kw_only=True):
     incarnations: tuple[int, ...] = ()
     """only in `Callback.on_rollouts`: for each rollout, the incarnation of its lane, which rises when the lane gets new
     copies; `Rollout.sequence` then starts from 0 again
+    """
+    fresh: tuple[Bools | bool, ...] = ()
+    """only in `Callback.on_rollouts`: for each rollout, [N], True for env copies that started afresh, so that its first row
+    doesn't continue the lane's previous rollout; a single value applies to all copies
     """
     requests: Requests | None = None
     """the requests of callbacks"""

@@ -3,8 +3,9 @@
 Rule: every valid row is in exactly one whole episode, or waits for its episode to end (`waiting`), or is counted as left out
     (`left_out`). A reset row is not part of an episode. An episode that spans several rollouts is assembled only if all of
     them arrived, in order, and each continues the previous one, so that no episode has a gap. (The first rollout of an
-    incarnation continues the previous rollout if another worker took over the lane. A client that owns its loop makes steps
-    between two rollouts, so the second doesn't continue the first; its first row is then not valid.)
+    incarnation may continue an earlier rollout, of another worker or from before a resume; `fresh` tells in which env
+    copies it doesn't. A client that owns its loop makes steps between two rollouts, so the second doesn't continue the
+    first; its first row is then not valid.)
 """
 
 from __future__ import annotations
@@ -67,13 +68,13 @@ class _LaneState:
     def waiting(self) -> int:
         return sum(len(fragment.reward) for fragments in self.running for fragment in fragments or ())
 
-    def continued_by(self, rollout: Rollout) -> Bools:
+    def continued_by(self, rollout: Rollout, fresh: Bools | bool) -> Bools:
         """[N] whether the rollout continues the newest one in each env copy.
 
-        It does if its first observation is the newest rollout's last one, and if it begins with a reset row exactly when
-        that rollout ended an episode.
+        It does if the copy isn't `fresh`, if its first observation is the newest rollout's last one, and if it begins with
+        a reset row exactly when that rollout ended an episode.
         """
-        continued: Bools = rollout.valid[0] != self.ended
+        continued: Bools = (rollout.valid[0] != self.ended) & np.logical_not(fresh)
         for last, leaf in zip(self.last_obs, rollout.obs, strict=True):
             continued &= (last == leaf[0]).reshape(len(last), -1).all(1)
         return continued
@@ -85,7 +86,7 @@ class EpisodeAssembler:
     def __init__(self, to_env_action: Callable[[Array], tuple[Array, ...]]) -> None:
         """`to_env_action` converts actions of rollouts, [k, *action], to the arrays [k, *part] that environments take."""
         self.left_out = 0
-        """number of valid rows in episodes that stay incomplete, because a rollout was dropped or the lane moved"""
+        """number of valid rows in episodes that stay incomplete, because rows are missing or an env copy started afresh"""
         self._to_env_action = to_env_action
         self._lanes: dict[int, _LaneState] = {}
 
@@ -94,16 +95,18 @@ class EpisodeAssembler:
         """Number of valid rows in episodes that have not ended."""
         return sum(lane.waiting for lane in self._lanes.values())
 
-    def add(self, rollout: Rollout, incarnation: int) -> list[RecordedEpisode]:
+    def add(self, rollout: Rollout, incarnation: int, fresh: Bools | bool) -> list[RecordedEpisode]:
         """The episodes that end in this rollout, in the order in which they end.
 
-        `incarnation`: the incarnation of the lane when the rollout was collected.
+        `incarnation`: the incarnation of the lane when the rollout was collected. `fresh`: [N], or a single value for all
+        env copies, True for copies that don't continue the lane's previous rollout.
         """
         lane = self._lanes.get(rollout.lane)
         if lane is not None and (incarnation, rollout.sequence) < (lane.incarnation, lane.sequence):
             self.left_out += rollout.env_steps  # the rollout arrived out of order
             return []
-        begins = rollout.valid[0] & (rollout.sequence == 0)
+        # In its first rollout, a fresh copy begins with a step, and any other copy with a reset row or within an episode.
+        begins = (rollout.valid[0] == fresh) & (rollout.sequence == 0)
         new: list[list[_Fragment] | None] = [[] if one else None for one in begins.tolist()]
         follows = lane is not None and (incarnation, rollout.sequence) == (lane.incarnation, lane.sequence)
         if lane is None or not (follows or rollout.sequence == 0):  # a rollout in between was dropped
@@ -111,7 +114,7 @@ class EpisodeAssembler:
             lane = self._lanes[rollout.lane] = _LaneState(incarnation, rollout.sequence, new)
         else:  # another worker may have continued the lane, with all of its copies or only some
             waiting = lane.waiting
-            continued = lane.continued_by(rollout)
+            continued = lane.continued_by(rollout, fresh)
             running = [one if continued[n] else new[n] for n, one in enumerate(lane.running)]
             lane = self._lanes[rollout.lane] = _LaneState(incarnation, rollout.sequence, running)
             self.left_out += waiting - lane.waiting

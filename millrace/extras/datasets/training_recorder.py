@@ -18,7 +18,6 @@ from millrace.protocol.envs.action_masks import without_mask
 from millrace.protocol.envs.description import DescribedEnv
 from millrace.protocol.envs.env_actions import action_leaves_of
 from millrace.protocol.errors import RunError
-from millrace.protocol.rollout import Rollout
 from millrace.protocol.specs import RunSpec
 
 log = logging.getLogger("millrace.learner")
@@ -46,8 +45,10 @@ class TrainingRecorder(Callback):
         if self._refused is not None:
             return
         try:
-            for rollout, incarnation in zip(progress.rollouts, progress.incarnations, strict=True):
-                self._add(rollout, incarnation)
+            for arrived in zip(progress.rollouts, progress.incarnations, progress.fresh, strict=True):
+                for episode in self._assembler.add(*arrived):
+                    self._dataset.add(episode)
+                    self._episodes += 1
         except RunError as error:
             log.warning("%s; it is removed, and training continues", error)
             self._dataset.discard()
@@ -63,11 +64,6 @@ class TrainingRecorder(Callback):
             self._finish()
         elif not progress.cut_short:
             raise self._refused
-
-    def _add(self, rollout: Rollout, incarnation: int) -> None:
-        for episode in self._assembler.add(rollout, incarnation):
-            self._dataset.add(episode)
-            self._episodes += 1
 
     def _finish(self) -> None:
         if self._episodes:

@@ -124,7 +124,7 @@ def taken(action: Array) -> tuple[Array, ...]:
 @given(rollouts())
 def test_the_episodes_of_a_copy_are_its_rows_without_the_resets(stream: list[tuple[int, Rollout]]) -> None:
     assembler = EpisodeAssembler(taken)
-    episodes = [episode for incarnation, rollout in stream for episode in assembler.add(rollout, incarnation)]
+    episodes = [episode for each in stream for episode in assembler.add(each[1], each[0], fresh=each[1].sequence == 0)]
     for episode in episodes:
         check_whole(episode)
     steps = sum(rollout.env_steps for _, rollout in stream)
@@ -165,7 +165,7 @@ def test_an_episode_has_no_hole_whatever_is_dropped_or_late(stream: list[tuple[i
     episodes, steps = [], 0
     for i in came:
         incarnation, rollout = stream[i]
-        episodes += assembler.add(rollout, incarnation)
+        episodes += assembler.add(rollout, incarnation, fresh=rollout.sequence == 0)
         steps += rollout.env_steps
     for episode in episodes:
         check_whole(episode)
@@ -192,7 +192,7 @@ def test_an_episode_has_no_hole_where_steps_are_in_no_rollout(
             gaps.remove(incarnation)
         rollout = msgspec.structs.replace(rollout, sequence=sequences[incarnation])
         sequences[incarnation] += 1
-        episodes += assembler.add(rollout, incarnation)
+        episodes += assembler.add(rollout, incarnation, fresh=rollout.sequence == 0)
         steps += rollout.env_steps
     for episode in episodes:
         check_whole(episode)
@@ -202,10 +202,10 @@ def test_an_episode_has_no_hole_where_steps_are_in_no_rollout(
 def test_what_is_kept_is_a_copy() -> None:
     ((_, first), (_, second)) = lives([[[0], [0], [0], [1]]], steps=2)
     assembler = EpisodeAssembler(lambda action: (action,))
-    assert assembler.add(first, 0) == []
+    assert assembler.add(first, 0, fresh=True) == []
     for array in (*first.obs, first.action, first.reward):
         array[...] = 77
-    (episode,) = assembler.add(second, 0)
+    (episode,) = assembler.add(second, 0, fresh=False)
     assert episode.obs[1].tolist() == [0, 1, 2, 3, 4]
     assert episode.action[0].tolist() == [0, 1, 2, 3]
     assert (assembler.waiting, assembler.left_out) == (0, 0)
@@ -213,7 +213,7 @@ def test_what_is_kept_is_a_copy() -> None:
 
 def test_the_episode_that_ended_first_comes_first() -> None:
     ((_, rollout),) = lives([[[0, 0], [0, 1], [1, 0], [0, 1]]], steps=4)
-    episodes = EpisodeAssembler(taken).add(rollout, 0)
+    episodes = EpisodeAssembler(taken).add(rollout, 0, fresh=True)
     assert [(int(episode.obs[0][0, 1]), episode.length) for episode in episodes] == [(1, 2), (0, 3), (1, 1)]
 
 
@@ -254,6 +254,23 @@ class Box(gymnasium.Env[Any, Any]):
         return {"step": self.steps - 1, self.key: inner, "camera": random.integers(0, 256, (4, 5), np.uint8)}
 
 
+class Blindfolded(gymnasium.Env[Any, Any]):
+    """All observations are equal. Episodes of 5 steps."""
+
+    observation_space = spaces.Discrete(1)
+    action_space = spaces.Discrete(2)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.steps = 0
+        return 0, {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self.steps += 1
+        return 0, 1.0, self.steps == 5, False, {}
+
+
+gymnasium.register("millrace-tests/Blindfolded-v0", entry_point=lambda **_: Blindfolded())
 gymnasium.register("millrace-tests/Box-v0", entry_point=lambda **kwargs: Box(**kwargs))
 
 
@@ -522,7 +539,11 @@ def test_nothing_is_left_of_a_training_dataset_that_cannot_be_written(
     run = run_of(f"{TOY}Countdown-v0", T=6, N=1)  # an episode, and the reset after it
     collector = Collector(run, random_policy(run.policy))
     first, second = (
-        Progress(rollouts=(collector.collect([Assignment(n, 0, 0, n, n)], 0, 1, no_pulse)[0],), incarnations=(0,))
+        Progress(
+            rollouts=(collector.collect([Assignment(n, 0, 0, n, n)], 0, 1, no_pulse)[0],),
+            incarnations=(0,),
+            fresh=(n == 0,),
+        )
         for n in range(2)
     )
     recorder = TrainingRecorder("ns/countdown-v0", described(run.env), run, "a test")
@@ -555,27 +576,66 @@ def test_an_episode_that_another_worker_goes_on_with_is_recorded_whole() -> None
     found: dict[str, list[RecordedEpisode]] = {"moved": [], "whole": []}
     for n in range(12):
         (rollout,) = stayed.collect([Assignment(n, 0, 0, n, n)], 0, 1, no_pulse)
-        found["whole"] += whole.add(rollout, 0)
+        found["whole"] += whole.add(rollout, 0, fresh=n == 0)
         incarnation, sequence = (0, n) if n < 5 else (1, n - 5)
         if incarnation:
             past = history.past(0) if not sequence else None
             (rollout,) = went.collect([Assignment(n, 0, 1, sequence, n, past=past)], 0, 1, no_pulse)
-        else:
-            history.add(rollout, b"")
-        found["moved"] += moved.add(rollout, incarnation)
+        fresh = history.add(rollout, b"")
+        found["moved"] += moved.add(rollout, incarnation, fresh | (n == 0))
     assert moved.left_out == 0
     assert len(found["moved"]) == len(found["whole"]) > 3
     for one, other in zip(found["moved"], found["whole"], strict=True):
         np.testing.assert_array_equal(one.obs[0], other.obs[0])
 
 
+@pytest.mark.parametrize(
+    ("T", "steps_left_out"),
+    [
+        pytest.param(3, 2, id="within an episode"),
+        pytest.param(5, 0, id="before a reset"),
+        pytest.param(6, 5, id="after one"),
+    ],
+)
+def test_after_a_resume_episodes_are_recorded_whose_reset_came_after_it(T: int, steps_left_out: int) -> None:
+    """Episodes of 5 steps, each followed by a row of its reset. The run is resumed after the first rollout."""
+    run = run_of(f"{TOY}Countdown-v0", T=T, N=2)
+    history = LaneHistory.of_nothing(2, most_steps=500)
+    (rollout,) = Collector(run, random_policy(run.policy)).collect([Assignment(0, 0, 0, 0, 0)], 0, 1, no_pulse)
+    history.add(rollout, b"")
+    resumed = Collector(run, random_policy(run.policy))
+    assembler, episodes = EpisodeAssembler(action_leaves_of(run.policy)), []
+    for n in range(6):
+        past = None if n else history.past(0)
+        (rollout,) = resumed.collect([Assignment(n, 0, 1, n, n + 1, past=past)], 0, 1, no_pulse)
+        episodes += assembler.add(rollout, 1, history.add(rollout, b""))
+    assert len(episodes) > 3
+    assert {(episode.length, float(episode.obs[0][0, 0])) for episode in episodes} == {(5, 1.0)}
+    assert assembler.left_out == 2 * steps_left_out
+
+
+def test_an_episode_that_was_lost_is_not_joined_with_the_next_one_even_if_all_observations_are_equal() -> None:
+    run = run_of("millrace-tests/Blindfolded-v0", T=3, N=2)
+    history = LaneHistory.of_nothing(2, most_steps=500)
+    assembler, episodes = EpisodeAssembler(action_leaves_of(run.policy)), []
+    for incarnation in range(2):
+        collector = Collector(run, random_policy(run.policy))
+        for n in range(5):
+            past = history.past(0) if incarnation and not n else None
+            (rollout,) = collector.collect([Assignment(n, 0, incarnation, n, n, past=past)], 0, 1, no_pulse)
+            fresh = history.add(rollout, b"") | (incarnation == n == 0)
+            episodes += assembler.add(rollout, incarnation, fresh)
+        history.start_anew(1, from_past=False)  # the environment has failed
+    assert [episode.length for episode in episodes] == [5] * 8
+    assert assembler.left_out == assembler.waiting == 2 * 3
+
+
 def test_a_run_that_ends_before_a_whole_episode_leaves_no_dataset(root: Path, caplog: pytest.LogCaptureFixture) -> None:
     run = run_of(f"{TOY}Countdown-v0", T=3, N=1)
     collector = Collector(run, random_policy(run.policy))
     recorder = TrainingRecorder("ns/countdown-v0", described(run.env), run, "a test")
-    recorder.on_rollouts(
-        Progress(rollouts=tuple(collector.collect([Assignment(0, 0, 0, 0, 0)], 0, 1, no_pulse)), incarnations=(0,))
-    )
+    (rollout,) = collector.collect([Assignment(0, 0, 0, 0, 0)], 0, 1, no_pulse)
+    recorder.on_rollouts(Progress(rollouts=(rollout,), incarnations=(0,), fresh=(True,)))
     recorder.on_end(Progress())
     assert caplog.messages == ["dataset ns/countdown-v0: 0 training episodes; 3 steps of others left out"]
     assert everything(root) == set()

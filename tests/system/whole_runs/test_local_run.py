@@ -229,19 +229,23 @@ def test_training_episodes_are_recorded_whole(
 ) -> None:
     minari = pytest.importorskip("minari")
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "datasets"))
-    folder = run(tmp_path, "CartPole-v1", steps=3_000, max_lag=1, record="cartpole/training-v0", **SMALL)
-    dataset = minari.load_dataset("cartpole/training-v0")
-    episodes = list(dataset.iterate_episodes())
-    assert len(episodes) > 20
-    rows = read_rows(folder / "metrics.jsonl")
-    for episode in episodes:
-        assert len(episode.observations) == len(episode.rewards) + 1
-        assert bool(episode.terminations[-1]) or bool(episode.truncations[-1])
-        assert not (episode.terminations[:-1] | episode.truncations[:-1]).any()
-        assert np.abs(episode.observations[0]).max() <= 0.05, "it does not begin with a reset of CartPole"
-    said = re.search(r"([\d,]+) steps of others left out", caplog.text)
-    left_out = int(said[1].replace(",", "")) if said else 0
-    assert dataset.total_steps + left_out == rows[-1]["time/total_timesteps"]
+    folder: Path | None = None
+    recorded = 0
+    for name, steps in (("training", 3_000), ("resumed", 6_000)):
+        caplog.clear()
+        env = "" if folder else "CartPole-v1"
+        folder = run(tmp_path, env, resume=folder, steps=steps, max_lag=1, record=f"cartpole/{name}-v0", **SMALL)
+        dataset = minari.load_dataset(f"cartpole/{name}-v0")
+        episodes = list(dataset.iterate_episodes())
+        assert len(episodes) > 20
+        for episode in episodes:
+            assert len(episode.observations) == len(episode.rewards) + 1
+            assert bool(episode.terminations[-1]) or bool(episode.truncations[-1])
+            assert not (episode.terminations[:-1] | episode.truncations[:-1]).any()
+            assert np.abs(episode.observations[0]).max() <= 0.05, "it does not begin with a reset of CartPole"
+        said = re.search(r"([\d,]+) steps of others left out", caplog.text)
+        recorded += dataset.total_steps + (int(said[1].replace(",", "")) if said else 0)
+        assert recorded == read_rows(folder / "metrics.jsonl")[-1]["time/total_timesteps"]
 
 
 def test_a_killed_worker_is_replaced_and_the_run_ends_well(

@@ -137,7 +137,7 @@ def test_a_lost_step_is_in_no_valid_row(at: int) -> None:
         np.testing.assert_array_equal(reward, valid)
         np.testing.assert_allclose(np.diff(left, axis=0)[valid[:-1] & valid[1:]], -0.2, atol=1e-6)
         assert (left[1:][~valid[:-1] & valid[1:]] == 1.0).all(), "an episode began amid another"
-        whole += [episode for rollout in rollouts for episode in assembler.add(rollout, 0)]
+        whole += [episode for rollout in rollouts for episode in assembler.add(rollout, 0, fresh=rollout.sequence == 0)]
     assert {episode.length for episode in whole if episode.terminated[-1]} == {5}
     cut = [episode.length for episode in whole if episode.truncated[-1]]
     assert cut == [] if at in (0, 3, 5, 6) else cut == [at if at < 5 else at - 6] * 2
