@@ -175,10 +175,13 @@ class SeatedEnv(gymnasium.Env[SeatStep, Sequence[Any]]):
     def _advance(self, actions: Sequence[Any], step: SeatStep) -> bool:
         """Step the environment, and write the result into `step`. Returns whether the episode is over."""
 
-    def owner(self, name: str) -> Any:
-        """The outermost PettingZoo wrapper that itself has this attribute; the environment if no wrapper has it."""
+    def owner(self, name: str, last: tuple[type, ...] = ()) -> Any:
+        """The outermost PettingZoo wrapper that itself has this attribute; the environment if no wrapper has it.
+
+        Wrappers inside an object of one of the types in `last` aren't searched.
+        """
         owner = self.env
-        while name not in dir(owner):
+        while name not in dir(owner) and not isinstance(owner, last):
             inner = getattr(owner, "env", None) or getattr(owner, "aec_env", None)  # the latter of `parallel_wrapper_fn`
             if inner is None:
                 break

@@ -364,7 +364,7 @@ def without_order_check(env: gymnasium.Env[Any, Any], which: EnvCopy = FIRST_COP
 
 def set_attribute(copy: int | None, env: Any, name: str, value: Any) -> None:
     """Set a public attribute of the environment or of one of its wrappers. Raises `CopyFailed` if none has it."""
-    owner = env.owner(name) if isinstance(env, SeatedEnv) else env
+    owner = env.owner(name, last=(ResetAhead,)) if isinstance(env, SeatedEnv) else env
     while not hasattr(owner, name) and isinstance(owner, gymnasium.Wrapper | VectorWrapper):
         if isinstance(owner, ResetAhead):
             for instance in owner.instances():

@@ -31,7 +31,12 @@ def repeatable(env: gymnasium.Env[Any, Any]) -> Any | None:
             return None  # two instances take turns, each with its own generator
         inner = inner.env
     if isinstance(inner, SeatedEnv):
-        inner = getattr(inner.env, "unwrapped", inner.env)
+        layer = inner.env
+        inner = getattr(layer, "unwrapped", layer)
+        while layer is not inner:
+            if isinstance(layer, ResetAhead):
+                return None
+            layer = getattr(layer, "env", inner)
     return inner
 
 

@@ -8,13 +8,16 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
-from gymnasium.spaces import Box, Discrete
+from gymnasium.spaces import Box, Discrete, Tuple
 
+from millrace.protocol.envs.seats import seated
+from millrace.protocol.envs.tuple_of_agents import TupleOfAgents
 from millrace.protocol.errors import UsageError
 from millrace.protocol.random_streams import Purpose, env_seed
 from millrace.protocol.wire.plain_values import pack
-from millrace.workers.copies.env_copies import LoopedCopies
+from millrace.workers.copies.env_copies import CANNOT_RESTART, LoopedCopies
 from millrace.workers.copies.reset_ahead import ResetAhead
+from millrace.workers.copies.seated_copies import SeatedCopies
 from tests.support.in_process.collectors import no_pulse
 
 DEADLINE_S = 20.0
@@ -27,8 +30,8 @@ class Traced(gymnasium.Env[Any, Any]):
     resets_wait_for = threading.Event()
     fails = False
     patience_s = DEADLINE_S
-    observation_space = Box(0, 1, (1,), np.float64)
-    action_space = Discrete(2)
+    observation_space: gymnasium.Space[Any] = Box(0, 1, (1,), np.float64)
+    action_space: gymnasium.Space[Any] = Discrete(2)
     resetting = False  # an instance is being reset
     set_meanwhile = False  # an attribute was set during a reset
 
@@ -70,7 +73,23 @@ class Traced(gymnasium.Env[Any, Any]):
         self.closed = True
 
 
+class TracedPair(Traced):
+    """The same for two agents, which both see everything."""
+
+    observation_space = Tuple([Traced.observation_space] * 2)
+    action_space = Tuple([Traced.action_space] * 2)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        seen, info = super().reset(seed=seed, options=options)
+        return (seen, seen), info
+
+    def step(self, action: Any) -> Any:
+        seen, reward, *over_and_info = super().step(action)
+        return (seen, seen), [reward, reward], *over_and_info
+
+
 gymnasium.register("tests/Traced-v0", f"{__name__}:Traced", disable_env_checker=True)
+gymnasium.register("tests/TracedPair-v0", f"{__name__}:TracedPair", disable_env_checker=True)
 
 
 @pytest.fixture(autouse=True)
@@ -136,17 +155,42 @@ def test_what_the_prepared_reset_raises_arrives_at_the_next_reset() -> None:
     env.close()
 
 
-def test_attributes_reach_both_instances_and_the_prepared_episode_has_the_old_ones() -> None:
-    made = gymnasium.make("tests/Traced-v0")
-    copies = LoopedCopies([lambda: ResetAhead(made)], no_pulse)
+def copies_of(agents: int, restart_episodes: int = 0) -> LoopedCopies:
+    """One copy that resets ahead, with one agent or with two in tuples."""
+    if agents == 1:
+        return LoopedCopies(
+            [lambda: ResetAhead(gymnasium.make("tests/Traced-v0"))], no_pulse, restart_episodes=restart_episodes
+        )
+
+    def make() -> gymnasium.Env[Any, Any]:
+        return seated(TupleOfAgents(ResetAhead(gymnasium.make("tests/TracedPair-v0"))), "two")
+
+    return SeatedCopies([make], no_pulse, ("agent_0", "agent_1"), restart_episodes=restart_episodes)
+
+
+@pytest.mark.parametrize("agents", [1, 2])
+def test_attributes_reach_both_instances_and_the_prepared_episode_has_the_old_ones(agents: int) -> None:
+    copies = copies_of(agents)
     copies.reset([1], no_pulse)
     for level in (1, 2):
         copies.assign("level", pack(level), no_pulse)
         for _ in range(6):  # two episodes
-            copies.step(np.zeros(1, np.int64), no_pulse)
+            copies.step(np.zeros(agents, np.int64), no_pulse)
     copies.close()
     assert [each.level for each in Traced.made] == [2, 2]
     assert [each.levels for each in Traced.made] == [[0, 1, 1, 2], [1, 2]]  # of each reset
+
+
+@pytest.mark.parametrize("agents", [1, 2])
+def test_a_copy_that_resets_ahead_is_never_created_anew(agents: int) -> None:
+    copies = copies_of(agents, restart_episodes=1)
+    copies.reset([1], no_pulse)
+    for _ in range(9):  # three episodes
+        copies.step(np.zeros(agents, np.int64), no_pulse)
+    assert copies.note == CANNOT_RESTART
+    assert copies.begun([]) == {0: None}
+    copies.close()
+    assert len(Traced.made) == 2
 
 
 def test_an_attribute_is_not_set_during_a_reset(monkeypatch: pytest.MonkeyPatch) -> None:
