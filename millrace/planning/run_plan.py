@@ -16,6 +16,7 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
+from millrace.learner.config.presets import added
 from millrace.planning.in_words import counted, number_in_words, time_in_words
 from millrace.planning.measurements import Machine, Measurements, Overheads
 from millrace.planning.recommendation import ChosenSetting
@@ -94,7 +95,7 @@ def train_command(
     """The command that trains with the chosen settings."""
     words = ["millrace", "train", env]
     if env_kwargs:
-        words += ["--env-kwargs", *(str(word) for pair in env_kwargs.items() for word in pair)]
+        words += ["--env-kwargs", *added(env_kwargs, {})]
     if wrappers:
         words += ["--wrappers", *wrappers]
     for each in chosen:

@@ -21,6 +21,7 @@ from millrace.planning.recommendation import (
     reasons,
 )
 from millrace.planning.run_plan import train_command
+from millrace.protocol.env_spec import Scalar
 from tests.millrace.planning.made_up import MACHINE, OVERHEADS, PPO, REPLAY, TRIED, chosen, measured, rate, situation
 
 WAITS_S = (0.0, 1e-4, 1e-3, 1e-2, 1e-1, 1.0)
@@ -160,15 +161,21 @@ def test_each_setting_has_a_reason_and_the_command_is_one_that_train_takes(wait_
     found = chosen(where, learning)
     settings = (ChosenSetting("algo", "ppo", "because"), *reasons(found, learning, where, lambda sizes: rate(sizes, where)))
     assert all(each.why and "\n" not in each.why for each in settings)
-    command = train_command(
-        "CartPole-v1", {"render_mode": "rgb array"}, ("gymnasium.wrappers:FlattenObservation",), settings
-    )
+    env_kwargs: dict[str, Scalar] = {
+        "render_mode": "rgb array",
+        "number": "8",
+        "port": "{5000 + slot}",
+        "wind": False,
+        "g": 9.8,
+    }
+    command = train_command("CartPole-v1", env_kwargs, ("gymnasium.wrappers:FlattenObservation",), settings)
     program, train, *argv = shlex.split(command)
     assert (program, train) == ("millrace", "train")
     assert f"--max-lag {found.max_lag} " in f"{command} "
     config, _ = read_config("train", argv)
     assert (config.workers, config.envs, config.lanes) == (found.workers, found.envs, found.lanes)
-    assert config.env_kwargs == {"render_mode": "rgb array"}
+    assert config.env_kwargs == env_kwargs
+    assert config.env_kwargs["wind"] is False
 
 
 def test_more_machines_have_as_many_of_all_and_updates_as_often_as_they_can() -> None:
