@@ -72,6 +72,8 @@ class Measurements(msgspec.Struct, frozen=True, kw_only=True):
     observation_bytes: int = 0
     side_by_side: tuple[StepCosts, ...]
     """costs of a step for each number of workers that was tried, in ascending order; never empty"""
+    copies_worked: int = 1
+    """the largest number of copies that were stepped side by side without a problem"""
     reset_s: float = 0.0
     """mean wall time of a reset"""
     reset_cpu_s: float = 0.0

@@ -304,6 +304,7 @@ def _with_all(measured: Measurements, sessions: Sequence[_SteppedCopies]) -> Mea
         reset_s=float((resets[:, 1] - resets[:, 3]).mean()),
         reset_cpu_s=float((resets[:, 2] + share * resets[:, 1]).mean()),
         resets=len(resets),
+        copies_worked=max((len(each.traces) for each in sessions if each.is_whole), default=1),
         episode_steps=steps / sum(map(len, later)) if later else sessions[0].time_limit,
         repeats=_repeats([trace for session in sessions for trace in session.traces]),
         findings=tuple(session.finding for session in sessions if session.wrong),

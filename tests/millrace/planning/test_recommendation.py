@@ -76,6 +76,21 @@ def test_licences_bound_copies(wait_s: float, cpu_s: float, licences: int) -> No
     assert found.workers <= found.lanes
 
 
+@pytest.mark.parametrize("learning", [PPO, REPLAY])
+@pytest.mark.parametrize(("wait_s", "cpu_s"), [(0.01, 1e-4), (0.0, 0.003), (0.0, 1e-5)])
+@pytest.mark.parametrize("worked", [1, 3])
+def test_after_a_failure_no_more_copies_are_chosen_than_have_worked(
+    worked: int, wait_s: float, cpu_s: float, learning: Learning
+) -> None:
+    found = measured(wait_s=wait_s, cpu_s=cpu_s, tried=worked, copies_worked=worked, findings=("2 copies: no licence",))
+    where = situation(found, machine=Machine(cores=16, free_bytes=64 << 30))
+    sizes = chosen(where, learning)
+    assert sizes.envs <= worked
+    assert sizes.workers <= sizes.lanes <= sizes.envs
+    why = {each.name: each.why for each in reasons(sizes, learning, where, lambda sizes: rate(sizes, where))}
+    assert why["envs"] == "more copies did not work side by side" or sizes.envs < worked
+
+
 def test_if_the_learner_is_the_limit_no_more_copies_are_chosen_than_it_can_use() -> None:
     slow = msgspec.structs.replace(OVERHEADS, update_s=0.02)
     found = chosen(situation(measured(wait_s=0.05), slow), REPLAY)

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import shlex
+import time
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -92,6 +95,41 @@ def test_a_crash_is_a_line_and_not_the_end(name: str, after: int) -> None:
     assert all("\n" not in line for line in plan.measured.findings)
     assert plan.measured.findings[0] in plan.advice
     assert plan.measured.alone.steps >= after // 2
+    assert plan.settings["envs"] <= plan.measured.copies_worked
+
+
+class Licensed(gymnasium.Env[Any, Any]):
+    """Computes for 3 ms in each step. Only one copy may exist on this machine."""
+
+    observation_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
+    action_space = gymnasium.spaces.Discrete(2)
+
+    def __init__(self, licence: str) -> None:
+        self._licence = os.open(licence, os.O_CREAT | os.O_RDWR)
+        fcntl.flock(self._licence, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action: Any) -> Any:
+        until_s = time.process_time() + 0.003
+        while time.process_time() < until_s:
+            pass
+        return np.zeros(1, np.float32), 0.0, False, False, {}
+
+    def close(self) -> None:
+        os.close(self._licence)
+
+
+def test_a_plan_for_an_environment_of_which_a_second_copy_fails_has_one_copy(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("millrace.planning.plan.usable_cores", lambda: 2)
+    plan = millrace.plan(Licensed, env_kwargs={"licence": str(tmp_path / "licence")}, seconds=2 * BRIEF_S)
+    assert plan.measured.copies_worked == 1
+    assert any(line.startswith("2 copies side by side: ") for line in plan.advice)
+    assert (plan.settings["envs"], plan.settings["workers"], plan.settings["lanes"]) == (1, 1, 1)
 
 
 def test_if_no_step_can_be_made_the_error_says_why() -> None:
