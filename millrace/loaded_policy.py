@@ -111,9 +111,10 @@ class LoadedPolicy:
             observation: An element of the environment's observation space, or n of them: arrays [n, *leaf]. A Dict or Tuple
                 observation is a dict or tuple of such arrays. The policy normalizes it if it was trained with normalization.
             first: For a recurrent policy: whether this observation is the first of an episode, as a bool or an array [n].
-            mask: Which actions are allowed: [choices] bool or int8, as in `info["action_mask"]`, or [n, choices]. If it is
-                None, a policy that was trained with masks in its Dict observations reads them there; otherwise all actions
-                are allowed.
+            mask: Which actions are allowed, in the form of `info["action_mask"]`: [choices] bool or int8, or a tuple with an
+                array for each entry of the action; or the masks of n observations, such as [n, choices]. If it is None, a
+                policy that was trained with masks in its Dict observations reads them there; otherwise all actions are
+                allowed.
 
         Raises `UsageError` if the observation isn't in the space, isn't finite, or has another number of copies than the
         `reset` before it; or if the mask has a wrong shape or allows no action.
@@ -168,14 +169,16 @@ class LoadedPolicy:
         """The mask as an array [1, n, choices]. Raises `UsageError` if it has a wrong shape or dtype or allows no action."""
         action = self.spec.action
         size = action.choices
-        try:
-            given = np.asarray(mask)
-        except (ValueError, TypeError):  # raised for rows of different lengths
-            given = np.asarray(None)
-        if not size or given.dtype.kind not in "biu" or given.shape not in ((size,), (n, size)):
+        parts = _parts_of_mask(mask, n)
+        total = sum(part.size for part in parts)
+        rows = 1 if total == size else n
+        are_bits = all(part.dtype.kind in "biu" and (rows == 1 or len(part) == rows) for part in parts)
+        if not size or total != rows * size or not are_bits:
             expected = f"{size} zeros and ones of int8 or bool, or [{n}, {size}]" if size else "none for this action space"
-            raise UsageError(f"mask: expected {expected}, got {given.dtype}{list(given.shape)}")
-        allowed: Bools = np.broadcast_to(given.astype(bool), (1, n, size))
+            got = ", ".join(f"{part.dtype}{list(part.shape)}" for part in parts)
+            raise UsageError(f"mask: expected {expected}, got {got}")
+        flat = np.concatenate([part.astype(bool).reshape(rows, -1) for part in parts], axis=1)
+        allowed: Bools = np.broadcast_to(flat, (1, n, size))
         if no_choice(allowed, action).any():
             raise UsageError("mask: expected an allowed choice for each entry of the action, got none")
         return allowed
@@ -222,6 +225,22 @@ def load(run: str | os.PathLike[str], *, best: bool = False, deterministic: bool
     (8,)
     """
     return LoadedPolicy(Path(run), best=best, deterministic=deterministic, seed=seed)
+
+
+def _parts_of_mask(mask: npt.ArrayLike, n: int) -> list[Array]:
+    """The arrays of a mask for n observations: one array for each entry of the action, or a single array for all entries.
+
+    A sequence is one for each entry if its arrays have different shapes, or if it is a tuple of arrays [n, …], which is how
+    a vector environment returns a Tuple.
+    """
+    try:
+        parts = [np.asarray(part) for part in mask] if isinstance(mask, tuple | list) else []
+        in_tuple = isinstance(mask, tuple) and all(part.ndim > 1 and len(part) == n for part in parts)
+        if parts and (in_tuple or len({part.shape for part in parts}) > 1):
+            return parts
+        return [np.asarray(mask)]
+    except (ValueError, TypeError):  # raised for nested lists of different lengths
+        return [np.asarray(None)]
 
 
 def _by_path(observation: Observation, path: str) -> Iterator[tuple[str, Any]]:

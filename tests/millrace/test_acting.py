@@ -10,6 +10,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
+from gymnasium import spaces
 
 import millrace
 from millrace.launch.policy_workers import PlayingWorkers, policy_player
@@ -20,9 +21,10 @@ from millrace.learner.run_folder.run_folder import RunFolder
 from millrace.protocol.arrays import Array
 from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.envs.env_actions import make_action_converter
-from millrace.protocol.envs.spaces import make_flatten, make_unflatten
+from millrace.protocol.envs.spaces import action_spec, make_flatten, make_unflatten, observation_leaves
+from millrace.protocol.errors import UsageError
 from millrace.protocol.messages import EpisodeRows
-from millrace.protocol.specs import RunSpec
+from millrace.protocol.specs import PolicySpec, RunSpec
 from tests.support.in_process.collectors import TOY, random_weights, run_of
 
 STEPS = 30
@@ -279,3 +281,49 @@ def test_a_copy_of_the_two_files_is_enough(tmp_path: Path) -> None:
     (copy / "policy.json").unlink()
     with pytest.raises(millrace.UsageError, match=r"expected a run folder, got one without config\.toml"):
         millrace.load(copy)
+
+
+def masked_policy(tmp_path: Path, sizes: Sequence[int] = (3, 3)) -> millrace.LoadedPolicy:
+    """A policy with masks, for a Dict observation of one number and MultiDiscrete actions."""
+    observation, action = spaces.Dict(x=spaces.Box(0, 1, (1,), np.float32)), spaces.MultiDiscrete(list(sizes))
+    policy = PolicySpec(observation_leaves(observation), action_spec(action))
+    return millrace.load(
+        folder_of(RunSpec(EnvSpec("Doors-v0"), policy, 8, copies=1, lanes=1, seed=1, masked=True), tmp_path)
+    )
+
+
+MASKS_OF_ENTRIES = np.eye(3, dtype=np.int8)[[[2, 0], [1, 1], [0, 2], [2, 2]]]  # [n, entries, choices], one choice each
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 4])
+@pytest.mark.parametrize(
+    "form",
+    [
+        lambda masks: masks.reshape(len(masks), -1),
+        lambda masks: masks,
+        lambda masks: list(masks),
+        lambda masks: tuple(masks[:, entry] for entry in range(2)),
+    ],
+    ids=["rows", "an array", "a list", "a tuple of entries"],
+)
+def test_masks_of_a_batch_may_have_each_form_that_environments_give_them(n: int, form: Any, tmp_path: Path) -> None:
+    policy = masked_policy(tmp_path)
+    masks = MASKS_OF_ENTRIES[:n]
+    expected = masks.argmax(-1).tolist()
+    seen = np.zeros((n, 1), np.float32)
+    assert policy({"x": seen}, mask=form(masks)).tolist() == expected
+    assert policy({"x": seen, "action_mask": form(masks)}).tolist() == expected
+
+
+@pytest.mark.parametrize("sizes", [(3, 3), (3, 2)])
+@pytest.mark.parametrize("kind", [tuple, list, np.concatenate])
+def test_a_mask_for_one_observation_may_be_a_sequence_with_one_for_each_entry(
+    sizes: tuple[int, int], kind: Any, tmp_path: Path
+) -> None:
+    policy = masked_policy(tmp_path, sizes)
+    mask = kind([np.eye(size, dtype=bool)[1] for size in sizes])
+    one, several = {"x": np.zeros(1, np.float32)}, {"x": np.zeros((3, 1), np.float32)}
+    assert policy(one, mask=mask).tolist() == [1, 1]
+    assert policy(several, mask=mask).tolist() == [[1, 1]] * 3
+    with pytest.raises(UsageError, match=rf"mask: expected {sum(sizes)} zeros and ones .*, got .*bool\[2\]"):
+        policy(one, mask=(*mask[:-1], np.ones(2, bool), np.ones(2, bool)))

@@ -92,10 +92,9 @@ def test_a_loaded_policy_takes_masks(kind: Any, deterministic: bool, tmp_path: P
     forbidden = 0
     for _ in range(200):
         mask = info.get("action_mask")
-        flat = None if mask is None else np.concatenate(mask) if isinstance(mask, tuple) else mask
-        action = policy(observation, mask=flat)  # the key of a Dict observation is read without it
+        action = policy(observation, mask=mask)  # the key of a Dict observation is read without it
         observation, _, terminated, truncated, info = env.step(action)
-        forbidden += 0 if flat is None else int((np.asarray(flat) == 0).sum())
+        forbidden += 0 if mask is None else int((np.hstack(mask) == 0).sum())
         if terminated or truncated:
             observation, info = env.reset()
     assert forbidden > 0 or kind is InObservation
