@@ -119,12 +119,13 @@ class Evaluations:
         return evaluation is not before
 
     def write_best(self) -> None:
-        """Write the best policy into the run folder, if there is one."""
+        """Write the best policy, if there is one. Raises `RunTakenOver` if another process trains this run now."""
         if self._state.best_policy is None:
             return
         policy = self._state.best_policy
         spec = self._run.spec
         folder = self._run.folder
+        folder.confirm_lock()
         folder.writes.write("best policy", lambda: folder.write_policy(spec, policy[0], policy[1], "best"))
 
     def to_report(self) -> Evaluation | None:

@@ -55,9 +55,13 @@ class RunFiles:
         self._saved_env_steps = self._policy_env_steps = self._state.env_steps if self._state.version else None
 
     def write_row(self, progress: Progress, metrics: Row) -> None:
-        """Write a row of metrics, or add these metrics to the newest row if it belongs to the same update."""
+        """Write a row of metrics, or add these metrics to the newest row if it belongs to the same update.
+
+        Raises `RunTakenOver` if another process, which trains this run now, has replaced the file.
+        """
         writes = self._folder.writes
         if self._metrics.gone:
+            self._folder.confirm_lock()
             writes.write("folder", self._make_folder_again)
         self._metrics.write(progress, metrics)
         writes.write("metrics", self._metrics.flush)
@@ -70,7 +74,7 @@ class RunFiles:
 
     def save(self) -> None:
         """Write a checkpoint and the policy. Raises `RunTakenOver` if another process trains this run now."""
-        self._confirm_lock()
+        self._folder.confirm_lock()
         began_s = time.monotonic()
         self._folder.writes.write("state", self._write_state)
         self._schedule.saved(began_s)
@@ -115,7 +119,7 @@ class RunFiles:
 
         Raises `RunTakenOver` if another process trains this run now.
         """
-        self._confirm_lock()
+        self._folder.confirm_lock()
         before = self._saved
         self._folder.writes.confirm()
         if self._saved != before:
@@ -197,10 +201,6 @@ class RunFiles:
             self.checkpoint = one_line(str(path))
             self._saved = self._position()
             self._saved_env_steps = env_steps
-
-    def _confirm_lock(self) -> None:
-        if self._folder.lock is not None:
-            self._folder.lock.confirm()
 
     def _position(self) -> tuple[object, ...]:
         """A value that changes whenever there is something new to save: an update, an evaluation or a set attribute."""

@@ -290,6 +290,11 @@ class RunFolder:
         self.write_config(config, workers_elsewhere=self._workers_elsewhere)
         return line
 
+    def confirm_lock(self) -> None:
+        """Read the run's lock, if this process has one. Raises `RunTakenOver` if another process trains this run now."""
+        if self.lock is not None:
+            self.lock.confirm()
+
     def write_config(self, config: RunSettings, *, workers_elsewhere: bool = False) -> None:
         """Write config.toml and run.json, at the start and again when a run is resumed, perhaps with other settings."""
         self._workers_elsewhere = workers_elsewhere

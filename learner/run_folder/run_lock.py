@@ -3,7 +3,9 @@
 Rule: the file `run.lock` names the owner. On a single machine, the system's lock on this file (flock) decides; the kernel
 releases it when the process dies, however it dies. Machines that share the folder may not see each other's system locks, so
 the owner also rewrites the file every few seconds (`lease.py`); an owner on another machine that stops doing so counts as
-dead. The lock of a dead owner is taken over. Commands that only read a run folder don't need the lock.
+dead. The lock of a dead owner is taken over. An owner that finds the file missing recreates it, unless it hasn't renewed the
+file for so long that another process may have taken over the run and ended. Commands that only read a run folder don't need
+the lock.
 """
 
 from __future__ import annotations
@@ -65,12 +67,14 @@ class RunLock:
         pace: Pace = PACE,
         clock: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
+        wall_clock: Callable[[], float] = time.time,
     ) -> None:
         self._folder = folder
         self._path = folder / LOCK_FILE
         self._pace = pace
         self._clock = clock
         self._sleep = sleep
+        self._wall_clock = wall_clock
         self._owner = Owner(
             host=socket.gethostname(),
             pid=os.getpid(),
@@ -80,7 +84,8 @@ class RunLock:
             pid_namespace=_namespace(NUMBERS),
         )
         self._file = -1
-        self._other: Owner | None = None
+        self._seen_s = 0.0  # wall-clock time of the last look at the file that showed that the run is still ours
+        self._lost = ""  # why the run is no longer ours
         self._stop = threading.Event()
         self._writing = threading.Lock()  # guards this object, because the thread and `confirm` both rewrite the file
         self._thread = threading.Thread(target=self._rewrite_often, name="run-lock", daemon=True)
@@ -95,6 +100,7 @@ class RunLock:
             self._take()
         except OSError as error:
             raise RunError(f"{self._path} not written: {error.strerror}") from error
+        self._seen_s = self._wall_clock()
         self._thread.start()
         return self
 
@@ -116,15 +122,12 @@ class RunLock:
     @property
     def taken_over(self) -> bool:
         """Whether another process is known to have taken the run over. Reads no file."""
-        return self._other is not None
+        return bool(self._lost)
 
     def check(self) -> None:
         """Raise `RunTakenOver` if another process is known to have taken the run over. Reads no file."""
-        if self._other is not None:
-            raise RunTakenOver(
-                f"run {self._folder}: {self._other} took it over, because this process seemed dead for "
-                f"{self._pace.dead_after:.0f} s; it continues there, and nothing more is written here"
-            )
+        if self._lost:
+            raise RunTakenOver(f"run {self._folder}: {self._lost}")
 
     def confirm(self) -> None:
         """Read the lock file. Raises `RunTakenOver` if another process has taken the run over. Called before writing."""
@@ -236,21 +239,37 @@ class RunLock:
 
     def _rewrite(self) -> None:
         with self._writing, suppress(OSError):  # a file system that fails now may work next time
-            if self._other is not None:
+            if self._lost:
                 return
+            began_s = self._wall_clock()
             try:
                 owner = decoded(read(self._path))
             except FileNotFoundError:
                 self._make_again()
-                return
-            if owner is not None and owner.token != self._owner.token:
-                self._other = owner
-                return
-            self._owner = replace(self._owner, count=self._owner.count + 1)
-            self._write()
+            else:
+                if owner is not None and owner.token != self._owner.token:
+                    self._lost = (
+                        f"{owner} took it over, because this process seemed dead for {self._pace.dead_after:.0f} s; "
+                        "it continues there, and nothing more is written here"
+                    )
+                    return
+                self._owner = replace(self._owner, count=self._owner.count + 1)
+                self._write()
+            self._seen_s = began_s
 
     def _make_again(self) -> None:
-        """Recreate the file after somebody has removed it, unless the whole folder is gone."""
+        """Recreate the file after somebody has removed it, unless the whole folder is gone.
+
+        Doesn't recreate the file if another process had the time to take over the run, and may have removed the file at its
+        end.
+        """
+        unseen_s = self._wall_clock() - self._seen_s  # other clocks may stop while the machine is suspended
+        if unseen_s >= self._pace.dead_after:
+            self._lost = (
+                f"{LOCK_FILE} is gone, and this process could not renew it for {unseen_s:.0f} s; another process may have "
+                "continued the run meanwhile, and nothing more is written here"
+            )
+            return
         if not self._folder.is_dir():
             return
         file = open_regular(self._path, os.O_RDWR | os.O_CREAT | os.O_EXCL)

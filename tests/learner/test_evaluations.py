@@ -56,6 +56,9 @@ class Fakes:
         self.published.append(version)
         self.attributes.append(None if env_attributes is None else env_attributes.tolist())
 
+    def confirm_lock(self) -> None:
+        pass
+
     def write_policy(self, run: Any, parameters: Any, *rest: Any) -> None:
         self.written.append(float(parameters[0]))
 

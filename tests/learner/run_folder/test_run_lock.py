@@ -219,6 +219,42 @@ def test_who_was_replaced_notices_and_writes_nothing_more(tmp_path: Path) -> Non
     assert (tmp_path / LOCK_FILE).read_bytes() == theirs
 
 
+@pytest.mark.parametrize("suspended_s", [29.0, 31.0])
+def test_a_lock_that_is_gone_after_a_suspension_is_recreated_only_if_nobody_can_have_had_it(
+    tmp_path: Path, suspended_s: float
+) -> None:
+    """Another process may have taken the run over, trained it and ended, which removes the file."""
+    wall = Time()
+    with RunLock(tmp_path, NEVER, wall_clock=wall.clock) as mine:
+        for _ in range(3):
+            wall.now += 29.0
+            mine.confirm()
+        (tmp_path / LOCK_FILE).unlink()
+        wall.now += suspended_s
+        if suspended_s < NEVER.dead_after:
+            mine.confirm()
+            assert owner_of(tmp_path).pid == os.getpid()
+        else:
+            with pytest.raises(RunTakenOver, match=rf"^run {tmp_path}: run.lock is gone, .* for 31 s; another process may"):
+                mine.confirm()
+            assert mine.taken_over
+            assert not (tmp_path / LOCK_FILE).exists()
+
+
+def test_a_folder_that_was_gone_for_long_and_is_made_again_is_still_ours(tmp_path: Path) -> None:
+    wall = Time()
+    folder = tmp_path / "run"
+    folder.mkdir()
+    with RunLock(folder, NEVER, wall_clock=wall.clock) as mine:
+        folder.rename(tmp_path / "renamed")
+        for _ in range(20):  # the thread looks every 3 s
+            wall.now += 3.0
+            mine.confirm()
+        folder.mkdir()
+        mine.confirm()
+        assert owner_of(folder).pid == os.getpid()
+
+
 def test_the_file_is_rewritten_again_and_again_and_made_again(tmp_path: Path) -> None:
     rewritten = threading.Event()
 

@@ -14,8 +14,11 @@ import pytest
 import millrace
 from millrace import Callback, Progress
 from millrace.learner.callbacks.callbacks import MOMENTS
+from millrace.learner.rollouts.evaluation_dealer import PlayedEpisode
+from millrace.learner.rollouts.hub import Hub
+from millrace.learner.run_folder.atomic_write import write_atomically
 from millrace.learner.run_folder.lease import Owner
-from millrace.learner.run_folder.metrics_log import read_rows
+from millrace.learner.run_folder.metrics_log import METRICS_FILE, read_rows
 from millrace.learner.run_folder.run_folder import Interrupted
 from millrace.learner.run_folder.run_lock import LOCK_FILE
 from millrace.protocol.errors import RunTakenOver
@@ -33,6 +36,7 @@ SMALL: dict[str, Any] = {
 SPIN_S = 0.05
 UPDATES = 13  # of 400 env steps; the rows that reset a copy do not count
 EVALUATED = (5, 9)  # updates, with eval_every 130
+OTHER = Owner(host="far", pid=77, boot_id="another kernel", token="theirs").encoded()  # run.lock of another process
 Act = Callable[[Progress], object]
 
 
@@ -229,14 +233,39 @@ def test_an_interrupt_while_a_callback_runs(tmp_path: Path, whole: Path) -> None
 
 
 def test_a_run_that_another_process_takes_over_ends_without_a_summary(tmp_path: Path) -> None:
-    other = Owner(host="far", pid=77, boot_id="another kernel", token="theirs").encoded()
-    told = Acts("on_update", lambda progress: Path(progress.run, LOCK_FILE).write_bytes(other), updates=4)
+    told = Acts("on_update", lambda progress: Path(progress.run, LOCK_FILE).write_bytes(OTHER), updates=4)
     with pytest.raises(RunTakenOver):
         run(tmp_path, told, checkpoint_every_s=0.0)
     (end,) = told.of("on_end")
     assert (end.updates, end.cut_short) == (4, True)
     assert "process 77 on far took it over" in end.stop_reason
     assert not (folder_of(tmp_path / "runs") / "summary.json").exists()
+
+
+def test_a_run_that_another_process_takes_over_writes_no_row_into_its_metrics(tmp_path: Path) -> None:
+    def take_over(progress: Progress) -> None:
+        Path(progress.run, LOCK_FILE).write_bytes(OTHER)
+        write_atomically(Path(progress.run, METRICS_FILE), lambda file: file.write(b"theirs\n"))  # as a resume does
+
+    with pytest.raises(RunTakenOver):
+        run(tmp_path, Acts("on_rollouts", take_over, updates=4))
+    assert (folder_of(tmp_path / "runs") / METRICS_FILE).read_bytes() == b"theirs\n"
+
+
+def test_a_run_that_another_process_takes_over_during_an_evaluation_keeps_no_best_policy(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    played = Hub.end_evaluation
+
+    def end_evaluation(hub: Hub, watch: Callable[[int, int], None]) -> list[PlayedEpisode]:
+        episodes = played(hub, watch)
+        (folder_of(tmp_path / "runs") / LOCK_FILE).write_bytes(OTHER)
+        return episodes
+
+    monkeypatch.setattr(Hub, "end_evaluation", end_evaluation)
+    with pytest.raises(RunTakenOver):
+        run(tmp_path, eval_every=130)
+    assert not (folder_of(tmp_path / "runs") / "best.safetensors").exists()
 
 
 def test_a_raise_after_an_error_is_only_logged(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
