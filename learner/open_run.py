@@ -94,8 +94,9 @@ def open_run(setup: RunSetup, lobby: Lobby, watch: Watch, observer: HubObserver)
         hub.keep_opponents(*state.opponent_policies)
     state.opponent_policies = None
     if config.record:
-        about = f"All whole training episodes of millrace run {folder.path.resolve().name}, as acted."
-        callbacks.add(started_by("record")(config.record, setup.known.described, spec, about))
+        resumed_at = state.env_steps if setup.resumed else None
+        name = folder.path.resolve().name
+        callbacks.add(started_by("record")(config.record, setup.known.described, spec, name, resumed_at))
     setup.check_interrupt()
     folder.remove_temporary()
     folder.write_config(config, workers_elsewhere=not lobby.processes.expected)

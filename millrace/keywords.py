@@ -246,7 +246,7 @@ class TrainKeywords(RolloutKeywords, total=False):
     """
     record: str
     """Write all whole training episodes to the Minari dataset with this id, such as cartpole/ppo-v0 (pip install
-    'minari[hdf5]' pillow).
+    'minari[hdf5]' pillow). A resumed run writes another dataset, with the next free version.
     """
     prior: str
     """Id of a Minari dataset to learn from in addition, such as cartpole/ppo-v0 (pip install 'minari[hdf5]' pillow). With

@@ -151,7 +151,7 @@ class Config(RolloutConfig, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     """
     record: Free[str] = ""
     """Write all whole training episodes to the Minari dataset with this id, such as cartpole/ppo-v0
-    (pip install 'minari[hdf5]' pillow).
+    (pip install 'minari[hdf5]' pillow). A resumed run writes another dataset, with the next free version.
     """
 
     prior: Fixed[str] = ""

@@ -31,9 +31,10 @@ class MinariDataset:
     Use it as a context manager: when the context ends, the dataset is complete. If the body raises, the dataset is removed.
     """
 
-    def __init__(self, dataset_id: str, env: gymnasium.Env[Any, Any], about: str) -> None:
+    def __init__(self, dataset_id: str, env: gymnasium.Env[Any, Any], about: str, *, free_version: bool = False) -> None:
         """`env`: the environment that is stored with the dataset. `about`: the dataset's description.
 
+        If a dataset with this id exists, `free_version` takes the next version that is free; otherwise that is an error.
         Raises `UsageError` if such a dataset can't be made or Minari isn't installed.
         """
         try:
@@ -44,7 +45,7 @@ class MinariDataset:
         except ImportError as error:
             raise UsageError("recording needs minari; pip install 'minari[hdf5]' pillow") from error
         try:
-            parse_dataset_id(dataset_id)
+            _, _, version = parse_dataset_id(dataset_id)
         except (ValueError, TypeError):  # TypeError: a name without a version
             raise UsageError(
                 f"dataset {dataset_id}: expected names of two letters or more and a version, as in cartpole/expert-v0"
@@ -54,11 +55,15 @@ class MinariDataset:
                 raise UsageError(f"dataset {dataset_id}: Minari cannot keep an {what} whose key has a slash, {slashed}")
         root = get_dataset_path()
         self._folder = get_dataset_path(dataset_id)
+        while free_version and self._folder.exists():
+            version += 1
+            dataset_id = f"{dataset_id.rpartition('-v')[0]}-v{version}"
+            self._folder = get_dataset_path(dataset_id)
         if self._folder.exists():
             raise UsageError(f"dataset {dataset_id} is there already, at {self._folder}; choose another name or version")
         self._namespaces = self._folder.parents[: len(self._folder.relative_to(root).parts) - 1]  # innermost first
         self._new_folders = [folder for folder in self._namespaces if not folder.exists()]
-        self._id = dataset_id
+        self.id = dataset_id
         self._env = env
         self._about = about
         self._storage: Any = None  # the dataset's files, made when the first episode is written
@@ -124,7 +129,7 @@ class MinariDataset:
             )
         except Exception as error:
             says = first_line(error, "")
-            raise RunError(f"dataset {self._id} was not written: {type(error).__name__}: {says}") from error
+            raise RunError(f"dataset {self.id} was not written: {type(error).__name__}: {says}") from error
         self._chunk = []
         self._chunk_bytes = 0
 
@@ -147,7 +152,7 @@ class MinariDataset:
             data_format="hdf5",
             jpeg_encoding=False,  # store images losslessly
         )
-        about = {"dataset_id": self._id, "algorithm_name": "millrace", "description": self._about}
+        about = {"dataset_id": self.id, "algorithm_name": "millrace", "description": self._about}
         storage.update_metadata(about | {"minari_version": minari.__version__})
         return storage
 

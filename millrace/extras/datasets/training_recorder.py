@@ -1,6 +1,8 @@
 """`--record`: a callback that writes every whole episode of training into a Minari dataset.
 
-Rule: if the dataset can't be written, training doesn't stop. The dataset is removed, and the run fails when it has ended.
+Rule: the dataset contains the rollouts that updates have used. The rollouts of an update that is undone are not recorded,
+    because a resumed run uses them, or collects them again. A resumed run makes another dataset. If the dataset can't be
+    written, training doesn't stop. The dataset is removed, and the run fails when it has ended.
 """
 
 from __future__ import annotations
@@ -29,23 +31,42 @@ class TrainingRecorder(Callback):
     Steps of incomplete episodes are only counted. If no episode is whole, no dataset is written.
     """
 
-    def __init__(self, dataset_id: str, env: DescribedEnv, run: RunSpec, about: str) -> None:
-        """`env`: the environment as a worker described it. `about`: the description of the dataset.
+    def __init__(self, dataset_id: str, env: DescribedEnv, run: RunSpec, name: str, resumed_at: int | None = None) -> None:
+        """`env`: the environment as a worker described it. `name`: the run's name.
 
-        Raises `UsageError`, with a one-line message, if the dataset cannot be made.
+        `resumed_at`: the number of env steps at which the run was resumed; None for a new run. If a resumed run finds a
+        dataset with this id, it takes the next free version. Raises `UsageError`, with a one-line message, if the dataset
+        cannot be made.
         """
+        resumed = resumed_at is not None
         self._assembler = EpisodeAssembler(action_leaves_of(run.policy))
-        self._id = dataset_id
         self._episodes = 0
-        self._dataset = MinariDataset(dataset_id, EnvironmentOfDataset(env, masked=run.masked), about)
+        since = f" that began after it was resumed at {resumed_at:,} env steps" if resumed else ""
+        about = f"All whole training episodes of millrace run {name}{since}, as acted."
+        env_of_dataset = EnvironmentOfDataset(env, masked=run.masked)
+        self._dataset = MinariDataset(dataset_id, env_of_dataset, about, free_version=resumed)
+        if self._dataset.id != dataset_id:
+            log.warning("dataset %s is there already: episodes from now on go to %s", dataset_id, self._dataset.id)
+        self._gathered: Progress | None = None  # the newest rollouts, until an update has used them
         self._refused: RunError | None = None
 
     def on_rollouts(self, progress: Progress) -> None:
-        """Add the rollouts of an update."""
-        if self._refused is not None:
+        """Keep the rollouts until an update has used them."""
+        self._record(progress.updates)
+        self._gathered = progress
+
+    def on_update(self, progress: Progress) -> None:
+        """Add the rollouts of this update."""
+        self._record(progress.updates)
+
+    def _record(self, updates: int) -> None:
+        """Add the kept rollouts, if the run has made the update that uses them. `updates` is the number of its updates."""
+        gathered = self._gathered
+        self._gathered = None
+        if gathered is None or gathered.updates == updates or self._refused is not None:
             return
         try:
-            for arrived in zip(progress.rollouts, progress.incarnations, progress.fresh, strict=True):
+            for arrived in zip(gathered.rollouts, gathered.incarnations, gathered.fresh, strict=True):
                 for episode in self._assembler.add(*arrived):
                     self._dataset.add(episode)
                     self._episodes += 1
@@ -60,6 +81,7 @@ class TrainingRecorder(Callback):
         If the dataset couldn't be written, now or earlier, it is removed. Then raises `RunError`, unless something else
         ended the run.
         """
+        self._record(progress.updates)  # another callback may have raised before `on_update` was called here
         if self._refused is None:
             self._finish()
         elif not progress.cut_short:
@@ -70,7 +92,7 @@ class TrainingRecorder(Callback):
             with self._dataset:
                 pass  # leaving the context writes the episodes that are still in memory
         parts = self._assembler.waiting + self._assembler.left_out
-        log.warning(f"dataset {self._id}: {self._episodes:,} training episodes; {parts:,} steps of others left out")
+        log.warning(f"dataset {self._dataset.id}: {self._episodes:,} training episodes; {parts:,} steps of others left out")
 
 
 class EnvironmentOfDataset(gymnasium.Env[Any, Any]):

@@ -540,6 +540,7 @@ def test_nothing_is_left_of_a_training_dataset_that_cannot_be_written(
     collector = Collector(run, random_policy(run.policy))
     first, second = (
         Progress(
+            updates=n,
             rollouts=(collector.collect([Assignment(n, 0, 0, n, n)], 0, 1, no_pulse)[0],),
             incarnations=(0,),
             fresh=(n == 0,),
@@ -549,22 +550,38 @@ def test_nothing_is_left_of_a_training_dataset_that_cannot_be_written(
     recorder = TrainingRecorder("ns/countdown-v0", described(run.env), run, "a test")
     monkeypatch.setattr(dataset_module, "CHUNK_BYTES", chunk_bytes)
     recorder.on_rollouts(first)
+    recorder.on_update(Progress(updates=1))
     monkeypatch.setattr(dataset_module, "append_episodes", full)
     monkeypatch.setattr(MinariStorage, "new", full)
     says = "dataset ns/countdown-v0 was not written: OSError: .*No space left on device"
     if chunk_bytes == 1:
         assert "ns/countdown-v0/data" in everything(root)
         recorder.on_rollouts(second)
+        recorder.on_update(Progress(updates=2))
         assert re.fullmatch(f"{says}; it is removed, and training continues", caplog.messages[-1])
         assert everything(root) == set()
         recorder.on_rollouts(second)
-        recorder.on_end(Progress(cut_short=True))  # the run has an error of its own
+        recorder.on_end(Progress(updates=2, cut_short=True))  # the run has an error of its own
         assert len(caplog.messages) == 1, "it is said once"
     else:
         recorder.on_rollouts(second)
     with pytest.raises(RunError, match=says):
-        recorder.on_end(Progress())
+        recorder.on_end(Progress(updates=2))
     assert everything(root) == set()
+
+
+def test_rollouts_are_recorded_once_an_update_has_used_them(root: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """A resumed run collects or uses the rollouts of an undone update again. Another callback may raise after an update."""
+    run = run_of(f"{TOY}Countdown-v0", T=6, N=1)  # an episode, and the reset after it
+    for used in (False, True):
+        collector = Collector(run, random_policy(run.policy))
+        recorder = TrainingRecorder("ns/countdown-v0", described(run.env), run, "a test")
+        for updates in range(2):
+            rollouts = collector.collect([Assignment(updates, 0, 0, updates, updates)], 0, 1, no_pulse)
+            recorder.on_rollouts(Progress(updates=updates, rollouts=tuple(rollouts), incarnations=(0,)))
+        recorder.on_end(Progress(updates=1 + used, cut_short=True))
+        assert f"dataset ns/countdown-v0: {1 + used} training episodes; 0 steps of others" in caplog.messages[-1]
+        (root / "ns").rename(root / f"used{used}")
 
 
 def test_an_episode_that_another_worker_goes_on_with_is_recorded_whole() -> None:
@@ -636,7 +653,7 @@ def test_a_run_that_ends_before_a_whole_episode_leaves_no_dataset(root: Path, ca
     recorder = TrainingRecorder("ns/countdown-v0", described(run.env), run, "a test")
     (rollout,) = collector.collect([Assignment(0, 0, 0, 0, 0)], 0, 1, no_pulse)
     recorder.on_rollouts(Progress(rollouts=(rollout,), incarnations=(0,), fresh=(True,)))
-    recorder.on_end(Progress())
+    recorder.on_end(Progress(updates=1))
     assert caplog.messages == ["dataset ns/countdown-v0: 0 training episodes; 3 steps of others left out"]
     assert everything(root) == set()
 

@@ -248,6 +248,38 @@ def test_training_episodes_are_recorded_whole(
         assert recorded == read_rows(folder / "metrics.jsonl")[-1]["time/total_timesteps"]
 
 
+def test_a_resumed_run_records_whole_episodes_into_another_dataset(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    minari = pytest.importorskip("minari")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "datasets"))
+
+    def recorded(dataset_id: str) -> list[tuple[bytes, bytes]]:
+        episodes = minari.load_dataset(dataset_id).iterate_episodes()
+        return [(episode.observations.tobytes(), episode.actions.tobytes()) for episode in episodes]
+
+    class Interrupts(millrace.Callback):
+        def on_update(self, progress: Progress) -> None:
+            if progress.updates == 3:
+                raise KeyboardInterrupt
+
+    settings: dict[str, Any] = {**SMALL, "steps": 1_000, "envs": 4, "lanes": 2, "rollout_steps": 64}
+    settings |= {"workers": 1, "transport": "inproc", "run_dir": str(tmp_path), "progress": False}
+    millrace.train("CartPole-v1", record="cartpole/whole-v0", **settings)
+    settings |= {"record": "cartpole/training-v0", "run_dir": str(tmp_path / "interrupted")}
+    with pytest.raises(KeyboardInterrupt):
+        millrace.train("CartPole-v1", callbacks=[Interrupts()], **settings)
+    before = recorded("cartpole/training-v0")
+    steps = millrace.train("CartPole-v1", resume="auto", **settings).metrics["time/total_timesteps"][2]
+    after = recorded("cartpole/training-v1")
+    whole = recorded("cartpole/whole-v0")
+    assert recorded("cartpole/training-v0") == before
+    assert len(before) > 3
+    assert len(after) > 3
+    assert {*before, *after} <= {*whole}
+    assert len(whole) - 4 <= len({*before, *after}) == len(before) + len(after), "only those that ran then may be missing"
+    about = json.loads((tmp_path / "datasets/cartpole/training-v1/data/metadata.json").read_text())["description"]
+    assert f"that began after it was resumed at {steps:,.0f} env steps" in about
+
+
 def test_a_killed_worker_is_replaced_and_the_run_ends_well(
     tmp_path: Path, inference: str, caplog: pytest.LogCaptureFixture
 ) -> None:
