@@ -175,6 +175,7 @@ class RunFiles:
     def _write_state(self) -> None:
         """Write the policy and a checkpoint. If one of them can't be written, writes the other and raises `RunError`."""
         self._make_folder_again()
+        self._folder.writes.write("metrics", self._metrics.sync)  # a resumed run doesn't write these rows again
         spec = self._spec
         env_steps = self._state.env_steps
         past = self._hub.past()

@@ -1,8 +1,9 @@
 """The metrics of a run on disk: metrics.jsonl.
 
 Rule: the file ends with a complete row, and there is one row for each update. Rows that can't be written now are written
-later. A resumed run first removes the rows after its checkpoint. If the run was interrupted before an evaluation, the
-resumed run makes this evaluation and adds its metrics to the row of the same update.
+later. The rows up to a checkpoint are flushed to the disk before the checkpoint, because a resumed run doesn't write them
+again. It removes the rows after its checkpoint. If the run was interrupted before an evaluation, the resumed run makes this
+evaluation and adds its metrics to the row of the same update.
 """
 
 from __future__ import annotations
@@ -80,6 +81,10 @@ class MetricsLog:
         Earlier rows then stay readable, and the next call tries again.
         """
         self._table.flush()
+
+    def sync(self) -> None:
+        """Like `flush`, but also waits until the rows are on the disk, because a checkpoint of their updates follows."""
+        self._table.sync()
 
     def close(self) -> None:
         """Write the remaining rows if possible, and close the file."""

@@ -72,6 +72,14 @@ class RecordFile:
                 self._file.truncate(self._bytes)
             raise RunError(f"{self._path}: rows are not written yet: {error.strerror}") from error
 
+    def sync(self) -> None:
+        """Write the waiting records, and wait until the file is on the disk. Raises `RunError` if that fails."""
+        self.flush()
+        try:
+            os.fsync(self._number)
+        except OSError as error:
+            raise RunError(f"{self._path}: rows may not be on the disk: {error.strerror}") from error
+
     def close(self) -> None:
         """Close the file without writing the waiting records."""
         self._file.close()

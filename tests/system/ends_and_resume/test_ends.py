@@ -23,7 +23,7 @@ from millrace.learner.callbacks.callbacks import Callbacks
 from millrace.learner.config.layers import resolve
 from millrace.learner.run_folder import atomic_write, checkpoint
 from millrace.learner.run_folder.last_line import resume_command
-from millrace.learner.run_folder.metrics_log import read_rows
+from millrace.learner.run_folder.metrics_log import METRICS_FILE, read_rows
 from millrace.learner.run_folder.progress import Progress
 from millrace.protocol.errors import RunError, UsageError
 from tests.support.envs.toy import Identity
@@ -300,6 +300,46 @@ class FullDisk:
         self._fsync(number)
 
 
+def test_the_rows_up_to_a_checkpoint_are_on_the_disk_before_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A power failure could leave the checkpoint without these rows, and a resumed run doesn't write them again."""
+    fsync = os.fsync
+    on_disk = b""
+    saves = 0
+
+    def flush(number: int) -> None:
+        nonlocal on_disk, saves
+        fsync(number)
+        path = Path(os.readlink(f"/proc/self/fd/{number}"))
+        if path.name == METRICS_FILE:
+            on_disk = path.read_bytes()
+        elif path.parent.name == "checkpoints" and path.suffix == ".tmp":
+            assert on_disk == (path.parents[1] / METRICS_FILE).read_bytes()
+            saves += 1
+
+    monkeypatch.setattr(os, "fsync", flush)
+    folder = run(tmp_path, checkpoint_every_s=0.0, eval_every=130)
+    assert saves > summary(folder)["updates"]
+
+
+def test_rows_that_are_not_on_the_disk_are_flushed_later(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    fsync = os.fsync
+    refused = 0
+
+    def flush(number: int) -> None:
+        nonlocal refused
+        if os.readlink(f"/proc/self/fd/{number}").endswith(METRICS_FILE) and refused < 4:
+            refused += 1
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        fsync(number)
+
+    monkeypatch.setattr(os, "fsync", flush)
+    folder = run(tmp_path, checkpoint_every_s=0.0)
+    assert "metrics.jsonl: rows may not be on the disk: No space left on device" in caplog.text
+    assert saved(folder) == summary(folder)["updates"]
+
+
 def test_a_disk_that_is_full_at_the_end_fails_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(atomic_write, "TRY_FOR_S", 0.0)
     with monkeypatch.context() as then, pytest.raises(RunError) as caught:
@@ -307,7 +347,9 @@ def test_a_disk_that_is_full_at_the_end_fails_the_run(tmp_path: Path, monkeypatc
     folder = folder_of(tmp_path / "runs")
     steps = read_rows(folder / "metrics.jsonl")[-1]["time/total_timesteps"]
     path = folder / "checkpoints" / f"{steps:012d}.pt"
-    assert str(caught.value) == f"checkpoint {path} not written: No space left on device; older checkpoints are untouched"
+    full = "No space left on device"
+    rows = f"{folder / METRICS_FILE}: rows may not be on the disk: {full}"
+    assert str(caught.value) == f"{rows}; checkpoint {path} not written: {full}; older checkpoints are untouched"
     assert saved(folder) == 1
     assert caught.value.__notes__ == how_to_go_on(folder)
     assert not (folder / "summary.json").exists()
