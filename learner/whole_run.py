@@ -68,7 +68,8 @@ def _learn_from_prior(run: OpenRun, prior: PriorData) -> None:
 
     try:
         if getattr(run.setup.config.algorithm, "clone_epochs", 0):
-            run.audience.cloned(started_by("clone_epochs")(algorithm, prior.batches(), pulse))
+            if metrics := started_by("clone_epochs")(algorithm, prior.batches(), pulse):
+                run.audience.cloned(metrics)
             run.parts.tally.state.next_evaluation = 0  # so that an evaluation is due, if the run makes any
         algorithm.learn_from_prior(pulse)
     except Interrupted:

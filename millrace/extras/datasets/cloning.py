@@ -38,7 +38,8 @@ def clone(algorithm: Algorithm, episodes: Iterable[Batch], pulse: Callable[[], N
 
     `episodes`: each one is a batch of one column. `pulse`, which may save the state, is called after each gradient step.
     Returns metrics over all steps of the episodes: `clone/loss`, and how close the policy's most probable actions are to
-    the demonstrated ones, as `clone/accuracy` (choices and bits), `clone/mean_absolute_error` (numbers), or both.
+    the demonstrated ones, as `clone/accuracy` (choices and bits), `clone/mean_absolute_error` (numbers), or both. Does
+    nothing and returns no metrics if `prior_steps` have already changed the cloned policy, in a resumed run.
 
     Raises `UsageError` if the algorithm derives from neither `ActorCritic` nor `Continuous`, and `RunError`, before the
     gradient step, if a loss or a gradient isn't finite.
@@ -48,6 +49,8 @@ def clone(algorithm: Algorithm, episodes: Iterable[Batch], pulse: Callable[[], N
     if isinstance(algorithm, Continuous) and algorithm.policy.needs_torch:
         name = type(algorithm).__name__.lower()
         raise UsageError(f"clone_epochs: {name} clones no encoder of images, which its critics train; take --algo ppo")
+    if isinstance(algorithm, Continuous) and algorithm.prior_gradient_steps:
+        return {}
     config = algorithm.config
     rows = Demonstrations.of(episodes, algorithm.scaled, config.gamma)
     size = len(rows.at)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import deepcopy
 from typing import Any
 
 import msgspec
@@ -264,6 +265,29 @@ def test_cloning_that_was_interrupted_goes_on_with_the_same_bits(algo: str, acti
     assert torch.equal(whole.net.flat, resumed.net.flat)
     untrained = made(algo, action, clone_epochs=3)
     assert not torch.equal(whole.net.flat, untrained.net.flat)
+
+
+@pytest.mark.parametrize("algo", ["sac", "td3"])
+@pytest.mark.parametrize("taken", [10, 20])
+def test_prior_steps_that_were_interrupted_go_on_with_the_same_bits(algo: str, taken: int) -> None:
+    """The target of TD3's actor lags behind the actor, so it must not become a copy of the actor again."""
+    settings: dict[str, Any] = {"clone_epochs": 1, "prior_steps": 20, "prior_share": 0.5, "replay_size": 1000}
+    whole, resumed = (made(algo, CONTINUOUS, **settings) for _ in range(2))
+    episodes = episodes_of(CONTINUOUS)
+    saved: dict[str, Any] = {}
+
+    def pulse() -> None:
+        if whole.prior_gradient_steps == taken:
+            saved.update(deepcopy(whole.state_dict()))
+
+    assert cloned(whole, episodes)
+    whole.learn_from_prior(pulse)
+    resumed.add_prior(GivenPrior(episodes))
+    resumed.load_state_dict(saved)
+    assert clone(resumed, episodes, lambda: None) == {}
+    resumed.learn_from_prior(lambda: None)
+    for name in ("parameters", "target"):
+        assert torch.equal(whole.state_dict()[name], resumed.state_dict()[name])
 
 
 def test_weights_of_units_of_xqc_have_norm_1_after_each_step() -> None:

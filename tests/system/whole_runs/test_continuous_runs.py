@@ -11,11 +11,15 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from torch import Tensor
 
 import millrace
 from millrace.launch.training import train
+from millrace.learner.algorithms.replay.transitions import Transitions
+from millrace.learner.algorithms.td3 import TD3
 from millrace.learner.config.layers import resolve
 from millrace.learner.run_folder.metrics_log import read_rows
+from millrace.learner.run_folder.run_folder import Interrupted
 from tests.system.stage.preloaded import workers_of
 from tests.system.stage.processes import START_S, Learner, Stage
 from tests.system.stage.run_folders import policy_of
@@ -141,3 +145,29 @@ def test_it_learns_from_prior_data(tmp_path: Path, algo: str, monkeypatch: pytes
     last = rows[-1]
     assert last["train/n_updates"] == 20 + int(0.3 * (last["time/total_timesteps"] - 90) + 1e-9)
     assert policy_of(prior) != policy_of(first)
+
+
+def test_a_clone_is_measured_before_its_prior_steps_even_if_they_are_interrupted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    pytest.importorskip("minari")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "datasets"))
+    run(tmp_path, "recorded", algo="td3", record="pendulum/first-v0", envs=2, lanes=2, steps=450)
+    settings: dict[str, Any] = {"algo": "td3", "prior": "pendulum/first-v0", "clone_epochs": 1, "prior_steps": 20}
+    whole = run(tmp_path, "whole", **settings)
+    step = TD3.step
+
+    def interrupted_step(self: TD3, rows: Transitions) -> tuple[dict[str, float], Tensor]:
+        if self.prior_gradient_steps == 10:
+            signal.raise_signal(signal.SIGTERM)
+        return step(self, rows)
+
+    with monkeypatch.context() as patched, pytest.raises(Interrupted) as stopped:
+        patched.setattr(TD3, "step", interrupted_step)
+        run(tmp_path, "stopped", **settings)
+    resumed = run(tmp_path, "stopped", resume=stopped.value.run, **settings)
+    assert policy_of(resumed) == policy_of(whole)
+    cloned = [read_rows(folder / "metrics.jsonl")[0] for folder in (whole, resumed)]
+    assert len({row["clone/mean_absolute_error"] for row in cloned}) == 1
+    said = [line for line in caplog.messages if line.startswith("cloned ")]
+    assert len(said) == 2, "once by each new run"
