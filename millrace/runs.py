@@ -18,10 +18,11 @@ from millrace.arguments import checked
 from millrace.keywords import TrainKeywords
 from millrace.learner.callbacks.callbacks import Callbacks
 from millrace.learner.config.config import Config
-from millrace.learner.config.layers import config_of_run, resolve
+from millrace.learner.config.layers import config_of_run, layers_of_keywords, resolve, settings_of_run
+from millrace.learner.config.resume_auto import settings_with_newest_run
 from millrace.learner.extras import started_by
 from millrace.learner.run_folder.metrics_log import METRICS_FILE, read_and_count_rows
-from millrace.learner.run_folder.newest_run import AUTO, newest_run
+from millrace.learner.run_folder.newest_run import AUTO
 from millrace.learner.run_folder.progress import ENV_STEPS_KEY, RETURN_KEY
 from millrace.learner.run_folder.results import Evaluation, RecordedDataset, Summary
 from millrace.learner.run_folder.run_folder import RunFolder
@@ -273,7 +274,8 @@ def train(
             names such as "gymnasium.wrappers:FlattenObservation".
         config: A TOML file of settings.
         resume: A `Run` or run folder, to continue from its newest checkpoint; or "auto", to continue the newest run of this
-            environment, algorithm and seed if there is one, and otherwise start a new run.
+            environment, algorithm and seed if there is one, and otherwise start a new run. `config` then overrides the
+            settings of the run.
         preset: The name of a preset (`millrace presets` lists them); "auto": the preset of `env`, if there is one; "none":
             no preset.
         callbacks: Called between updates; they may also end the run. A callback is an object with some of the methods of
@@ -303,9 +305,10 @@ def train(
         given["wrappers"] = list(wrapper_names(wrappers))
     file, run = (None if path is None else Path(path) for path in (config, resume))
     if run == AUTO:
-        run = newest_run(resolve(name, file=file, preset=preset, **given))
-        file, preset = (None, "none") if run else (file, preset)
-    resolved = resolve(name, file=file, resume=run, preset=preset, **given)
+        lower, keywords = layers_of_keywords(name, file=file, preset=preset, **given)
+        resolved, run = settings_with_newest_run(lower, lambda lower: settings_of_run(lower, keywords))
+    else:
+        resolved = resolve(name, file=file, resume=run, preset=preset, **given)
     objects = {name: made for name, made in given.items() if callable(made)}
     objects |= {} if isinstance(env, str) else {"env": env}
     objects |= {} if wrappers is None else {"wrappers": wrappers}

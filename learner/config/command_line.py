@@ -12,7 +12,8 @@ from millrace.learner.config.algorithm_names import settings_record
 from millrace.learner.config.config import Config
 from millrace.learner.config.layers import LowerLayers, SettingsLayer, merged, read_lower_layers, settings_of_run
 from millrace.learner.config.other_names import in_place_of
-from millrace.learner.run_folder.newest_run import AUTO, newest_run
+from millrace.learner.config.resume_auto import settings_with_newest_run
+from millrace.learner.run_folder.newest_run import AUTO
 
 
 class RunFlags(Config, frozen=True, kw_only=True):
@@ -26,7 +27,8 @@ class RunFlags(Config, frozen=True, kw_only=True):
     """
     resume: Annotated[Path | None, Flag("PATH")] = None
     """Continue this run from its newest checkpoint. auto: continue the newest run in --run-dir with the same ENV,
-    --algo and --seed, or start a new run if there is none. Some settings cannot change then: see docs/how-to/resume.md.
+    --algo and --seed, or start a new run if there is none; --config then overrides the settings of the run. Some settings
+    cannot change: see docs/how-to/resume.md.
     """
     log_json: bool = False
     """Log to stderr as JSON, one event per line, instead of text."""
@@ -76,16 +78,10 @@ def read_config(command: str, argv: list[str]) -> tuple[Config, Path | None]:
     file = _path(words, "config")
     resume = _path(words, "resume")
     preset = words.get("preset", "auto")
+    with_flags = partial(_read_flags, command, argv, typed)
     if resume == AUTO:
-        config = _read_flags(command, argv, typed, read_lower_layers(algo, file=file, resume=None, preset=preset))
-        resume = newest_run(config)
-        if resume is None:
-            return config, None
-        # the settings of the run that was found already include those of the file and the preset
-        file = None
-        preset = "none"
-    lower = read_lower_layers(algo, file=file, resume=resume, preset=preset)
-    return _read_flags(command, argv, typed, lower), resume
+        return settings_with_newest_run(read_lower_layers(algo, file=file, resume=None, preset=preset), with_flags)
+    return with_flags(read_lower_layers(algo, file=file, resume=resume, preset=preset)), resume
 
 
 def _read_flags(command: str, argv: list[str], typed: list[Typed], lower: LowerLayers) -> Config:

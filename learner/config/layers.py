@@ -1,9 +1,11 @@
 """The layers that a run's settings come from, merged into one record. Pure except for reading TOML files.
 
 The layers are, from the weakest to the strongest: the defaults of the records, the preset of (algorithm, environment), a
-named preset, a TOML file, and flags or keyword arguments. A setting has one name everywhere: the field `learning_rate` is
-the TOML key `learning_rate` and the flag `--learning-rate`. The settings of the algorithm are in a TOML table named after
-it, such as [ppo].
+named preset, a TOML file, and flags or keyword arguments. In a resumed run, its config.toml replaces the presets and the
+file; with `--resume auto`, the file comes between the config.toml and the flags.
+
+A setting has one name everywhere: the field `learning_rate` is the TOML key `learning_rate` and the flag `--learning-rate`.
+The settings of the algorithm are in a TOML table named after it, such as [ppo].
 
 Rule: a layer is a dictionary that knows its source. Layers are merged as dictionaries and converted to a record once, so
 that each value is checked once, and an error names the layer that the value comes from.
@@ -60,7 +62,10 @@ class LowerLayers(NamedTuple):
     preset: str
     named: SettingsLayer
     file: SettingsLayer
+    """the TOML file, or the config.toml of the run to resume"""
     resume: Path | None
+    over_run: SettingsLayer = NOTHING
+    """the TOML file of `--resume auto`, whose settings override those of the run to resume"""
 
     def below(self, given: SettingsLayer) -> list[SettingsLayer]:
         """The layers below `given`, which holds the flags or keyword arguments, and may name the environment.
@@ -75,7 +80,7 @@ class LowerLayers(NamedTuple):
         layers = [self._of_environment(env), self.named]
         if self.file.settings.keys() >= ALL_BUT_TABLES:  # the file holds a whole run, so its tables are complete, too
             layers = [layer.without_tables() for layer in layers]
-        return [*layers, self.file]
+        return [*layers, self.file, self.over_run]
 
     def _of_environment(self, env: str) -> SettingsLayer:
         """The preset of this algorithm for this environment, or for the environment that --preset names."""
@@ -101,6 +106,13 @@ def resolve(
     "auto" (the environment's preset, if there is one), "none", the environment whose preset to use, or the name of a whole
     run. `algo` may be a class (`algorithm_names.name_of`).
     """
+    return settings_of_run(*layers_of_keywords(env, file=file, resume=resume, preset=preset, **keywords))
+
+
+def layers_of_keywords(
+    env: str = "", *, file: Path | None = None, resume: Path | None = None, preset: str = "auto", **keywords: Any
+) -> tuple[LowerLayers, SettingsLayer]:
+    """The lower layers, and the layer of keyword arguments on top of them. For the arguments and errors, see `resolve`."""
     if isinstance(algo := keywords.get("algo", ""), type):
         keywords["algo"] = name_of(algo)
     elif not isinstance(algo, str):
@@ -108,7 +120,7 @@ def resolve(
             f"train: algo: expected one of {', '.join(HYPERPARAMETERS)}, module:Class or a class, got {algo!r:.60}"
         )
     lower = read_lower_layers(keywords.get("algo"), file=file, resume=resume, preset=preset)
-    return settings_of_run(lower, SettingsLayer("train", keywords | ({"env": env} if env else {})))
+    return lower, SettingsLayer("train", keywords | ({"env": env} if env else {}))
 
 
 def config_from_toml(text: str, where: str = "config.toml") -> Config:
@@ -138,19 +150,28 @@ def read_lower_layers(algo: str | None, *, file: Path | None, resume: Path | Non
             raise UsageError(f"a config file ({file}) or a run to resume ({resume}): expected one, got both")
         if preset not in ("auto", "none"):
             raise UsageError(f"a preset ({preset}) or a run to resume ({resume}): expected one, got both")
-        file = resume / CONFIG_FILE
-        preset = "none"
-        if not file.is_file():
-            raise UsageError(f"run {resume}: expected a run folder with a {CONFIG_FILE} to resume, got none")
-        check_format(resume)
-        table = with_algorithm(read_config(resume), algo)
-    else:
-        table = {} if file is None else _read_toml(file)
+        return layers_of_run(resume, algo)
+    table = {} if file is None else _read_toml(file)
     whole_runs = named_presets()
     named = SettingsLayer(f"preset {preset}", whole_runs[preset].settings if preset in whole_runs else {})
     if algo is None:
         algo = _algorithm_of_file({**named.settings, **table}, str(file))
-    return LowerLayers(algo, preset, named, _layer_of_file(table, algo, str(file)), resume)
+    return LowerLayers(algo, preset, named, _layer_of_file(table, algo, str(file)), None)
+
+
+def layers_of_run(run: Path, algo: str | None) -> LowerLayers:
+    """The lower layers of a run to resume: its config.toml. `algo` is the algorithm that flags or keywords name, or None.
+
+    Raises `UsageError` if the file cannot be read.
+    """
+    file = run / CONFIG_FILE
+    if not file.is_file():
+        raise UsageError(f"run {run}: expected a run folder with a {CONFIG_FILE} to resume, got none")
+    check_format(run)
+    table = with_algorithm(read_config(run), algo)
+    if algo is None:
+        algo = _algorithm_of_file(table, str(file))
+    return LowerLayers(algo, "none", NOTHING, _layer_of_file(table, algo, str(file)), run)
 
 
 def _file_alone(table: dict[str, Any], where: str) -> LowerLayers:
@@ -167,7 +188,7 @@ def settings_of_run(lower: LowerLayers, given: SettingsLayer) -> Config:
         validate(config)
     except UsageError as error:
         if lower.file.settings and _is_wrong_alone(lower.algo, [*below, SettingsLayer("", {"env": config.env})], error):
-            raise UsageError(f"{lower.file.where}: {error}") from error
+            raise UsageError(f"{lower.over_run.where or lower.file.where}: {error}") from error
         raise
     return config
 

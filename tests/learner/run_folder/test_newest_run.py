@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
+import msgspec
 import pytest
 
 import millrace
 from millrace.launch import training
 from millrace.learner.config.command_line import read_config
 from millrace.learner.config.config import Config
+from millrace.learner.config.hyperparameters import PPOConfig
 from millrace.learner.config.layers import resolve
+from millrace.learner.resume_checks import check_settings
 from millrace.learner.run_folder.newest_run import newest_run
 from millrace.learner.run_folder.run_folder import RunFolder
 from millrace.protocol.errors import UsageError
@@ -58,17 +62,42 @@ def test_a_run_of_another_environment_algorithm_or_seed_is_let_be(tmp_path: Path
     assert newest_run(resolve("CartPole-v1", run_dir=str(tmp_path), seed=11)) is None
 
 
-def test_the_first_time_it_starts_and_then_it_goes_on_with_the_runs_own_settings(tmp_path: Path) -> None:
+def test_the_first_time_it_starts_and_then_it_goes_on_with_the_settings_of_the_run_file_and_flags(tmp_path: Path) -> None:
     file = tmp_path / "my.toml"
     file.write_text("[ppo]\ngamma = 0.5\n")
     flags = ["CartPole-v1", "--run-dir", str(tmp_path / "runs"), "--resume", "auto", "--config", str(file), "--steps", "9"]
     config, resume = read_config("learner", flags)
     assert (config.algorithm.gamma, config.steps, resume) == (0.5, 9, None)
     run = a_run(config, HOURS)
-    file.write_text("[ppo]\ngamma = 0.7\n")  # the run has its own settings now
     assert read_config("learner", flags) == (config, run)
-    again, _ = read_config("learner", [*flags, "--steps", "20"])
+    without_file = [*flags[:5], "--steps", "20"]
+    again, _ = read_config("learner", without_file)
     assert (again.algorithm.gamma, again.steps) == (0.5, 20)
+    file.write_text("steps = 30\nworkers = 3\n[ppo]\nlearning_rate = 0.125\n")
+    again, _ = read_config("learner", flags)
+    assert isinstance(again.algorithm, PPOConfig)
+    assert (again.steps, again.workers, again.algorithm.gamma, again.algorithm.learning_rate) == (9, 3, 0.5, 0.125)
+    assert check_settings(again, run) == []
+    file.write_text("[ppo]\ngamma = 0.7\n")
+    with pytest.raises(UsageError, match=r"gamma: expected 0.5 as in its config.toml, got 0.7; a run keeps this setting"):
+        check_settings(read_config("learner", flags)[0], run)
+    file.write_text("[ppo]\nlearning_rate = -1.0\n")
+    with pytest.raises(UsageError, match=rf"^{file}: learning_rate: expected "):
+        read_config("learner", flags)
+
+
+def test_the_file_of_the_settings_may_be_a_pipe(tmp_path: Path) -> None:
+    a_run(resolve("CartPole-v1", run_dir=str(tmp_path)), HOURS)
+    reading, writing = os.pipe()
+    os.write(writing, b"steps = 30\n")
+    os.close(writing)
+    try:
+        flags = ["CartPole-v1", "--run-dir", str(tmp_path), "--resume", "auto", "--config", f"/dev/fd/{reading}"]
+        config, run = read_config("train", flags)
+    finally:
+        os.close(reading)
+    assert run is not None
+    assert config.steps == 30
 
 
 def test_a_run_by_name_is_found_again(tmp_path: Path) -> None:
@@ -93,5 +122,9 @@ def test_in_python_it_is_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     run = a_run(asked[0][0], HOURS)
     millrace.train("CartPole-v1", resume="auto", run_dir=str(tmp_path))
     millrace.train("CartPole-v1", resume="auto", run_dir=str(tmp_path), preset="CartPole-v1")
-    assert [resume for _, resume in asked] == [None, run, run]
+    file = tmp_path / "my.toml"
+    file.write_text("steps = 30\n")
+    millrace.train("CartPole-v1", resume="auto", run_dir=str(tmp_path), config=file)
+    assert [resume for _, resume in asked] == [None, run, run, run]
     assert asked[2][0] == asked[1][0] == asked[0][0]
+    assert asked[3][0] == msgspec.structs.replace(asked[0][0], steps=30)

@@ -1,0 +1,28 @@
+"""The settings of `--resume auto`, which continues the newest run with these settings, or starts a new run.
+
+Rule: the settings of the file and the flags, or keyword arguments, override those in the run's config.toml. So an edited
+file takes effect, and a setting that a resumed run can't change is refused wherever it is named. The file is read once,
+because it may be a pipe.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from millrace.learner.config.config import Config
+from millrace.learner.config.layers import LowerLayers, layers_of_run
+from millrace.learner.run_folder.newest_run import newest_run
+
+
+def settings_with_newest_run(lower: LowerLayers, above: Callable[[LowerLayers], Config]) -> tuple[Config, Path | None]:
+    """The settings, and the run to resume; None if there is none, so that a new run begins.
+
+    `lower` are the layers of a new run. `above` returns the settings on top of lower layers. Raises `UsageError` if a
+    setting or a file is not valid.
+    """
+    config = above(lower)
+    run = newest_run(config)
+    if run is None:
+        return config, None
+    return above(layers_of_run(run, lower.algo)._replace(over_run=lower.file)), run
