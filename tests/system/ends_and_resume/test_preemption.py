@@ -118,8 +118,8 @@ def interrupts_at(update: int) -> Watch:
     return watch
 
 
-MAY_DIFFER = {"wall_s", "ledger", "incarnations"}
-"""Of the counters in a checkpoint: the time, and the tickets and lanes that were lost with the old learner or worker."""
+MAY_DIFFER = {"wall_s", "stages", "ledger", "incarnations"}
+"""Of the counters in a checkpoint: the times, and the tickets and lanes that were lost with the old learner or worker."""
 
 
 def assert_equal(one: Path, other: Path) -> None:
