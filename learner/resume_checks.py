@@ -19,6 +19,7 @@ from millrace.learner.config.hyperparameters import OffPolicyConfig, QLearningCo
 from millrace.learner.config.layers import config_of_run
 from millrace.learner.config.resume_rules import Change, OnResume, changes, refusal
 from millrace.learner.env_spaces import EnvSpaces
+from millrace.learner.run_folder.results import ALL_STEPS_DONE, DecidingReturns
 from millrace.learner.run_folder.run_folder import RunFolder, StoredPolicy
 from millrace.protocol.bounds import one_line
 from millrace.protocol.envs.found_names import moved
@@ -108,15 +109,21 @@ def _with_present_names(before: Config, now: Config) -> Config:
 
 
 def _is_finished(config: Config, folder: RunFolder) -> bool:
-    """Whether the run has nothing left to do, because the reason why it ended still holds with these settings."""
+    """Whether the run has nothing left to do, because the reason why it ended still holds with these settings.
+
+    The reason rests on the returns that ended training. The evaluation of the final policy came later, and the summary has a
+    mean training return even if too few episodes had ended for it to count.
+    """
     summary = folder.summary()
     if summary is None or summary.evaluation is None:
         return False
     reason = reason_to_stop(
         config,
+        DecidingReturns(
+            evaluation=summary.ended_by,
+            training=None if summary.stop_reason == ALL_STEPS_DONE else summary.return_mean_100,
+        ),
         env_steps_after_next_update=summary.env_steps + config.algorithm.rollout_steps * config.envs,
-        evaluation_return=summary.evaluation.return_mean if summary.ended_by is None else summary.ended_by,
-        training_return=summary.return_mean_100,
     )
     return reason == summary.stop_reason.partition(BY_THE_POLICY_OF)[0]
 

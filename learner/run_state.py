@@ -22,7 +22,7 @@ from millrace.learner.rollouts.past_rollouts import PastRollouts, RoundsState, p
 from millrace.learner.run_folder import checkpoint
 from millrace.learner.run_folder.env_attributes import AttributesState, EnvAttributes
 from millrace.learner.run_folder.episode_window import EpisodeWindow
-from millrace.learner.run_folder.results import EvaluatedPolicy, Evaluation
+from millrace.learner.run_folder.results import DecidingReturns, EvaluatedPolicy, Evaluation
 from millrace.learner.run_folder.run_folder import RunFolder
 from millrace.protocol.arrays import Floats
 from millrace.protocol.bounds import Natural, Real, Seconds, one_line
@@ -71,6 +71,8 @@ class RunState(msgspec.Struct, kw_only=True):
     newest_evaluation: Evaluation | None = None
     evaluated: EvaluatedPolicy = EvaluatedPolicy()
     """The policy that `newest_evaluation` evaluated."""
+    ended_with: DecidingReturns | None = None
+    """The returns with which training ended; None while it continues. The evaluations after training don't change them."""
     pending: EvaluatedPolicy | None = None
     """The policy that is being evaluated alongside training, if there is one."""
     pending_policy: Any = None

@@ -95,6 +95,7 @@ def train(run: OpenRun, workers: int, cores: CrowdedCores) -> str:
                 tell(evaluations.evaluate_when_due(audience.show_now))
             else:
                 files.save_if_due()
+        tally.training_ended()
         files.save()
         tell(evaluations.end_pending(audience.show_now))
         if evaluations.conclude(audience.show_now):

@@ -2,7 +2,8 @@
 
 A return that was used to select a policy is a biased estimate of that policy's return. The highest of several evaluations
 is biased upwards. So is an evaluation that ended the run, by reaching the target or through a callback. Therefore, for the
-best policy, and for the final policy of such a run, the summary reports a second evaluation, on other episodes.
+best policy, and for the final policy if its evaluation ended the run, the summary reports a second evaluation, on other
+episodes.
 
 Rule: without `eval_workers`, training waits for each evaluation. With them, evaluations run alongside training. The result
 of an evaluation is used when the next one is due, or at the end of the run; if it isn't ready by then, the run waits for it.
@@ -19,7 +20,7 @@ from millrace.learner.between_updates.run_parts import RunParts
 from millrace.learner.config.evaluation_size import EvaluationSize, evaluation_size, final_evaluation_size
 from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan, evaluation_of
 from millrace.learner.run_folder.progress import Row
-from millrace.learner.run_folder.results import ALL_STEPS_DONE, EVALUATED_AT_KEY, Best, EvaluatedPolicy, Evaluation
+from millrace.learner.run_folder.results import EVALUATED_AT_KEY, Best, EvaluatedPolicy, Evaluation
 from millrace.protocol.arrays import Array, Floats
 from millrace.protocol.logs.notices import log_notice
 from millrace.protocol.random_streams import Purpose
@@ -36,8 +37,8 @@ class Evaluations:
         """The best policy and its second evaluation. Set by `conclude`."""
         self.final: Evaluation | None = None
         """The evaluation of the final policy that is reported. Set by `conclude`."""
-        self.ended_by: Evaluation | None = None
-        """The evaluation that ended the run, if one did. `final` then evaluates the same policy again, on other episodes."""
+        self.ended_by: float | None = None
+        """The mean return of the evaluation that ended the run, if one did. Set by `conclude`."""
         self._run = run
         self._config = run.config
         self._time_limit = time_limit
@@ -97,25 +98,26 @@ class Evaluations:
     def conclude(self, watch: Callable[[], None]) -> bool:
         """Evaluate the final policy and, if the run kept a best policy, evaluate that again on other episodes.
 
-        Sets `final` and `confirmed`. Returns True if the final policy had not yet been evaluated with as many episodes.
+        Sets `final`, `confirmed` and `ended_by`. Returns True if the final policy had not yet been evaluated with as many
+        episodes.
         """
         state = self._state
         before = self.of_newest()
-        ended = self._tally.stop_reason() != ALL_STEPS_DONE
+        decided = self._tally.decided_by_evaluation()
+        biased = self._newest_is_biased()
         size = final_evaluation_size(self._config, state.env_steps, self._tally.window.length_mean, self._time_limit)
         if size != (usual := evaluation_size(self._config)):
             log_notice(log, _smaller(size, usual))
         evaluation = self._evaluate_newest(size, watch)
         if self._config.eval_every or state.best is not None:  # a run resumed with eval_every 0 may have a best policy
             self._keep_if_best(evaluation, state.env_steps, self._run.algorithm.weights)
-        if ended and before is not None:
+        found_again = None
+        if biased:
             found_again = self._evaluate(Purpose.CONFIRMATION, size, watch)
             self._say(found_again, state.env_steps)
-            self.final = found_again
-            self.ended_by = before
-        else:
-            self.final = evaluation
-        self.confirmed = self._confirm(size, watch)
+        self.final = found_again or evaluation
+        self.ended_by = None if decided is None else decided.evaluation
+        self.confirmed = self._confirm(found_again, size, watch)
         return evaluation is not before
 
     def write_best(self) -> None:
@@ -132,20 +134,25 @@ class Evaluations:
         """The evaluation to report, even for a run that was cut short; None if the newest one may have ended the run."""
         if self.final is not None:
             return self.final
-        return self.of_newest() if self._tally.stop_reason() in (None, ALL_STEPS_DONE) else None
+        return None if self._newest_is_biased() else self.of_newest()
 
     def of_newest(self) -> Evaluation | None:
         """The evaluation of the newest policy, if there is one."""
         return self._state.newest_evaluation if self._state.evaluated.version == self._state.version else None
 
-    def _confirm(self, size: EvaluationSize, watch: Callable[[], None]) -> Best | None:
-        """Evaluate the best policy again, if the run kept one."""
+    def _newest_is_biased(self) -> bool:
+        """Whether the evaluation of the newest policy ended the run."""
+        decided = self._tally.decided_by_evaluation()
+        return decided is not None and decided.evaluated_before is None
+
+    def _confirm(self, found_again: Evaluation | None, size: EvaluationSize, watch: Callable[[], None]) -> Best | None:
+        """Evaluate the best policy again, if the run kept one. `found_again`: the second evaluation of the final policy."""
         state = self._state
         if state.best is None:
             return None
         chosen_by, env_steps = state.best
-        if self.final is not None and self.ended_by is not None and env_steps == state.env_steps:
-            return Best(env_steps=env_steps, chosen_by=chosen_by, evaluation=self.final)
+        if found_again is not None and env_steps == state.env_steps:
+            return Best(env_steps=env_steps, chosen_by=chosen_by, evaluation=found_again)
         self._run.hub.publish(state.version + 1, *state.best_policy, deal=False)  # a version that no update has used
         confirmed = self._evaluate(Purpose.CONFIRMATION, size, watch)
         return Best(env_steps=env_steps, chosen_by=chosen_by, evaluation=confirmed)

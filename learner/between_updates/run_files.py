@@ -227,7 +227,7 @@ class RunFiles:
             return_mean_100=tally.window.return_mean,
             facts_100=tally.window.facts,
             evaluation=self._evaluations.to_report(),
-            ended_by=None if (ended_by := self._evaluations.ended_by) is None else ended_by.return_mean,
+            ended_by=self._evaluations.ended_by,
             best=self._evaluations.confirmed,
             ledger=snapshot.ledger.counts(),
             lags=self._hub.lag_statistics.histogram(),

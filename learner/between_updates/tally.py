@@ -10,11 +10,12 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-from millrace.learner.between_updates.stop_rules import reason_to_stop
+from millrace.learner.between_updates.stop_rules import reason_to_stop, target_reached
 from millrace.learner.config.config import Config
 from millrace.learner.rollouts.hub import HubSnapshot
 from millrace.learner.rollouts.opponent_pool import OpponentPool
 from millrace.learner.run_folder.episode_window import EpisodeWindow
+from millrace.learner.run_folder.results import DecidingReturns
 from millrace.learner.run_state import RunState
 from millrace.protocol.rollout import Batch, Episode
 from millrace.protocol.specs import RunSpec
@@ -58,6 +59,7 @@ class Tally:
 
     def count(self, batch: Batch) -> None:
         """Count an update with this batch."""
+        self.state.ended_with = None
         self.state.version += 1
         self.state.env_steps += batch.env_steps
         self.window.extend(batch.episodes)
@@ -70,16 +72,30 @@ class Tally:
         return {} if self.pool is None else self.pool.metrics()
 
     def stop_reason(self) -> str | None:
-        """Why the run should end now; None if it should continue."""
-        state = self.state
-        newest = self.state.newest_evaluation
-        return self._ended_by() or reason_to_stop(
-            self._config,
-            env_steps_after_next_update=state.env_steps + self._steps_per_update if state.version else 0,
-            evaluation_return=None if newest is None else newest.return_mean,
-            training_return=self.window.return_mean if self.window.full else None,
-            evaluated_before=state.evaluated.env_steps if state.evaluated.version != state.version else None,
-        )
+        """Why the run should end now; None if it should continue.
+
+        If training has ended, the reason rests on the returns with which it ended, unless the run was resumed with settings
+        for which they give no reason.
+        """
+        ended_with = self.state.ended_with
+        return self._ended_by() or (ended_with and self._reason(ended_with)) or self._reason(self._returns())
+
+    def training_ended(self) -> None:
+        """Record the returns with which training ended. The evaluations that follow then don't change why it ended."""
+        ended_with = self.state.ended_with
+        if ended_with is None or self._reason(ended_with) is None:
+            self.state.ended_with = self._returns()
+
+    def decided_by_evaluation(self) -> DecidingReturns | None:
+        """The returns with which the run ends, if it ends because of an evaluation; otherwise None.
+
+        If a callback ended the run after the newest policy was evaluated, this evaluation may have been the callback's
+        reason.
+        """
+        returns = self.state.ended_with or self._returns()
+        of_newest = returns.evaluation is not None and returns.evaluated_before is None
+        decided = of_newest if self._ended_by() is not None else target_reached(self._config, returns)
+        return returns if decided else None
 
     def training_goes_on(self) -> bool:
         """Whether the next rollouts may be collected now, because no evaluation is due and the run does not end yet."""
@@ -122,3 +138,19 @@ class Tally:
     def wall_s(self, snapshot: HubSnapshot) -> float:
         """Seconds of training so far, without evaluations but including the time before a resume."""
         return self.wall_before_s + snapshot.taken_s - self._started_s - snapshot.evaluate_s
+
+    # ---------------------------------------------------------------- inside
+
+    def _reason(self, returns: DecidingReturns) -> str | None:
+        after_next = self.state.env_steps + self._steps_per_update if self.state.version else 0
+        return reason_to_stop(self._config, returns, env_steps_after_next_update=after_next)
+
+    def _returns(self) -> DecidingReturns:
+        """The returns that decide now whether the run stops."""
+        state = self.state
+        newest = state.newest_evaluation
+        return DecidingReturns(
+            evaluation=None if newest is None else newest.return_mean,
+            evaluated_before=state.evaluated.env_steps if state.evaluated.version != state.version else None,
+            training=self.window.return_mean if self.window.full else None,
+        )

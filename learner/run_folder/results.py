@@ -138,6 +138,17 @@ class EvaluatedPolicy(msgspec.Struct, frozen=True):
     """the env steps of training up to this version"""
 
 
+class DecidingReturns(msgspec.Struct, frozen=True, kw_only=True):
+    """The returns that decide whether a run ends. Each is None if there is none yet."""
+
+    evaluation: Real | None = None
+    """the mean return of the newest evaluation"""
+    evaluated_before: Natural | None = None
+    """the env steps of training up to the evaluated policy; None if it is the newest policy"""
+    training: Real | None = None
+    """the mean return of the last training episodes; None as long as there are too few"""
+
+
 class Best(msgspec.Struct, frozen=True, kw_only=True):
     """The policy with the highest mean return in the run's own evaluations."""
 
@@ -184,8 +195,9 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     evaluation: Evaluation | None
     """evaluation of the final policy by greedy episodes; None if the run was cut short before it"""
     ended_by: Real | None = None
-    """the mean return of the final policy's evaluation, if that ended the run by reaching `target_return` or through a
-    callback. Such a return is biased upwards, so `evaluation` is then a second evaluation, on other episodes
+    """the mean return of the evaluation that ended the run by reaching `target_return`, or, if a callback ended the run, of
+    the final policy's evaluation that the callback could see. Such a return is biased upwards. So if the final policy has
+    it, `evaluation` is a second evaluation, on other episodes
     """
     best: Best | None = None
     """the best policy of the run's own evaluations, if there were any"""

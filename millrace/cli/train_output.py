@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 from millrace.flags.parse import typed_flags
 from millrace.flags.program_name import typed_name
+from millrace.learner.between_updates.stop_rules import BY_THE_POLICY_OF
 from millrace.learner.config.local_workers import chosen_workers
 from millrace.learner.config.presets import origin
 from millrace.learner.run_folder.results import ALL_STEPS_DONE
@@ -78,7 +79,8 @@ def result(summary: Summary) -> list[str]:
     """Lines about how a run ended and the evaluations of its policies."""
     lines = [f"{summary.stop_reason}: {summary.env_steps:,} env steps in {summary.wall_s:.1f} s"]
     if summary.evaluation is not None:
-        others = "" if summary.ended_by is None else ", on other episodes than those that ended the run"
+        ended_by_final = summary.ended_by is not None and BY_THE_POLICY_OF not in summary.stop_reason
+        others = ", on other episodes than those that ended the run" if ended_by_final else ""
         lines.append(f"greedy {summary.evaluation}{others}")
     if (best := summary.best) is not None and best.env_steps != summary.env_steps:
         lines.append(f"best policy, after {best.env_steps:,} env steps: greedy {best.evaluation}")

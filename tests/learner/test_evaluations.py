@@ -22,8 +22,8 @@ from millrace.learner.run_folder.run_folder import RunFolder
 from millrace.learner.run_state import RunState
 from millrace.play_flags import EvaluateFlags
 from millrace.protocol.bounds import LARGEST
-from millrace.protocol.rollout import Episode
-from tests.support.conversation.fake_ends import run_spec
+from millrace.protocol.rollout import Episode, stack_rollouts
+from tests.support.conversation.fake_ends import fake_rollout, run_spec
 
 
 class Fakes:
@@ -165,13 +165,13 @@ def test_the_return_that_reached_the_target_is_not_the_one_that_is_reported() ->
     evaluations, state, again = concluded(fakes, 2, target_return=5.0)
     assert evaluations.final is not None
     assert evaluations.confirmed is not None
-    assert evaluations.ended_by is not None
-    assert (evaluations.final.return_mean, evaluations.ended_by.return_mean) == (4.5, 6.0)
+    assert (evaluations.final.return_mean, evaluations.ended_by) == (4.5, 6.0)
     assert evaluations.to_report() is evaluations.final is evaluations.confirmed.evaluation
     assert evaluations.confirmed.chosen_by == 6.0
     (others,) = again
     assert not {*others} & {*fakes.seeds[0]}
-    assert state.newest_evaluation is evaluations.ended_by  # the run would end here again, if it were resumed
+    assert state.newest_evaluation is not None
+    assert state.newest_evaluation.return_mean == 6.0
 
 
 def test_nor_is_it_where_an_earlier_policy_was_better() -> None:
@@ -217,6 +217,70 @@ def test_the_last_policy_is_not_evaluated_twice() -> None:
     assert not evaluations.conclude(lambda: None)
     assert evaluations.confirmed is not None
     assert (state.newest_evaluation is not None, fakes.evaluated) == (True, 2), "once, and once as the best"
+
+
+def ended(fakes: Fakes, state: RunState, **settings: Any) -> tuple[Tally, Evaluations]:
+    """A run that ends as `train` ends it, with the evaluations that are due after 100, 200, … env steps."""
+    tally, evaluations = fakes.evaluations(100, state, **settings)
+    if tally.evaluation_is_due():
+        evaluations.evaluate_when_due(lambda: None)
+    while tally.stop_reason() is None:
+        state.version, state.env_steps = state.version + 1, state.env_steps + 100
+        if tally.evaluation_is_due():
+            evaluations.evaluate_when_due(lambda: None)
+    tally.training_ended()
+    evaluations.end_pending(lambda: None)
+    evaluations.conclude(lambda: None)
+    return tally, evaluations
+
+
+BESIDE = f"{TARGET} by the policy of 100 env steps"
+MEAN_REACHED = "mean return 2 of the last episodes reached"
+WINDOW = [Episode(2.0, 1, 0.0)] * 100
+
+
+@pytest.mark.parametrize(
+    ("settings", "returns", "reason", "ended_by", "reported"),
+    [
+        ({"eval_workers": 1, "target_return": 5.0}, [6.0, 1.0, 5.5], BESIDE, 6.0, 1.0),
+        ({"eval_workers": 1, "target_return": 5.0}, [6.0, 7.0, 5.5], BESIDE, 6.0, 7.0),
+        ({"eval_workers": 1, "target_return": 5.0, "steps": 200}, [1.0, 6.0, 5.5], "all steps done", None, 6.0),
+        ({"target_mean_return": 2.0}, [6.0, 4.5], MEAN_REACHED, None, 6.0),
+        ({"target_mean_return": 2.0, "target_return": 7.0}, [6.0, 4.5], MEAN_REACHED, None, 6.0),
+        ({"target_mean_return": 2.0, "target_return": 5.0, "eval_workers": 1}, [6.0, 4.5], MEAN_REACHED, None, 6.0),
+        ({"target_return": 5.0}, [6.0, 4.5], TARGET, 6.0, 4.5),
+    ],
+)
+def test_evaluations_after_training_do_not_change_why_a_run_ended(
+    settings: dict[str, Any], returns: list[float], reason: str, ended_by: float | None, reported: float
+) -> None:
+    """Nor does a resume: whether the run was interrupted before its second evaluations, or has finished."""
+    mean_reached = "target_mean_return" in settings
+    state = RunState(version=1, env_steps=100, next_evaluation=100, episodes=WINDOW if mean_reached else [])
+    settings = {"steps": 1_000_000, **settings}
+    fakes = Fakes(*returns)
+    tally, evaluations = ended(fakes, state, **settings)
+    assert (tally.stop_reason(), evaluations.ended_by) == (reason, ended_by)
+    assert evaluations.final is not None
+    assert evaluations.final.return_mean == reported
+    before = state.env_steps
+    again, others = ended(Fakes(*returns[-1:] * 2), state, **settings)
+    assert (again.stop_reason(), others.ended_by, state.env_steps) == (reason, ended_by, before)
+    assert others.final is not None
+    assert others.final.return_mean == reported
+
+
+def test_with_a_higher_target_a_resumed_run_trains_on() -> None:
+    state = RunState()
+    settings: dict[str, Any] = {"eval_workers": 1, "steps": 1_000_000}
+    ended(Fakes(6.0, 1.0, 5.5), state, target_return=5.0, **settings)
+    assert Fakes().evaluations(100, state, target_return=6.0, **settings)[0].stop_reason() == BESIDE.replace("5", "6", 1)
+    tally, _ = Fakes().evaluations(100, state, target_return=6.5, **settings)
+    assert tally.stop_reason() is None
+    tally.count(stack_rollouts([fake_rollout(1, 0, 0, 0, 0)]))
+    assert state.ended_with is None
+    tally, _ = Fakes().evaluations(100, state, target_return=0.5, **settings)
+    assert tally.stop_reason() == "target return 0.5 reached by the policy of 200 env steps", "the final one"
 
 
 @pytest.mark.parametrize(("pending", "expected"), [(5, [1, 2]), (3, None)])

@@ -140,9 +140,16 @@ def test_a_run_is_finished_while_its_reason_to_stop_holds(tmp_path: Path) -> Non
     beside = "target return 400 reached by the policy of 600 env steps"
     folder.write_summary(summary(stop_reason=beside, ended_by=401.0))
     assert is_finished(config, folder.path), "by an evaluation beside training"
+    assert not is_finished(resolve(resume=folder.path, target_return=402.0), folder.path)
     folder.write_summary(summary())
-    for more in ({"steps": 900 + per_update}, {"target_return": 100.0}):
-        assert not is_finished(resolve(resume=folder.path, **more), folder.path), f"{more}: another reason, or none"
+    assert is_finished(resolve(resume=folder.path, target_return=100.0), folder.path), "nothing is left to train"
+    assert not is_finished(resolve(resume=folder.path, steps=900 + per_update), folder.path)
+    folder.write_summary(summary(return_mean_100=500.0))
+    both = resolve(resume=folder.path, target_return=100.0, target_mean_return=300.0)
+    assert is_finished(both, folder.path), "neither the final policy's evaluation nor the mean of few episodes ended it"
+    folder.write_summary(summary(return_mean_100=500.0, stop_reason="mean return 300 of the last episodes reached"))
+    assert is_finished(both, folder.path)
+    assert not is_finished(resolve(resume=folder.path, target_mean_return=501.0), folder.path)
     for unfinished in ({"evaluation": None}, {"stop_reason": "interrupted"}, {"env_steps": 1000 - per_update}):
         folder.write_summary(summary(**unfinished))
         assert not is_finished(config, folder.path), unfinished

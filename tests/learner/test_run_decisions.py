@@ -8,11 +8,11 @@ from millrace.learner.between_updates.stop_rules import reason_to_stop
 from millrace.learner.config.config import Config
 from millrace.learner.config.evaluation_size import evaluation_size, final_evaluation_size
 from millrace.learner.run_folder.checkpoint import CheckpointSchedule
+from millrace.learner.run_folder.results import DecidingReturns
 
 
-def reason(config: Config, **numbers: Any) -> str | None:
-    none = {"env_steps_after_next_update": 0, "evaluation_return": None, "training_return": None}
-    return reason_to_stop(config, **{**none, **numbers})
+def reason(config: Config, env_steps_after_next_update: int = 0, **returns: Any) -> str | None:
+    return reason_to_stop(config, DecidingReturns(**returns), env_steps_after_next_update=env_steps_after_next_update)
 
 
 def test_a_run_ends_when_one_more_update_would_pass_its_steps() -> None:
@@ -24,10 +24,10 @@ def test_a_run_ends_when_one_more_update_would_pass_its_steps() -> None:
 def test_a_run_ends_when_a_target_is_reached() -> None:
     config = Config(target_return=475.0, target_mean_return=300.0)
     assert reason(config) is None
-    assert reason(config, evaluation_return=474.9, training_return=299.9) is None
-    assert reason(config, evaluation_return=475.0) == "target return 475 reached"
-    assert reason(config, training_return=300.0) == "mean return 300 of the last episodes reached"
-    assert reason(Config(), evaluation_return=1e9, training_return=1e9) is None
+    assert reason(config, evaluation=474.9, training=299.9) is None
+    assert reason(config, evaluation=475.0) == "target return 475 reached"
+    assert reason(config, training=300.0) == "mean return 300 of the last episodes reached"
+    assert reason(Config(), evaluation=1e9, training=1e9) is None
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ from msgspec.structs import replace
 import millrace
 from millrace.cli.commands import COMMANDS
 from millrace.cli.main import main
-from millrace.cli.train_output import next_commands
+from millrace.cli.train_output import next_commands, result
 from millrace.learner.callbacks.callbacks import Callbacks
 from millrace.learner.config.config import Config
 from millrace.learner.config.hyperparameters import HYPERPARAMETERS
@@ -264,6 +264,25 @@ def test_the_next_commands_are_for_a_shell_and_more_steps_for_a_run_that_made_al
     assert commands[1] == "  millrace dashboard 'my runs/a'"
     assert commands[-1] == "  millrace learner --resume 'my runs/a' --steps 60000"
     assert len(next_commands(Path("a"), replace(ended, stop_reason="target return 9 reached"), "train")) == 3
+
+
+@pytest.mark.parametrize(
+    ("reason", "ended_by", "said"),
+    [
+        ("all steps done", None, ""),
+        ("target return 9 reached", 9.5, ", on other episodes than those that ended the run"),
+        ("target return 9 reached by the policy of 50 env steps", 9.5, ""),
+    ],
+)
+def test_the_end_of_a_run_says_if_the_final_policy_was_evaluated_again(
+    reason: str, ended_by: float | None, said: str
+) -> None:
+    found = Evaluation(episodes=2, return_mean=9.0, return_std=0.5, length_mean=9.5)
+    ended = Summary(
+        env="E", algo="ppo", seed=1, env_steps=100, updates=1, wall_s=0.5, env_steps_per_s=20.0,
+        stop_reason=reason, return_mean_100=None, evaluation=found, ended_by=ended_by,
+    )  # fmt: skip
+    assert result(ended)[1] == f"greedy return 9.0 ± 0.5 over 2 episodes{said}"
 
 
 @pytest.mark.parametrize("flag", ["--log-json", "--log_json"])

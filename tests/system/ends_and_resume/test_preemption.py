@@ -13,6 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -21,13 +22,15 @@ from millrace.launch.training import train
 from millrace.learner.algorithm_check.same_bits import first_difference
 from millrace.learner.algorithms import Algorithm, algorithm_class
 from millrace.learner.algorithms.ppo import PPO
+from millrace.learner.between_updates import evaluations
 from millrace.learner.config.layers import resolve
 from millrace.learner.interrupts import Interrupts
-from millrace.learner.rollouts.evaluation_dealer import PlayedEpisode
+from millrace.learner.rollouts.evaluation_dealer import PlayedEpisode, evaluation_of
 from millrace.learner.rollouts.hub import Hub
 from millrace.learner.run_folder import checkpoint
 from millrace.learner.run_folder.metrics_log import read_rows
 from millrace.learner.run_folder.progress import Progress
+from millrace.learner.run_folder.results import Evaluation
 from millrace.learner.run_folder.run_folder import Interrupted
 from millrace.protocol.rollout import Batch
 from tests.system.stage.processes import START_S, Stage, crowding
@@ -263,10 +266,52 @@ def test_the_best_policy_is_that_of_the_checkpoint(tmp_path: Path) -> None:
 
 
 def test_a_run_that_has_reached_its_return_does_not_train_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It is interrupted while its best policy is evaluated again, after its last checkpoint."""
     settings = {**VARIANTS["ppo"], "target_return": 1.0}
     whole = run(tmp_path / "whole", **settings)
     assert summary(whole)["stop_reason"] == "target return 1 reached"
+    folder = interrupted_at_the_end(tmp_path / "resumed", monkeypatch, **settings)
+    assert run(tmp_path / "resumed", resume=folder, **settings) == folder
+    assert_equal(whole, folder)
+
+
+@pytest.mark.parametrize(
+    ("variant", "settings", "returns", "reason"),
+    [
+        ("ppo, evaluated beside", {}, [6.0, 1.0, 5.5], "target return 5 reached by the policy of 124 env steps"),
+        ("ppo", {"eval_every": 500}, [1.0, 6.0, 5.5], "all steps done"),
+    ],
+)
+def test_the_evaluation_of_the_final_policy_does_not_change_why_a_run_ended(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    variant: str,
+    settings: dict[str, Any],
+    returns: list[float],
+    reason: str,
+) -> None:
+    """The final policy misses the target that an earlier one reached, or the other way round."""
+    settings = {**VARIANTS[variant], **settings, "target_return": 5.0}
+    script: list[float] = []
+
+    def scripted(*played: Any) -> Evaluation:
+        return msgspec.structs.replace(evaluation_of(*played), return_mean=script.pop(0))
+
+    monkeypatch.setattr(evaluations, "evaluation_of", scripted)
+    script[:] = returns
+    whole = run(tmp_path / "whole", **settings)
+    assert (summary(whole)["stop_reason"], script) == (reason, [])
+    written = (whole / "summary.json").stat().st_mtime_ns
+    assert run(tmp_path / "whole", resume=whole, **settings) == whole
+    assert (whole / "summary.json").stat().st_mtime_ns == written, "the finished run was opened again"
+    script[:] = returns
+    folder = interrupted_at_the_end(tmp_path / "resumed", monkeypatch, **settings)
+    script[:] = returns[-1:]
+    assert run(tmp_path / "resumed", resume=folder, **settings) == folder
+    assert_equal(whole, folder)
+
+
+def interrupted_at_the_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, **settings: Any) -> Path:
+    """A run that is interrupted while its best policy is evaluated again, after its last checkpoint. Returns its folder."""
     end_evaluation = Hub.end_evaluation
 
     def interrupted(hub: Hub, watch: Callable[[int, int], None]) -> list[PlayedEpisode]:
@@ -278,10 +323,8 @@ def test_a_run_that_has_reached_its_return_does_not_train_on(tmp_path: Path, mon
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(Hub, "end_evaluation", interrupted)
-        run(tmp_path / "resumed", **settings)
-    folder = folder_of(tmp_path / "resumed")
-    assert run(tmp_path / "resumed", resume=folder, **settings) == folder
-    assert_equal(whole, folder)
+        run(tmp_path, **settings)
+    return folder_of(tmp_path)
 
 
 # ---------------------------------------------------------------- the grace time
