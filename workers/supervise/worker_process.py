@@ -14,8 +14,8 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
@@ -83,13 +83,12 @@ class WorkerProcess:
         command += ["--slots", str(self._slots), *start.flags]
         # The child must find the modules that its parent found: a user's environment may be in the folder of their script.
         path = os.pathsep.join(entry or os.getcwd() for entry in [*sys.path, str(Path(__file__).parents[3])])
-        # Remove the variable: a token in it is for another learner. A token for this learner is passed as `start.token`.
+        # Remove the variable: a token in it is for another learner. A token for this learner is `start.token`.
         environment = {name: value for name, value in os.environ.items() if name != TOKEN_VARIABLE}
         environment |= SINGLE_THREADED | {NONCE_VARIABLE: str(self.process_nonce), "PYTHONPATH": path}
-        if start.token is not None:
-            environment[TOKEN_VARIABLE] = start.token.to_text()
         try:
-            with _opened(start.log) as stderr:
+            with _opened(start.log) as stderr, _token_pipe(start.token) as token:
+                command += [word for fd in token for word in ("--token", f"/dev/fd/{fd}")]
                 self._log_from = stderr.tell()  # earlier text comes from another process
                 self._process = popen(
                     command,
@@ -98,7 +97,7 @@ class WorkerProcess:
                     stderr=stderr if start.log else None,
                     start_new_session=True,  # only the supervisor gets the Ctrl-C of the terminal
                     env=environment,
-                    pass_fds=(self._page.fd, self._slots, *start.handed),
+                    pass_fds=(self._page.fd, self._slots, *token, *start.handed),
                 )
         except BaseException:
             self._page.close()
@@ -306,6 +305,24 @@ def _end_of(output: str) -> str:
 def _signal_name(number: int) -> str:
     """The name of a signal, or its number if it has no name, like most real-time signals."""
     return signal.Signals(number).name if number in set(signal.Signals) else f"signal {number}"
+
+
+@contextmanager
+def _token_pipe(token: Token | None) -> Iterator[list[int]]:
+    """The file descriptor of a pipe from which the worker can read its token; none without a token.
+
+    Every process of the user can read the command line and the environment variables with which a process was started.
+    """
+    if token is None:
+        yield []
+        return
+    reads, writes = os.pipe()
+    try:
+        with os.fdopen(writes, "w") as file:
+            file.write(token.to_text())
+        yield [reads]
+    finally:
+        os.close(reads)
 
 
 def _opened(log: Path | None) -> BinaryIO:

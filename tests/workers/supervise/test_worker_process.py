@@ -16,10 +16,13 @@ from typing import Any
 
 import pytest
 
+from millrace.flags.parse import parse_flags
 from millrace.protocol.call_timeouts import CallTimeouts, Doing
-from millrace.protocol.keys.worker_token import TOKEN_VARIABLE
+from millrace.protocol.keys.keys import Key, Token
+from millrace.protocol.keys.worker_token import TOKEN_VARIABLE, read_token
 from millrace.workers import activity, program
 from millrace.workers.activity import ENV_CALLS, SINCE_S, STEPPING, Activity, ActivityReader
+from millrace.workers.flags import WorkerFlags
 from millrace.workers.supervise import worker_process
 from millrace.workers.supervise.how_it_ended import Ending
 from millrace.workers.supervise.worker_process import MOST_LAST_LINES, WorkerCommand, WorkerProcess
@@ -138,11 +141,27 @@ def test_one_that_leaves_on_purpose_before_it_has_joined_says_why_if_it_failed(
     assert (ending.code, ending.on_purpose, ending.last_lines) == (code, True, last_lines)
 
 
-def test_a_worker_gets_the_token_that_its_supervisor_gives_it_and_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("given", [None, Token(Key.new().public, Key.new())], ids=["no token", "a token"])
+def test_a_worker_gets_the_token_that_its_supervisor_gives_it_and_no_other(
+    monkeypatch: pytest.MonkeyPatch, given: Token | None
+) -> None:
+    """Through a pipe, because every process of the user can read the environment variables of the others."""
     monkeypatch.setenv(TOKEN_VARIABLE, "of another learner")
-    ending = ending_of(f"exit ${{#{TOKEN_VARIABLE}}}", monkeypatch)
-    assert ending is not None
-    assert ending.code == 0, "the length of the token"
+    got: list[Token | None] = []
+
+    def popen(command: list[str], **how: Any) -> subprocess.Popen[bytes]:
+        words = [*command, *how["env"].values()]
+        assert TOKEN_VARIABLE not in how["env"]
+        assert given is None or not any(given.to_text() in word for word in words)
+        monkeypatch.delenv(TOKEN_VARIABLE)
+        flags = parse_flags(WorkerFlags, command[4:], "worker")
+        got.append(read_token(flags.token))
+        assert given is None or int(Path(flags.token).name) in how["pass_fds"]
+        return subprocess.Popen(["true"], **how)
+
+    monkeypatch.setattr(worker_process, "popen", popen)
+    WorkerProcess(WorkerCommand("tcp://127.0.0.1:1", "w0", token=given)).wait(WITHIN_S)
+    assert got == [given]
 
 
 @pytest.mark.parametrize(
