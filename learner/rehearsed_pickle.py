@@ -3,13 +3,14 @@
 Rule: a pickle may contain only what torch.save writes for tensors and plain data. torch's loader for untrusted files
 (`weights_only`) doesn't run code from them, but it calls `bytearray` with any length, and copies a container or a string as
 many times as the file says, so a few bytes could fill the memory. It also hashes the keys of dicts, which could take forever
-with tuples that contain a tuple twice, or with numbers that all have the same hash. This file interprets the pickle without
-making its objects.
+with tuples that contain a tuple twice, or with numbers that all have the same hash; and whoever visits lists that contain a
+list twice could take as long. This file interprets the pickle without making its objects.
 """
 
 from __future__ import annotations
 
 import pickletools
+from dataclasses import dataclass
 from typing import NamedTuple
 
 VALUES = {"NONE", "NEWTRUE", "NEWFALSE", "BININT", "BININT1", "BININT2", "LONG1", "LONG4", "BINFLOAT", "BINUNICODE"}
@@ -23,6 +24,8 @@ HOOKS = "collections OrderedDict"  # the empty dict of a tensor's hooks
 BYTES = "_codecs encode"  # makes a bytes object, whose content the pickle holds as text
 CALLED = REBUILD | {HOOKS, BYTES}
 MOST_KEY = 1 << 60  # limit on the size of a number that is a key; larger numbers may all have the same hash
+MOST_REPEATED = 1 << 20  # limit on how often a visitor finds an object that it has found before,
+REPEATED_PER_BYTE = 16  # plus this number for each byte of the pickle, because dicts have the same keys again and again
 TYPES = ("torch ", "torch.storage ")  # prefixes of the names of storage types and dtypes, which aren't called
 
 
@@ -34,15 +37,28 @@ class _Function(NamedTuple):
     name: str
 
 
+@dataclass(slots=True)
+class _Made:
+    """An object that the loader would make."""
+
+    value: object
+    """a number, a text, a function, or a tuple of these; None for anything else"""
+    values: int = 1
+    """the number of objects that a visitor finds in it. One that occurs several times counts several times"""
+    used_again: bool = False
+    """whether it occurs a second time. If so, it must be complete, because `values` would be too small otherwise"""
+
+
 def rehearse(content: bytes) -> None:
     """Interpret a pickle to its end. Raises `Unfit` for anything that isn't allowed.
 
     Damaged bytes raise other exceptions, from `pickletools` or from an empty stack.
     """
-    stack = list[object]()
+    stack = list[_Made]()
     marks = list[int]()
-    notes = dict[int, object]()
+    notes = dict[int, _Made]()
     bytes_left = len(content)
+    values_left = MOST_REPEATED + REPEATED_PER_BYTE * len(content)
     for opcode, argument, _ in pickletools.genops(content):
         match opcode.name, argument:
             case "PROTO" | "STOP", _:
@@ -50,17 +66,17 @@ def rehearse(content: bytes) -> None:
             case "MARK", _:
                 marks.append(len(stack))
             case name, _ if name in VALUES:
-                stack.append(argument)
+                stack.append(_Made(argument))
             case name, _ if name in CONTAINERS:
-                stack.append(None)
+                stack.append(_Made(None))
             case name, _ if name in TUPLES:
                 _gather(stack, len(stack) - TUPLES[name])
             case "TUPLE", _:
                 _gather(stack, marks.pop())
             case "APPENDS", _:
-                del stack[marks.pop() :]
+                _add(stack, marks.pop())
             case "APPEND", _:
-                stack.pop()
+                _add(stack, len(stack) - 1)
             case "SETITEMS", _:
                 _set_items(stack, marks.pop())
             case "SETITEM", _:
@@ -68,27 +84,41 @@ def rehearse(content: bytes) -> None:
             case "BINPUT" | "LONG_BINPUT", int(note):
                 notes[note] = stack[-1]
             case "BINGET" | "LONG_BINGET", int(note):
+                notes[note].used_again = True
+                values_left -= notes[note].values
+                if values_left < 0:
+                    raise Unfit("it contains the same values too often")
                 stack.append(notes[note])
             case "BINPERSID", _:  # a storage, whose content torch reads from elsewhere in the file
-                _check_storage(stack[-1])
-                stack[-1] = None
+                _check_storage(stack[-1].value)
+                stack[-1] = _Made(None)
             case "GLOBAL", str(name) if name in CALLED or name.startswith(TYPES):
-                stack.append(_Function(name))
+                stack.append(_Made(_Function(name)))
             case "REDUCE", _:
                 arguments = stack.pop()
                 called = stack.pop()
-                bytes_left -= _cost(called, arguments)
+                bytes_left -= _cost(called.value, arguments.value)
                 if bytes_left < 0:
                     raise Unfit("it has more bytes objects than fit into the file")
-                stack.append(None)
+                stack.append(_Made(None))
             case name, _:
                 got = str(argument).replace(" ", ".") if name == "GLOBAL" else f"the opcode {name}"
                 raise Unfit(f"expected a pickle of tensors and plain data, got {got}")
 
 
-def _gather(stack: list[object], first: int) -> None:
+def _gather(stack: list[_Made], first: int) -> None:
     """Replace the items on the stack, from this index on, with a tuple of them."""
-    stack[first:] = [tuple(stack[first:])]
+    items = stack[first:]
+    stack[first:] = [_Made(tuple(each.value for each in items), 1 + sum(each.values for each in items))]
+
+
+def _add(stack: list[_Made], first: int) -> None:
+    """Move the items on the stack, from this index on, into the list or dict below them."""
+    container = stack[first - 1]
+    container.values += sum(each.values for each in stack[first:])
+    del stack[first:]
+    if container.used_again:
+        raise Unfit("it has a list or dict that changes after its use")
 
 
 def may_be_key(key: object) -> bool:
@@ -96,12 +126,12 @@ def may_be_key(key: object) -> bool:
     return type(key) is str or (type(key) is int and abs(key) < MOST_KEY)
 
 
-def _set_items(stack: list[object], first: int) -> None:
-    """Remove keys and values from the stack, from this index on. Raises `Unfit` for a key that isn't allowed."""
+def _set_items(stack: list[_Made], first: int) -> None:
+    """Move keys and values, from this index on, into the dict below them. Raises `Unfit` for a key that isn't allowed."""
     for key in stack[first::2]:
-        if not may_be_key(key):
+        if not may_be_key(key.value):
             raise Unfit("expected a pickle of tensors and plain data, got a key that is neither text nor a small number")
-    del stack[first:]
+    _add(stack, first)
 
 
 def _check_storage(storage: object) -> None:

@@ -238,19 +238,20 @@ def with_pickle(path: Path, content: bytes) -> None:
     writer.write_end_of_file()
 
 
+TUPLE = b"K\x01\x85"
 PAIRED = b"K\x01q\x00" + b"h\x00\x86q\x00" * 200
-"""Opcodes that pair a tuple with itself 200 times. Its hash takes 2^200 steps."""
+"""Opcodes that pair a value with itself 200 times. The hash of such a tuple takes 2^200 steps."""
 STORAGE = b"(X\x07\x00\x00\x00storagectorch\nFloatStorage\n%bX\x03\x00\x00\x00cpuK\x01tQ"
 
 
 @pytest.mark.parametrize(
     "opcodes",
     [
-        b"}" + PAIRED + b"K\x01s",
-        b"}(K\x01K\x01" + PAIRED + b"K\x01u",
+        b"}" + TUPLE + b"K\x01s",
+        b"}(K\x01K\x01" + TUPLE + b"K\x01u",
         b"}G" + bytes(8) + b"K\x01s",
         b"}\x8a\x08" + (2**61 - 1).to_bytes(8, "little") + b"K\x01s",
-        STORAGE % PAIRED,
+        STORAGE % TUPLE,
         b"K\x01Q",
     ],
     ids=["key", "second key", "float", "number whose hash is 0", "storage", "storage without a tuple"],
@@ -260,6 +261,34 @@ def test_keys_that_take_long_to_find_are_refused(tmp_path: Path, opcodes: bytes)
     with_pickle(path, b"\x80\x02" + opcodes + b".")
     with pytest.raises(CheckpointError, match=r"expected a pickle of tensors and plain data, got a (key|storage)"):
         checkpoint.load(path)
+
+
+@pytest.mark.parametrize(
+    ("opcodes", "why"),
+    [
+        (b"}X\x01\x00\x00\x00a" + PAIRED + b"s", "the same values too often"),
+        (b"]q\x00" + b"](h\x00h\x00eq\x00" * 200, "the same values too often"),
+        (b"}q\x00" + b"}(K\x01h\x00K\x02h\x00uq\x00" * 200, "the same values too often"),
+        (b"]q\x00]q\x01(h\x00h\x00e]q\x02(h\x01h\x01eh\x00K\x01a", "a list or dict that changes after its use"),
+        (b"]q\x00h\x00a", "a list or dict that changes after its use"),
+        (b"}q\x00K\x01h\x00s", "a list or dict that changes after its use"),
+        (b"]q\x00(K\x01h\x00e", "a list or dict that changes after its use"),
+    ],
+    ids=["tuples", "lists", "dicts", "filled later", "list in itself", "dict in itself", "in itself, of several"],
+)
+def test_values_that_are_repeated_without_end_are_refused(tmp_path: Path, opcodes: bytes, why: str) -> None:
+    """Whoever visits each of them, as an optimizer does, would never end."""
+    path = tmp_path / "model.pt"
+    with_pickle(path, b"\x80\x02" + opcodes + b".")
+    with pytest.raises(CheckpointError, match=why):
+        checkpoint.load(path)
+
+
+def test_values_may_be_shared(tmp_path: Path) -> None:
+    shared = [(0.9, 0.999), [1, {"a": (2, 3)}], {}]
+    saved = {"parts": [shared] * 20, "long": [[each] for each in shared * 1_000]}
+    checkpoint.save(tmp_path, saved, 100, keep=1)
+    assert checkpoint.newest(tmp_path)[0].state == saved
 
 
 def entry(name: bytes, data: bytes, offset: int, extra: bytes) -> bytes:
