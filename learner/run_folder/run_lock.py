@@ -1,11 +1,11 @@
 """The lock of a run folder, which ensures that only one process trains a run at a time.
 
 Rule: the file `run.lock` names the owner. On a single machine, the system's lock on this file (flock) decides; the kernel
-releases it when the process dies, however it dies. Machines that share the folder may not see each other's system locks, so
-the owner also rewrites the file every few seconds (`lease.py`); an owner on another machine that stops doing so counts as
-dead. The lock of a dead owner is taken over. An owner that finds the file missing recreates it, unless it hasn't renewed the
-file for so long that another process may have taken over the run and ended. Commands that only read a run folder don't need
-the lock.
+releases it when the process dies, however it dies. Machines that share the folder may not see each other's system locks, or
+may still see the lock of a machine that died. So the owner also rewrites the file every few seconds (`lease.py`); an owner
+on another machine that stops doing so counts as dead. The lock of a dead owner is taken over. An owner that finds the file
+missing recreates it, unless it hasn't renewed the file for so long that another process may have taken over the run and
+ended. Commands that only read a run folder don't need the lock.
 """
 
 from __future__ import annotations
@@ -19,12 +19,14 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from enum import Enum
 from pathlib import Path
 from types import TracebackType
 from typing import NamedTuple, Self
 
 from msgspec.structs import replace
 
+from millrace.learner.run_folder.atomic_write import TEMPORARY
 from millrace.learner.run_folder.lease import WIDTH, LeaseWatch, Listens, Owner, Unreachable, Verdict, decoded
 from millrace.learner.run_folder.regular_files import open_regular, read, reason
 from millrace.protocol.address import is_local
@@ -36,6 +38,14 @@ LOCK_FILE = "run.lock"
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 NETWORK = Path("/proc/self/ns/net")
 NUMBERS = Path("/proc/self/ns/pid")
+
+
+class SystemLock(Enum):
+    """Who has the system's lock on a file."""
+
+    OURS = "this process"
+    OTHERS = "another process, or a machine that died before it could release the lock"
+    NOBODYS = "nobody, because the file system has no locks"
 
 
 class Pace(NamedTuple):
@@ -162,19 +172,25 @@ class RunLock:
 
         Raises `UsageError` if the owner is alive.
         """
-        alone = self._lock_by_system()
+        locked = self._lock_by_system()
         if not self._is_open_file():
             return False
+        owner = decoded(self._read_open_file())
+        here = owner is not None and owner.boot_id == self._owner.boot_id
+        if locked is SystemLock.OTHERS and (here or owner is None):
+            raise self._refusal(owner)
         if made:
             self._write()
             return True
-        owner = decoded(self._read_open_file())
-        elsewhere = owner is None or owner.boot_id != self._owner.boot_id or not alone
+        elsewhere = not here or locked is SystemLock.NOBODYS
         if elsewhere:
             self._wait_until_dead(owner)
             if not self._is_open_file():
                 return False
-        self._write()
+        if locked is SystemLock.OTHERS:
+            self._replace_file()
+        else:
+            self._write()
         if elsewhere:
             self._sleep(self._pace.confirm_after)
             if not self._is_ours():
@@ -182,18 +198,29 @@ class RunLock:
         log.warning("run %s: %s held its lock and is gone; this process takes over", self._folder, owner or "a process")
         return True
 
-    def _lock_by_system(self) -> bool:
-        """Take the system's lock. Returns False if the file system has no locks.
-
-        Raises `UsageError` if another process has it.
-        """
+    def _lock_by_system(self) -> SystemLock:
+        """Try to take the system's lock on the open file. Returns who has the lock now."""
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise self._refusal(decoded(self._read_open_file())) from None
+            return SystemLock.OTHERS
         except OSError:
-            return False
-        return True
+            return SystemLock.NOBODYS
+        return SystemLock.OURS
+
+    def _replace_file(self) -> None:
+        """Replace the file with a new one, because a machine that died still has the system's lock on the old one."""
+        new = self._path.with_name(f"{LOCK_FILE}-{self._owner.token}{TEMPORARY}")
+        file = open_regular(new, os.O_RDWR | os.O_CREAT | os.O_EXCL)
+        self._close()
+        self._file = file
+        self._lock_by_system()
+        try:
+            self._write()
+            new.replace(self._path)
+        except OSError:
+            new.unlink(missing_ok=True)
+            raise
 
     def _wait_until_dead(self, owner: Owner | None) -> None:
         """Wait until the content has stayed the same for long enough, or the file is gone.
@@ -275,8 +302,7 @@ class RunLock:
         file = open_regular(self._path, os.O_RDWR | os.O_CREAT | os.O_EXCL)
         self._close()
         self._file = file
-        with suppress(OSError, UsageError):
-            self._lock_by_system()
+        self._lock_by_system()
         self._write()
 
     def _write(self) -> None:

@@ -171,6 +171,38 @@ def test_an_owner_elsewhere_that_is_dead_is_replaced_after_the_whole_time(
     assert "process 77 on far held its lock and is gone" in caplog.text
 
 
+@pytest.mark.parametrize("lives", [True, False])
+def test_a_system_lock_that_another_machine_seems_to_hold_is_judged_by_the_lease(tmp_path: Path, lives: bool) -> None:
+    """On some network file systems, the server keeps the lock of a machine that died."""
+    held_elsewhere(tmp_path)
+    time = Time(lambda now: held_elsewhere(tmp_path, count=int(now // 3)) if lives else None)
+    with (tmp_path / LOCK_FILE).open() as far:
+        fcntl.flock(far, fcntl.LOCK_EX)
+        if lives:
+            with pytest.raises(UsageError, match=rf"^run {tmp_path}: process 77 on far is training it"):
+                lock(tmp_path, time).__enter__()
+            assert owner_of(tmp_path).token == "theirs"
+        else:
+            with lock(tmp_path, time) as mine:
+                assert time.now >= 1000.0 + NEVER.dead_after
+                assert owner_of(tmp_path).pid == os.getpid()
+                mine.confirm()
+                with pytest.raises(UsageError, match=rf"process {os.getpid()} on \S+ is training it"):
+                    lock(tmp_path).__enter__()
+            assert not [*tmp_path.glob("*lock*")]
+
+
+def test_of_two_that_replace_a_locked_file_at_the_same_time_one_is_refused(tmp_path: Path) -> None:
+    held_elsewhere(tmp_path)
+    third = Owner(host="third", pid=5, boot_id="a third kernel", token="third")
+    time = Time(lambda now: (tmp_path / LOCK_FILE).write_bytes(third.encoded()) if now > 1030 else None)
+    with (tmp_path / LOCK_FILE).open() as far:
+        fcntl.flock(far, fcntl.LOCK_EX)
+        with pytest.raises(UsageError, match="process 5 on third is training it"):
+            lock(tmp_path, time).__enter__()
+    assert owner_of(tmp_path) == third
+
+
 def test_a_lock_that_is_released_while_one_waits_is_taken(tmp_path: Path) -> None:
     held_elsewhere(tmp_path)
     time = Time(lambda now: (tmp_path / LOCK_FILE).unlink(missing_ok=True) if now < 1002 else None)
