@@ -3,7 +3,8 @@
 Rule: the file ends with a complete row, and there is one row for each update. Rows that can't be written now are written
 later. The rows up to a checkpoint are flushed to the disk before the checkpoint, because a resumed run doesn't write them
 again. It removes the rows after its checkpoint. If the run was interrupted before an evaluation, the resumed run makes this
-evaluation and adds its metrics to the row of the same update.
+evaluation and adds its metrics to the row of the same update. If the run was killed while it wrote a row, the resumed run
+keeps the numbers of this row that are complete.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ log = logging.getLogger("millrace.learner")
 
 METRICS_FILE = "metrics.jsonl"
 MOST_LINE_BYTES = 1 << 16  # size of the longest row that is read while the file grows
+MOST_COMMAS = 10  # how many commas the last number of a row that is cut off may have in its name
 
 
 class MetricsLog:
@@ -44,7 +46,7 @@ class MetricsLog:
         """The number of rows that were removed."""
         try:
             if table.exists():
-                rows = read_rows(table)
+                rows = read_rows(table) + _cut_off_rows(table)
                 kept = [
                     row
                     for row in rows
@@ -124,6 +126,26 @@ def decoded_row(line: bytes) -> dict[str, Any] | None:
     except (*INVALID, KeyError, OverflowError):
         return None
     return row
+
+
+def _cut_off_rows(path: Path) -> list[dict[str, Any]]:
+    """The last row, if its end is missing, with the numbers before the place where it is cut off. Raises OSError.
+
+    Empty if the last row is complete, or if it isn't known to which update it belongs.
+    """
+    content = read(path, MOST_BYTES)
+    line = content.removesuffix(b"\n").rpartition(b"\n")[2]
+    if len(line) > MOST_LINE_BYTES:
+        return []
+    row = decoded_row(line)
+    if row is not None and content.endswith(b"\n"):
+        return []
+    for _ in range(MOST_COMMAS):
+        if row is not None:
+            break
+        line = line.rpartition(b",")[0]  # without the last number, which may lack digits
+        row = decoded_row(line + b"}")
+    return [row] if row is not None and UPDATES_KEY in row else []
 
 
 def _json_line(row: Row) -> bytes:

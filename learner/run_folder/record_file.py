@@ -1,6 +1,8 @@
 """A file of a run that grows by whole records, such as metrics.jsonl.
 
-Rule: the file ends with a whole record. Records that can't be written now wait in memory and are written later.
+Rule: the file ends with a whole record. Records that can't be written now wait in memory and are written later. A record
+that replaces the newest one is written over it, from the first byte that differs, so that a process that is killed leaves
+at least the bytes that both have in common, and no mixture of two numbers.
 """
 
 from __future__ import annotations
@@ -13,6 +15,7 @@ from pathlib import Path
 from millrace.learner.run_folder.regular_files import open_regular, subfolder
 from millrace.protocol.errors import RunError
 
+END = b"}\n"  # the end of a record that is replaced, which is a line of JSON
 MOST_WAITING = 100_000  # limit on the records that wait to be written; that many rows of metrics take 100 MB of memory
 
 
@@ -28,7 +31,7 @@ class RecordFile:
         self._path = run / name
         self._waiting: deque[bytes] = deque(maxlen=MOST_WAITING)
         self._bytes = 0
-        self._cut = 0  # number of bytes at the end of the file that the first waiting record replaces
+        self._replaced = b""  # the record at the end of the file that the first waiting record replaces
         self._open()
 
     @property
@@ -48,7 +51,7 @@ class RecordFile:
         if self._waiting:
             self._waiting.pop()
         else:
-            self._cut = len(newest)
+            self._replaced = newest
         self._waiting.append(record)
 
     def flush(self) -> None:
@@ -58,10 +61,10 @@ class RecordFile:
                 gone = self._file
                 self._open()
                 gone.close()
-            if self._cut:
-                self._file.truncate(self._bytes - self._cut)
-                self._bytes = self._bytes - self._cut
-                self._cut = 0
+            if self._replaced:
+                self._overwrite(self._replaced, self._waiting[0])
+                self._replaced = b""
+                self._waiting.popleft()
             while self._waiting:
                 rest = self._waiting[0]
                 while rest:  # if only a part was written, the next write raises and says why
@@ -84,6 +87,25 @@ class RecordFile:
         """Close the file without writing the waiting records."""
         self._file.close()
 
+    def _overwrite(self, old: bytes, new: bytes) -> None:
+        """Write `new` over `old`, the record at the end of the file. If that fails, `old` is restored as far as possible."""
+        differ = (at for at, (one, other) in enumerate(zip(old, new, strict=False)) if one != other)
+        equal = next(differ, min(len(old), len(new)))
+        begin = self._bytes - len(old)
+        file = open_regular(self._path, os.O_WRONLY)  # Linux appends even with `pwrite` to a file opened for appending
+        try:
+            if equal < len(old) - len(END):  # the new record changes a number
+                os.ftruncate(file, begin + equal)
+            _write_at(file, new[equal:], begin + equal)
+            os.ftruncate(file, begin + len(new))
+            self._bytes = begin + len(new)
+        except OSError:
+            with suppress(OSError):
+                _write_at(file, old[equal:], begin + equal)
+            raise
+        finally:
+            os.close(file)
+
     def _open(self) -> None:
         if self._path.parent == self._run:
             self._run.mkdir(parents=True, exist_ok=True)
@@ -92,4 +114,11 @@ class RecordFile:
         self._file = os.fdopen(open_regular(self._path, os.O_WRONLY | os.O_APPEND | os.O_CREAT), "ab", buffering=0)
         self._number = self._file.fileno()
         self._bytes = self._path.stat().st_size
-        self._cut = 0
+        self._replaced = b""
+
+
+def _write_at(file: int, rest: bytes, offset: int) -> None:
+    while rest:  # if only a part was written, the next write raises and says why
+        written = os.pwrite(file, rest, offset)
+        rest = rest[written:]
+        offset += written

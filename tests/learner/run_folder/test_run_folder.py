@@ -237,7 +237,56 @@ def test_a_resumed_run_takes_back_updates_that_only_reset_env_copies(tmp_path: P
     assert [row["time/iterations"] for row in read_rows(tmp_path / "metrics.jsonl")] == [1, 2, 3, 4]
 
 
-def test_rows_that_the_disk_refuses_are_written_later(tmp_path: Path) -> None:
+@pytest.mark.parametrize("added", [{"eval/mean_reward": 7.0}, {"train/loss": 12.5}, {"train/loss": None}])
+def test_a_row_that_gets_more_numbers_is_never_lost(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, added: dict[str, float | None]
+) -> None:
+    """The run is killed after any number of bytes, and resumed from its checkpoint of the same update."""
+    pwrite = os.pwrite
+    path = tmp_path / "metrics.jsonl"
+    progress = Progress(updates=2, env_steps=20, return_mean=1.5)
+
+    class Killed(BaseException):
+        pass
+
+    def killed(file: int, record: bytes, offset: int) -> int:
+        pwrite(file, record[:taken], offset)
+        raise Killed
+
+    taken = 0
+    while taken < 40:
+        path.unlink(missing_ok=True)
+        log = MetricsLog(tmp_path)
+        for updates in (1, 2):
+            log.write(Progress(updates=updates, env_steps=10 * updates, return_mean=1.5), {"n_updates": 3, "loss": 0.25})
+        log.flush()
+        before = read_rows(path)
+        log.write(progress, added)
+        with monkeypatch.context() as patched, pytest.raises(Killed):
+            patched.setattr(os, "pwrite", killed)
+            log.flush()
+        log._table.close()
+        log = MetricsLog(tmp_path, from_env_steps=20, from_update=2)
+        rows = read_rows(path)
+        assert len(rows) == 2
+        assert rows[0] == before[0]
+        assert rows[1].items() <= before[1].items() | added.items(), "a number is wrong"
+        assert before[1].keys() - rows[1].keys() <= {*added}, "only a number that was being replaced may be missing"
+        log.write(progress, added)
+        log.close()
+        assert read_rows(path) == [before[0], before[1] | added]
+        taken += 1
+
+
+def test_a_row_that_is_cut_off_before_its_update_is_known_is_dropped(tmp_path: Path) -> None:
+    for content in (b'{"a":1', b'{"time/total_timesteps":5,"a":1', b"{" + b'"a":1,' * 99, b"," * 99):
+        (tmp_path / "metrics.jsonl").write_bytes(content)
+        log = MetricsLog(tmp_path, from_env_steps=20, from_update=2)
+        log.close()
+        assert (tmp_path / "metrics.jsonl").read_bytes() == b""
+
+
+def test_rows_that_the_disk_refuses_are_written_later(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     log = MetricsLog(tmp_path)
     log.write(Progress(updates=1, env_steps=100), {})
     log.flush()
@@ -258,13 +307,34 @@ def test_rows_that_the_disk_refuses_are_written_later(tmp_path: Path) -> None:
             took.clear()
             file.truncate(length)
 
-    appender._file = Full()  # type: ignore[assignment]
+    pwrite = os.pwrite
+
+    def full(number: int, record: bytes, offset: int) -> int:
+        if offset + len(record) > len(first):
+            if took:
+                raise OSError(errno.EDQUOT, os.strerror(errno.EDQUOT))
+            took.append(pwrite(number, record[:10], offset))
+            return took[0]
+        return pwrite(number, record, offset)
+
+    first = (tmp_path / "metrics.jsonl").read_bytes()
     log.write(Progress(updates=1, env_steps=100), {"eval/mean_reward": 3.0})
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "pwrite", full)
+        for _ in range(2):
+            with pytest.raises(RunError, match=r"metrics\.jsonl: rows are not written yet: Disk quota exceeded$"):
+                log.flush()
+            assert (tmp_path / "metrics.jsonl").read_bytes() == first
+            took.clear()
+    log.flush()
+    first = (tmp_path / "metrics.jsonl").read_bytes()
+    appender._file = Full()  # type: ignore[assignment]
+    log.write(Progress(updates=2, env_steps=200), {})
     for updates in (2, 3):
         with pytest.raises(RunError, match=r"metrics\.jsonl: rows are not written yet: Disk quota exceeded$"):
             log.flush()
         log.write(Progress(updates=updates, env_steps=100 * updates), {})
-    assert (tmp_path / "metrics.jsonl").read_bytes() == b"", "a part of a row is left"
+    assert (tmp_path / "metrics.jsonl").read_bytes() == first, "a part of a row is left"
     log.write(Progress(updates=3, env_steps=300), {"eval/mean_reward": 5.0})
     appender._file = file
     log.flush()
