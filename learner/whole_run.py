@@ -70,7 +70,9 @@ def _learn_from_prior(run: OpenRun, prior: PriorData) -> None:
         if getattr(run.setup.config.algorithm, "clone_epochs", 0):
             if metrics := started_by("clone_epochs")(algorithm, prior.batches(), pulse):
                 run.audience.cloned(metrics)
-            run.parts.tally.state.next_evaluation = 0  # so that an evaluation is due, if the run makes any
+            state = run.parts.tally.state
+            if state.newest_evaluation is None and state.pending is None:
+                state.next_evaluation = 0  # so that an evaluation is due, if the run makes any
         algorithm.learn_from_prior(pulse)
     except Interrupted:
         run.files.save()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 import warnings
 from collections.abc import Iterator
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 from torch import Tensor
 
+from millrace import Callback, Progress
 from millrace.cli.main import main
 from millrace.extras.datasets import cloning
 from millrace.extras.datasets.demonstrations import Demonstrations
@@ -21,6 +23,7 @@ from millrace.launch.training import train
 from millrace.learner.algorithms.dqn import DQN
 from millrace.learner.algorithms.ppo import PPO
 from millrace.learner.algorithms.replay.transitions import Transitions
+from millrace.learner.callbacks.callbacks import Callbacks
 from millrace.learner.config.layers import resolve
 from millrace.learner.run_folder.metrics_log import read_rows
 from millrace.learner.run_folder.run_folder import Interrupted
@@ -175,6 +178,41 @@ def test_cloning_that_was_interrupted_goes_on(tmp_path: Path, monkeypatch: pytes
         run(tmp_path, "stopped", base=CLONED)
     resumed = run(tmp_path, "stopped", resume=stopped.value.run, base=CLONED)
     assert policy_of(resumed) == policy_of(whole)
+
+
+@pytest.mark.parametrize("eval_workers", [0, 1])
+def test_a_cloned_policy_is_evaluated_once_even_if_the_run_is_interrupted_then(tmp_path: Path, eval_workers: int) -> None:
+    class Evaluations(Callback):
+        def __init__(self, interrupts: str) -> None:
+            self.of_versions: list[int] = []
+            self._interrupts = interrupts
+
+        def on_evaluation(self, progress: Progress) -> None:
+            self.of_versions.append(progress.evaluated.version)
+            self._interrupt("on_evaluation")
+
+        def on_rollouts(self, progress: Progress) -> None:
+            self._interrupt("on_rollouts")
+
+        def _interrupt(self, moment: str) -> None:
+            if moment == self._interrupts:
+                raise KeyboardInterrupt
+
+    def evaluated(name: str, resume: Path | None = None, interrupts: str = "") -> list[int]:
+        told = Evaluations(interrupts)
+        config = resolve(
+            "" if resume else "CartPole-v1", run_dir=str(tmp_path / name), resume=resume,
+            **(CLONED | {"workers": 2, "eval_every": 200, "eval_workers": eval_workers}),
+        )  # fmt: skip
+        with pytest.raises(KeyboardInterrupt) if interrupts else nullcontext():
+            train(config, resume, Callbacks([told]))
+        return told.of_versions
+
+    whole = evaluated("whole")
+    before = evaluated("stopped", interrupts="on_rollouts" if eval_workers else "on_evaluation")
+    (stopped,) = (tmp_path / "stopped").iterdir()
+    assert before == ([] if eval_workers else [0])
+    assert before + evaluated("stopped", resume=stopped) == whole
 
 
 def test_an_interrupt_while_the_dataset_is_read_leaves_no_run_folder(
