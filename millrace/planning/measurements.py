@@ -69,6 +69,8 @@ class Measurements(msgspec.Struct, frozen=True, kw_only=True):
     images: bool = False
     goals: bool = False
     """whether its observations contain goals, as hindsight replay needs them"""
+    masks_in_info: bool = False
+    """whether its infos contain masks of the allowed actions"""
     observation_bytes: int = 0
     side_by_side: tuple[StepCosts, ...]
     """costs of a step for each number of workers that was tried, in ascending order; never empty"""

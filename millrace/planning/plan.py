@@ -104,6 +104,8 @@ def plan_of(env: ProbedEnv, *, max_env_copies: int, seconds: float, say: Callabl
     algorithm = choose_algorithm(measured, machine)
     config = resolve(env.name, algo=algorithm.value)
     others = _limits(max_env_copies, allowed)
+    if measured.masks_in_info:
+        others.append(ChosenSetting("action_masks", "info", "the infos contain masks of the allowed actions"))
     if isinstance(config.algorithm, OffPolicyConfig):
         replay_size = choose_replay_size(config.algorithm.replay_size, measured, machine)
         others += [] if replay_size is None else [replay_size]

@@ -26,13 +26,16 @@ from millrace.learner.vector_env.env import ZmqVectorEnv
 from millrace.learner.vector_env.settings import VectorEnvSettings
 from millrace.planning.measurements import WORKER_BYTES, ActionKind, Machine, Measurements, StepCosts
 from millrace.planning.stopwatch import CopyTimes, read_notes
-from millrace.protocol.arrays import Array
+from millrace.protocol.arrays import Array, Bools
 from millrace.protocol.bounds import one_line
 from millrace.protocol.env_spec import EnvLike, EnvSpec, Scalar
-from millrace.protocol.envs.spaces import observation_leaves
+from millrace.protocol.envs.action_masks import has_mask
+from millrace.protocol.envs.spaces import action_spec, observation_leaves
 from millrace.protocol.envs.wrappers import WrapperLike
 from millrace.protocol.errors import MillraceError, RunError, UsageError, first_line
 from millrace.protocol.policy.masks import MASK
+from millrace.workers.copies.env_errors import CopyFailed
+from millrace.workers.copies.mask_reader import MaskReader
 
 LEAST_STEPS = 8  # number of steps that each copy makes, even if they take longer than planned
 SCRIPT = 1009  # number of random actions, which all copies take in the same order, again and again
@@ -143,6 +146,7 @@ class _SteppedCopies(NamedTuple):
     start_s: float
     wrong: str
     """what went wrong, as one line; empty if nothing did"""
+    masks_in_info: bool
     observation_space: gymnasium.Space[Any]
     action_space: gymnasium.Space[Any]
     seats: tuple[str, ...]
@@ -178,6 +182,7 @@ def _session(env: ProbedEnv, workers: int, seconds: float, give_up_at_s: float, 
         traces: list[list[int]] = [[] for _ in range(copies)]
         wrong = ""
         known: tuple[Any, ...] = (None, None, (), None)
+        masks_in_info = False
         start_s = 0.0
         try:
             timeout_s = max(1.0, give_up_at_s - began_s)
@@ -195,7 +200,7 @@ def _session(env: ProbedEnv, workers: int, seconds: float, give_up_at_s: float, 
                 start_s = time.monotonic() - began_s
                 limit = None if envs.spec is None else envs.spec.max_episode_steps
                 known = (envs.single_observation_space, envs.single_action_space, envs.seats, limit)
-                _step(envs, traces, time.monotonic() + seconds, give_up_at_s)
+                masks_in_info = _step(envs, traces, time.monotonic() + seconds, give_up_at_s)
         except UsageError:
             raise
         except MillraceError as error:
@@ -203,42 +208,68 @@ def _session(env: ProbedEnv, workers: int, seconds: float, give_up_at_s: float, 
                 raise
             wrong = one_line(first_line(error, type(error).__name__))
         times = [each for each in read_notes(notes) if len(each.resets)]
-        return _SteppedCopies(times, traces, start_s, wrong, *known)
+        return _SteppedCopies(times, traces, start_s, wrong, masks_in_info, *known)
 
 
-def _step(envs: ZmqVectorEnv, traces: list[list[int]], end_at_s: float, give_up_at_s: float) -> None:
-    """Step all copies until `end_at_s`, each one again as soon as its step has ended."""
+def _step(envs: ZmqVectorEnv, traces: list[list[int]], end_at_s: float, give_up_at_s: float) -> bool:
+    """Step all copies until `end_at_s`, each one again as soon as its step has ended. Actions that a mask forbids are never
+    taken.
+
+    Returns whether the masks are in the infos.
+    """
     agents = max(1, len(envs.seats))
-    envs.single_action_space.seed(SEED)
-    script = [envs.single_action_space.sample() for _ in range(SCRIPT)]
+    space = envs.single_action_space
+    space.seed(SEED)
+    script = [space.sample() for _ in range(SCRIPT)]
+    masks = MaskReader(envs.single_observation_space, space)
+    spec = action_spec(space)
+    starts = np.cumsum(spec.sizes)[:-1].tolist()  # of the entries of an action, except for the first one
+    in_observation = has_mask(envs.single_observation_space, space)
+    masks_in_info = False
     envs.reset_async(seed=[SEED] * len(traces))
     while envs.outstanding:
         observation, reward, terminated, truncated, infos = envs.recv(timeout=max(1.0, give_up_at_s - time.monotonic()))
         ready = infos["env_id"].tolist()
+        over = np.ones(len(ready) * agents, bool)  # so that no row needs a mask
+        try:
+            allowed = masks.read_all(observation, infos, terminated=~over, truncated=over)
+            masks_in_info |= bool(spec.choices) and not in_observation and MASK in infos
+        except CopyFailed:  # what is called a mask isn't one
+            allowed = np.broadcast_to(masks.everything, (len(over), spec.choices))
         actions = []
         for i, copy in enumerate(ready):
             rows = slice(i * agents, (i + 1) * agents)
             shown = [array[rows] for array in _arrays(observation)]
             traces[copy].append(_digest([*shown, reward[rows], terminated[rows], truncated[rows]]))
-            masks = observation[MASK][rows] if isinstance(observation, dict) and MASK in observation else [None] * agents
-            for seat, mask in enumerate(masks):
-                number = len(traces[copy]) * agents + seat
-                actions.append(_allowed(script, number, mask, envs.single_action_space))
+            for seat, mask in enumerate(allowed[rows]):
+                action = script[(len(traces[copy]) * agents + seat) % SCRIPT]
+                actions.append(action if mask.all() else _allowed(space, action, iter(np.split(mask, starts))))
         now_s = time.monotonic()
         if now_s < give_up_at_s and (now_s < end_at_s or min(map(len, traces)) <= LEAST_STEPS):
-            space = envs.single_action_space
             into: Any = create_empty_array(space, len(actions))
             batch = concatenate(space, actions, into)
             envs.send(batch, ready)
+    return masks_in_info
 
 
-def _allowed(script: Sequence[Any], number: int, mask: Array | None, space: gymnasium.Space[Any]) -> Any:
-    """The action with this number in the script, or another one if the mask doesn't allow it."""
-    action = script[number % SCRIPT]
-    if mask is None or not isinstance(space, spaces.Discrete) or not np.any(mask):
-        return action
+def _allowed(space: gymnasium.Space[Any], action: Any, masks: Iterator[Bools]) -> Any:
+    """The action with an allowed choice in each entry. `masks` are the masks of the entries, in the order of the space."""
+    match space:
+        case spaces.Dict():
+            return {key: _allowed(inner, action[key], masks) for key, inner in space.spaces.items()}
+        case spaces.Tuple():
+            return tuple(_allowed(inner, part, masks) for inner, part in zip(space.spaces, action, strict=True))
+        case spaces.Discrete() | spaces.MultiDiscrete():
+            chosen = [_allowed_choice(choice, next(masks)) for choice in np.ravel(action - space.start).tolist()]
+            return space.start + np.reshape(chosen, space.shape or ()).astype(space.dtype)
+        case _:
+            return action
+
+
+def _allowed_choice(choice: int, mask: Bools) -> int:
+    """An allowed choice that depends only on the given one and on the mask [choices]."""
     allowed = np.flatnonzero(mask)
-    return space.start + allowed[(int(action) - space.start) % len(allowed)]
+    return int(allowed[choice % len(allowed)])
 
 
 def _arrays(observation: Any) -> Iterator[Array]:
@@ -281,6 +312,7 @@ def _measured_alone(env: ProbedEnv, session: _SteppedCopies) -> Measurements:
         agents=max(1, len(session.seats)),
         action=_kind(session.action_space),
         images=any(leaf.is_image for leaf in leaves),
+        masks_in_info=session.masks_in_info,
         goals={"achieved_goal", "desired_goal"} <= {*keys},
         observation_bytes=sum(math.prod(leaf.shape) * np.dtype(leaf.dtype).itemsize for leaf in leaves),
         side_by_side=(_costs(1, session.times),),

@@ -13,6 +13,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
+from millrace.protocol.envs.spaces import make_flatten, make_unflatten
 from millrace.protocol.policy.masks import MASK
 
 
@@ -101,6 +102,12 @@ class StandInOfAgents:
 def shown(space: gymnasium.Space[Any]) -> Any:
     """A random observation of this space. If it has an action mask, the mask allows every action."""
     observation = space.sample()
-    if isinstance(observation, dict) and MASK in observation:
-        observation[MASK] = np.ones_like(observation[MASK])
+    if isinstance(space, gymnasium.spaces.Dict) and MASK in space.spaces:
+        observation[MASK] = _ones(space.spaces[MASK])
     return observation
+
+
+def _ones(mask: gymnasium.Space[Any]) -> Any:
+    """A mask of this space that allows every action."""
+    parts = make_flatten(mask)(mask.sample())
+    return make_unflatten(mask)([np.ones_like(part) for part in parts])

@@ -113,6 +113,15 @@ def test_a_stand_in_never_ends_and_allows_every_action() -> None:
     assert env.step(3)[2:4] == (False, False)
 
 
+def test_a_stand_in_allows_every_action_if_its_mask_has_parts() -> None:
+    bits = gymnasium.spaces.Tuple([gymnasium.spaces.MultiBinary(3), gymnasium.spaces.Discrete(2)])
+    masked = gymnasium.spaces.Dict({"action_mask": bits, "x": gymnasium.spaces.Box(-1, 1, (3,))})
+    first, second = shown(masked)["action_mask"]
+    assert first.tolist() == [1, 1, 1]
+    assert second == 1
+    assert masked.contains(shown(masked))
+
+
 def test_its_rewards_are_the_cpu_time_of_the_worker_whichever_of_its_copies_is_stepped() -> None:
     spaces = gymnasium.spaces.Box(-1, 1, (3,)), gymnasium.spaces.Discrete(4)
     copies = StandIn(*spaces), StandIn(*spaces, wait_s=0.005)

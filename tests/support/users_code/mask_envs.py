@@ -107,7 +107,24 @@ class InObservation(_Masked):
         return {"seen": observation, **info}, self._info
 
 
+class PartsInObservation(Parts):
+    """A MultiDiscrete action, with a tuple of masks under a key of a Dict observation."""
+
+    observation_space: Any = Dict(
+        {"action_mask": Tuple([MultiBinary(size) for size in SIZES]), "seen": Parts.observation_space}
+    )
+
+    def given(self, bits: Any) -> Any:
+        return tuple(np.split(bits.astype(np.int8), np.cumsum(SIZES)[:-1]))
+
+    def _next(self, ended: bool = False) -> tuple[Any, dict[str, Any]]:
+        observation, info = super()._next(ended)
+        self._info = {}
+        return {"seen": observation, **info}, self._info
+
+
 gymnasium.register("Mixed-v0", "tests.support.users_code.mask_envs:Mixed")
 gymnasium.register("InInfo-v0", "tests.support.users_code.mask_envs:InInfo")
 gymnasium.register("Parts-v0", "tests.support.users_code.mask_envs:Parts")
 gymnasium.register("InObservation-v0", "tests.support.users_code.mask_envs:InObservation")
+gymnasium.register("PartsInObservation-v0", "tests.support.users_code.mask_envs:PartsInObservation")

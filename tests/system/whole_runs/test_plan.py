@@ -17,6 +17,8 @@ import pytest
 import millrace
 from millrace.cli.main import main
 from millrace.learner.config.command_line import read_config
+from millrace.planning.measurements import Machine
+from millrace.planning.probe import LEAST_STEPS, ProbedEnv, probe
 from millrace.protocol.errors import RunError, UsageError
 
 TOY = "tests.support.envs.toy"
@@ -139,3 +141,23 @@ def test_if_no_step_can_be_made_the_error_says_why() -> None:
         millrace.plan(f"{TOY}:Hangs", env_kwargs={"after": 0}, seconds=BRIEF_S)
     with pytest.raises(UsageError, match="seconds: expected at least 5, got 1"):
         millrace.plan("CartPole-v1", seconds=1)
+
+
+@pytest.mark.parametrize("name", ["InInfo", "InObservation", "Parts", "PartsInObservation", "Mixed"])
+def test_random_actions_are_allowed_ones_in_whichever_form_masks_come(name: str) -> None:
+    """The environments raise for any other action."""
+    env = ProbedEnv(f"tests.support.users_code.mask_envs:{name}-v0", {}, ())
+    measured = probe(env, Machine(cores=1), seconds=3).measured
+    assert measured.findings == ()
+    assert measured.alone.steps >= LEAST_STEPS
+    assert measured.masks_in_info == ("InObservation" not in name)
+
+
+def test_an_environment_with_a_tuple_of_masks_gets_a_plan_that_trains(tmp_path: Path) -> None:
+    env = "tests.support.users_code.mask_envs:{}-v0"
+    plan = millrace.plan(env.format("PartsInObservation"), seconds=BRIEF_S)
+    assert "action_masks" not in plan.settings
+    plan = millrace.plan(env.format("Parts"), seconds=BRIEF_S)
+    assert plan.settings["action_masks"] == "info"
+    settings: dict[str, Any] = {"steps": 64, "eval_episodes": 1, "max_env_failures": 0, "run_dir": str(tmp_path)}
+    millrace.train(plan.env, progress=False, **plan.settings, **settings)
