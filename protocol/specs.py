@@ -6,6 +6,7 @@ import math
 from typing import Literal
 
 import msgspec
+import numpy as np
 
 from millrace.protocol.bounds import MAX_FACTS, MAX_NAME, one_line
 from millrace.protocol.call_timeouts import CallTimeouts
@@ -119,6 +120,14 @@ class ActionSpec(msgspec.Struct, frozen=True):
     def numbers(self) -> int:
         """Number of continuous elements (box, mixed); the policy has a standard deviation for each."""
         return len(self.low)
+
+    @property
+    def unbounded(self) -> tuple[float, float] | None:
+        """The first bounds (box) of which one is so large that it means "no bound"; None if there are no such bounds."""
+        if self.kind != "box":
+            return None
+        largest = min(float(np.finfo(kind).max) for kind in (self.dtype, "float32"))
+        return next(((low, high) for low, high in zip(self.low, self.high, strict=True) if max(-low, high) >= largest), None)
 
 
 class NamedShape(msgspec.Struct, frozen=True, array_like=True):

@@ -34,6 +34,7 @@ from millrace.protocol.envs.spaces import action_spec, observation_leaves
 from millrace.protocol.envs.wrappers import WrapperLike
 from millrace.protocol.errors import MillraceError, RunError, UsageError, first_line
 from millrace.protocol.policy.masks import MASK
+from millrace.protocol.specs import ActionSpec
 from millrace.workers.copies.env_errors import CopyFailed
 from millrace.workers.copies.mask_reader import MaskReader
 
@@ -310,7 +311,7 @@ def _measured_alone(env: ProbedEnv, session: _SteppedCopies) -> Measurements:
     return Measurements(
         env=env.name,
         agents=max(1, len(session.seats)),
-        action=_kind(session.action_space),
+        action=_kind(action_spec(session.action_space)),
         images=any(leaf.is_image for leaf in leaves),
         masks_in_info=session.masks_in_info,
         goals={"achieved_goal", "desired_goal"} <= {*keys},
@@ -343,11 +344,11 @@ def _with_all(measured: Measurements, sessions: Sequence[_SteppedCopies]) -> Mea
     )
 
 
-def _kind(space: gymnasium.Space[Any]) -> ActionKind:
-    match space:
-        case spaces.Box() if space.is_bounded("both"):
+def _kind(action: ActionSpec) -> ActionKind:
+    match action.kind:
+        case "box" if action.unbounded is None:
             return "box"
-        case spaces.Discrete():
+        case "discrete":
             return "discrete"
     return "other"
 

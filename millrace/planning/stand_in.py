@@ -12,6 +12,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium import spaces
 
 from millrace.protocol.envs.spaces import make_flatten, make_unflatten
 from millrace.protocol.policy.masks import MASK
@@ -100,11 +101,29 @@ class StandInOfAgents:
 
 
 def shown(space: gymnasium.Space[Any]) -> Any:
-    """A random observation of this space. If it has an action mask, the mask allows every action."""
-    observation = space.sample()
-    if isinstance(space, gymnasium.spaces.Dict) and MASK in space.spaces:
+    """A random observation of this space. If it has an action mask, the mask allows every action.
+
+    Its floats are as close to 0 as those of an environment, because bounds may be so large that they say nothing.
+    """
+    observation = _with_small_floats(space).sample()
+    if isinstance(space, spaces.Dict) and MASK in space.spaces:
         observation[MASK] = _ones(space.spaces[MASK])
     return observation
+
+
+def _with_small_floats(space: gymnasium.Space[Any]) -> gymnasium.Space[Any]:
+    """The part of the space whose floats differ by at most 1 from 0, or from the bound that is nearest to 0."""
+    match space:
+        case spaces.Dict():
+            return spaces.Dict([(key, _with_small_floats(inner)) for key, inner in space.spaces.items()])
+        case spaces.Tuple():
+            return spaces.Tuple(map(_with_small_floats, space.spaces))
+        case spaces.Box() if space.dtype.kind == "f":
+            nearest = np.clip(np.zeros_like(space.low), space.low, space.high)
+            kind: Any = space.dtype.type
+            return spaces.Box(np.maximum(space.low, nearest - 1), np.minimum(space.high, nearest + 1), dtype=kind)
+        case _:
+            return space
 
 
 def _ones(mask: gymnasium.Space[Any]) -> Any:

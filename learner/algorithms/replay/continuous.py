@@ -93,13 +93,12 @@ class Continuous(OffPolicy):
         if action.kind != "box":
             others = "ppo or dqn" if action.kind == "discrete" else "ppo"
             raise UsageError(f"{name}: expected an action space Box, got {action.in_words}; take --algo {others} for it")
-        largest = min(float(np.finfo(kind).max) for kind in (action.dtype, "float32"))  # a bound this large means "no bound"
-        for low, high in zip(action.low, action.high, strict=True):
-            if max(-low, high) >= largest:
-                raise UsageError(
-                    f"{name}: expected an action Box with finite bounds, got {low:g} to {high:g}; "
-                    "take --algo ppo, or give the Box the bounds between which good actions are"
-                )
+        if action.unbounded is not None:
+            low, high = action.unbounded
+            raise UsageError(
+                f"{name}: expected an action Box with finite bounds, got {low:g} to {high:g}; "
+                "take --algo ppo, or give the Box the bounds between which good actions are"
+            )
         return replace(OffPolicy.policy_spec(config, observation, action), **head)
 
     def __init__(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import time
 from pathlib import Path
@@ -111,6 +112,22 @@ def test_a_stand_in_never_ends_and_allows_every_action() -> None:
     observation, _ = env.reset(seed=1)
     assert masked.contains(observation)
     assert env.step(3)[2:4] == (False, False)
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
+@pytest.mark.parametrize(("low", "high"), [(-math.inf, math.inf), (None, None), (0.0, None), (-0.25, 0.25), (100.0, 1e4)])
+def test_a_stand_in_shows_small_numbers_of_its_space_whatever_its_bounds(
+    dtype: Any, low: float | None, high: float | None
+) -> None:
+    """A bound of None is the largest number of the dtype."""
+    largest = float(np.finfo(dtype).max)
+    box = gymnasium.spaces.Box(-largest if low is None else low, largest if high is None else high, (50,), dtype)
+    space = gymnasium.spaces.Dict({"x": gymnasium.spaces.Tuple([box, gymnasium.spaces.Discrete(3, start=5)])})
+    found = shown(space)
+    assert space.contains(found)
+    numbers = found["x"][0].tolist()
+    assert max(map(abs, numbers)) <= (101.0 if low == 100.0 else 1.0)
+    assert len(set(numbers)) > 10
 
 
 def test_a_stand_in_allows_every_action_if_its_mask_has_parts() -> None:

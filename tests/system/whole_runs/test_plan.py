@@ -23,6 +23,7 @@ from millrace.protocol.errors import RunError, UsageError
 
 TOY = "tests.support.envs.toy"
 BRIEF_S = 6.0
+LARGEST = float(np.finfo(np.float32).max)
 
 
 class Forgets(gymnasium.Env[Any, Any]):
@@ -161,3 +162,28 @@ def test_an_environment_with_a_tuple_of_masks_gets_a_plan_that_trains(tmp_path: 
     assert plan.settings["action_masks"] == "info"
     settings: dict[str, Any] = {"steps": 64, "eval_episodes": 1, "max_env_failures": 0, "run_dir": str(tmp_path)}
     millrace.train(plan.env, progress=False, **plan.settings, **settings)
+
+
+class Boundless(gymnasium.Env[Any, Any]):
+    """Waits for 20 ms in each step. Its bounds are float32's largest numbers, which say nothing."""
+
+    observation_space = gymnasium.spaces.Box(-LARGEST, LARGEST, (4,), np.float32)
+
+    def __init__(self, continuous: bool) -> None:
+        box = gymnasium.spaces.Box(-LARGEST, LARGEST, (1,), np.float32)
+        self.action_space: gymnasium.Space[Any] = box if continuous else gymnasium.spaces.Discrete(2)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        return np.zeros(4, np.float32), {}
+
+    def step(self, action: Any) -> Any:
+        time.sleep(0.02)
+        return np.zeros(4, np.float32), 0.0, False, False, {}
+
+
+@pytest.mark.parametrize(("continuous", "algo"), [(False, "rainbow"), (True, "ppo")])
+def test_bounds_that_say_nothing_fit_a_plan(continuous: bool, algo: str) -> None:
+    plan = millrace.plan(Boundless, env_kwargs={"continuous": continuous}, max_env_copies=2, seconds=BRIEF_S)
+    assert plan.settings["algo"] == algo, "those for continuous actions need bounds"
+    assert plan.steps_per_s > 0
