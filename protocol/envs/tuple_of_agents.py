@@ -1,6 +1,7 @@
 """`millrace:TupleOfAgents`, a wrapper for multi-agent gymnasium environments whose spaces are Tuples.
 
-Rule: element i of the observations, actions and rewards is agent i's, and an episode ends for all agents at once.
+Rule: element i of the observations, actions and rewards is agent i's. An episode ends for all agents at once: when each of
+them is terminated or truncated.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
+from millrace.protocol.arrays import Bools
 from millrace.protocol.bounds import one_line
 from millrace.protocol.envs.answers import WrongAnswer, reset_answer, wrong_step
 from millrace.protocol.errors import UsageError, safe_repr
@@ -49,7 +51,7 @@ class TupleOfAgents:
     >>> env.possible_agents
     ['agent_0', 'agent_1']
     >>> env.reset()
-    ({'agent_0': 0, 'agent_1': 1}, {})
+    ({'agent_0': 0, 'agent_1': 1}, {'agent_0': {}, 'agent_1': {}})
     """
 
     def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
@@ -83,13 +85,11 @@ class TupleOfAgents:
         """The agent's element of the action space."""
         return self._action_spaces[agent]
 
-    def reset(
-        self, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
-        """Begin an episode with all agents. Returns the observations by agent, and an empty dict of infos."""
-        observations, _ = reset_answer(self.env.reset(seed=seed, options=options))
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Begin an episode with all agents. Returns observations and infos, by agent."""
+        observations, info = reset_answer(self.env.reset(seed=seed, options=options))
         self.agents = list(self.possible_agents)
-        return self._by_agent("observation", observations), {}
+        return self._by_agent("observation", observations), dict.fromkeys(self.possible_agents, info)
 
     def step(self, actions: dict[str, Any]) -> tuple[dict[str, Any], ...]:
         """Step with the actions of all agents. Returns observations, rewards, terminated, truncated and infos, by agent."""
@@ -98,16 +98,22 @@ class TupleOfAgents:
             observations, rewards, terminated, truncated, info = answer
         except (TypeError, ValueError) as error:
             raise wrong_step(answer) from error
-        ends = bool(np.all(terminated)), bool(np.all(truncated))
-        if any(ends):
+        terminates, truncates = self._flags(terminated), self._flags(truncated)
+        over = bool((terminates | truncates).all())
+        if over:
             self.agents = []
         return (
             self._by_agent("observation", observations),
             self._by_agent("reward", rewards),
-            dict.fromkeys(self.possible_agents, ends[0]),
-            dict.fromkeys(self.possible_agents, ends[1]),
+            dict(zip(self.possible_agents, (terminates & over).tolist(), strict=True)),
+            dict(zip(self.possible_agents, (truncates & over).tolist(), strict=True)),
             dict.fromkeys(self.possible_agents, info),
         )
+
+    def _flags(self, given: Any) -> Bools:
+        """The flag of each agent, from one for each agent or from one for all."""
+        flags = np.ravel(given).astype(bool)
+        return flags if len(flags) == len(self.possible_agents) else np.full(len(self.possible_agents), flags.all())
 
     def _by_agent(self, what: str, values: Any) -> dict[str, Any]:
         if not isinstance(values, Sequence | np.ndarray) or len(values) != len(self.possible_agents):

@@ -73,6 +73,51 @@ def test_one_reward_for_all_agents_is_named() -> None:
         env.step(action)
 
 
+class Ending(Lamps):
+    """Returns these flags in each step, and an info with a mask in each reset and step."""
+
+    def __init__(self, terminated: Any, truncated: Any) -> None:
+        super().__init__()
+        self._flags = terminated, truncated
+        self.told = {"action_mask": np.array([1, 0, 1], np.int8)}
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        return super().reset(seed=seed)[0], self.told
+
+    def step(self, action: Any) -> Any:
+        return *super().step(action)[:2], *self._flags, self.told
+
+
+@pytest.mark.parametrize(
+    ("terminated", "truncated", "expected"),
+    [
+        (True, False, ([True, True], [False, False])),
+        (True, True, ([True, True], [True, True])),
+        (np.array([False]), np.array([True]), ([False, False], [True, True])),
+        ([True, False], [False, True], ([True, False], [False, True])),
+        ((True, True), (False, True), ([True, True], [False, True])),
+        (np.array([True, False]), np.array([True, False]), None),
+        ([True, False], False, None),
+        (False, [False, True], None),
+    ],
+)
+def test_an_episode_ends_once_each_agent_is_terminated_or_truncated(terminated: Any, truncated: Any, expected: Any) -> None:
+    env = millrace.TupleOfAgents(Ending(terminated, truncated))
+    env.reset(seed=1)
+    action = dict(zip(env.possible_agents, Lamps().action_space.sample(), strict=True))
+    flags = [list(by_agent.values()) for by_agent in env.step(action)[2:4]]
+    assert flags == list(expected or ([False, False], [False, False]))
+    assert env.agents == ([] if expected else env.possible_agents)
+
+
+def test_each_agent_gets_the_info_of_a_reset_and_of_a_step() -> None:
+    plain = Ending(False, False)
+    env = millrace.TupleOfAgents(plain)
+    infos = [env.reset(seed=1)[1]]
+    infos.append(env.step(dict(zip(env.possible_agents, Lamps().action_space.sample(), strict=True)))[4])
+    assert infos == [{"agent_0": plain.told, "agent_1": plain.told}] * 2
+
+
 class Uneven(Lamps):
     """Has an observation less than actions."""
 
