@@ -64,6 +64,11 @@ def train(run: OpenRun, workers: int, cores: CrowdedCores) -> str:
             audience.evaluated(metrics)
             files.save()
 
+    def evaluate() -> None:
+        """Make the evaluation that is due, or begin it. The result of the previous one comes first: it may end the run."""
+        tell(evaluations.end_pending(audience.show_now))
+        tell(evaluations.evaluate_when_due(audience.show_now))
+
     files.save()
     try:
         hub.wait_for(workers)
@@ -71,7 +76,7 @@ def train(run: OpenRun, workers: int, cores: CrowdedCores) -> str:
         tell(evaluations.begin_again(audience.env_attributes(), audience.show_now))
         publish(acting_weights(algorithm, policy))
         if tally.evaluation_is_due():  # true if the run was interrupted before this evaluation
-            tell(evaluations.evaluate_when_due(audience.show_now))
+            evaluate()
         while (reason := tally.stop_reason()) is None:
             arrived = hub.gather(audience.show_now)
             began_s = time.monotonic()
@@ -92,7 +97,7 @@ def train(run: OpenRun, workers: int, cores: CrowdedCores) -> str:
             audience.updated(metrics | tally.ratings())
             if tally.evaluation_is_due():
                 files.save()  # before the evaluation, which may take long
-                tell(evaluations.evaluate_when_due(audience.show_now))
+                evaluate()
             else:
                 files.save_if_due()
         tally.training_ended()

@@ -63,21 +63,20 @@ class Evaluations:
     def evaluate_when_due(self, watch: Callable[[], None]) -> Row | None:
         """Evaluate the newest policy, because an evaluation is due. Returns the metrics of the evaluation.
 
-        With `eval_workers`, only begins the evaluation, and returns the metrics of the previous one, or None for the first.
-        `watch` is called several times a second while this waits.
+        With `eval_workers`, only begins the evaluation, and returns None. The previous one must have ended (`end_pending`),
+        and if its result ended the run, no other begins. `watch` is called several times a second while this waits.
         """
         if not self._config.eval_workers:
             evaluation = self._evaluate_newest(evaluation_size(self._config), watch)
             self._keep_if_best(evaluation, self._state.env_steps, self._run.algorithm.weights)
             self._tally.evaluated()
             return evaluation.metrics()
-        metrics = self.end_pending(watch)
-        self._tally.evaluated()
         if self._tally.stop_reason() is None:
+            self._tally.evaluated()
             self._state.pending = EvaluatedPolicy(self._state.version, self._state.env_steps)
             self._state.pending_policy = self._run.algorithm.weights()
             self._begin_beside()
-        return metrics
+        return None
 
     def end_pending(self, watch: Callable[[], None]) -> Row | None:
         """Wait for the evaluation that runs alongside training, if there is one.

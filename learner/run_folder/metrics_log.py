@@ -5,6 +5,9 @@ later. The rows up to a checkpoint are flushed to the disk before the checkpoint
 again. It removes the rows after its checkpoint. If the run was interrupted before an evaluation, the resumed run makes this
 evaluation and adds its metrics to the row of the same update. If the run was killed while it wrote a row, the resumed run
 keeps the numbers of this row that are complete.
+
+A row has room for one evaluation. If evaluations of two policies end after the same update, the row is repeated with the
+metrics of the second.
 """
 
 from __future__ import annotations
@@ -21,6 +24,7 @@ from millrace.learner.run_folder.atomic_write import write_atomically
 from millrace.learner.run_folder.progress import ENV_STEPS_KEY, UPDATES_KEY, Progress, Row, named
 from millrace.learner.run_folder.record_file import RecordFile
 from millrace.learner.run_folder.regular_files import MOST_BYTES, read
+from millrace.learner.run_folder.results import EVALUATED_AT_KEY, EVALUATION_KEY
 from millrace.protocol.bounds import INVALID, Natural
 from millrace.protocol.errors import RunError
 
@@ -67,14 +71,19 @@ class MetricsLog:
     def write(self, progress: Progress, train: Row) -> None:
         """Add a row, which `flush` writes. `train` are the metrics of the algorithm, of an evaluation, or of callbacks.
 
-        If the newest row belongs to the same update, the metrics are added to that row.
+        If the newest row belongs to the same update, the metrics are added to that row, or to a copy of it if it has the
+        evaluation of another policy.
         """
         row: Row = progress.row(train)
-        if all(self._newest.get(key) == row[key] for key in (UPDATES_KEY, ENV_STEPS_KEY)):
-            row = {**self._newest, **named(train)}
-            self._table.replace(_json_line(self._newest), _json_line(row))
-        else:
+        newest = self._newest
+        if not newest or _update(newest) != _update(row):
             self._table.append(_json_line(row))
+        elif EVALUATION_KEY in newest and EVALUATION_KEY in row and _evaluated(newest) != _evaluated(row):
+            row = {name: number for name, number in newest.items() if not name.startswith("eval/")} | named(train)
+            self._table.append(_json_line(row))
+        else:
+            row = {**newest, **named(train)}
+            self._table.replace(_json_line(newest), _json_line(row))
         self._newest = row
 
     def flush(self) -> None:
@@ -111,6 +120,16 @@ def read_and_count_rows(path: Path) -> tuple[list[dict[str, Any]], int]:
     *lines, _ = read(path, MOST_BYTES).split(b"\n")
     rows = [row for line in lines if (row := decoded_row(line)) is not None]
     return rows, len(lines) - len(rows)
+
+
+def _update(row: Row) -> tuple[Any, Any]:
+    """The number of the update to which a row belongs, and its env steps."""
+    return row.get(UPDATES_KEY), row[ENV_STEPS_KEY]
+
+
+def _evaluated(row: Row) -> Any:
+    """The env steps of the policy to which the evaluation in a row belongs."""
+    return row.get(EVALUATED_AT_KEY, row[ENV_STEPS_KEY])
 
 
 _DECODER = msgspec.json.Decoder(dict[str, int | float | None])

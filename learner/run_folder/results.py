@@ -195,9 +195,9 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     evaluation: Evaluation | None
     """evaluation of the final policy by greedy episodes; None if the run was cut short before it"""
     ended_by: Real | None = None
-    """the mean return of the evaluation that ended the run by reaching `target_return`, or, if a callback ended the run, of
-    the final policy's evaluation that the callback could see. Such a return is biased upwards. So if the final policy has
-    it, `evaluation` is a second evaluation, on other episodes
+    """the mean return of the evaluation that ended the run by reaching `target_return`; if a callback ended the run, the
+    mean return of the final policy if the callback could know it. Such a return is biased upwards, so if it is a return of
+    the final policy, `evaluation` is a second evaluation, on other episodes
     """
     best: Best | None = None
     """the best policy of the run's own evaluations, if there were any"""

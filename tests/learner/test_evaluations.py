@@ -17,6 +17,7 @@ from millrace.learner.config.config import Config
 from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan, PlayedEpisode, evaluation_of
 from millrace.learner.rollouts.hub import Hub
 from millrace.learner.run_folder.atomic_write import Writes
+from millrace.learner.run_folder.progress import Row
 from millrace.learner.run_folder.results import EvaluatedPolicy
 from millrace.learner.run_folder.run_folder import RunFolder
 from millrace.learner.run_state import RunState
@@ -77,9 +78,15 @@ def due(parts: tuple[Tally, Evaluations], *env_steps: int) -> list[int]:
     tally, evaluations = parts
     for tally.state.version, tally.state.env_steps in enumerate(env_steps, 1):
         if tally.evaluation_is_due():
-            evaluations.evaluate_when_due(lambda: None)
+            evaluate(evaluations)
             made.append(tally.state.env_steps)
     return made
+
+
+def evaluate(evaluations: Evaluations) -> Row | None:
+    """Make the evaluation that is due, as `train` does. Returns the metrics that it reports."""
+    before = evaluations.end_pending(lambda: None)
+    return evaluations.evaluate_when_due(lambda: None) or before
 
 
 def test_one_evaluation_follows_each_multiple_of_eval_every() -> None:
@@ -135,7 +142,7 @@ def test_when_a_run_stops_and_which_policy_it_keeps(
     tally, evaluations = fakes.evaluations(100, state, eval_workers=eval_workers, target_return=5.0, steps=433, envs=4)
     found = []
     for state.version, state.env_steps in enumerate(range(30, 431, 10), 1):
-        if tally.evaluation_is_due() and evaluations.evaluate_when_due(lambda: None) is not None:
+        if tally.evaluation_is_due() and evaluate(evaluations) is not None:
             found.append(state.evaluated.env_steps)
         if (stop := tally.stop_reason()) is not None:
             break
@@ -212,7 +219,7 @@ def test_a_return_that_decided_nothing_is_reported_as_it_was_found() -> None:
 def test_the_last_policy_is_not_evaluated_twice() -> None:
     fakes, state = Fakes(3.0, 4.0, 3.5), RunState(version=1, env_steps=100)
     _, evaluations = fakes.evaluations(100, state, eval_workers=1)
-    assert evaluations.evaluate_when_due(lambda: None) is None
+    assert evaluate(evaluations) is None
     assert evaluations.end_pending(lambda: None) is not None
     assert not evaluations.conclude(lambda: None)
     assert evaluations.confirmed is not None
@@ -223,11 +230,11 @@ def ended(fakes: Fakes, state: RunState, **settings: Any) -> tuple[Tally, Evalua
     """A run that ends as `train` ends it, with the evaluations that are due after 100, 200, … env steps."""
     tally, evaluations = fakes.evaluations(100, state, **settings)
     if tally.evaluation_is_due():
-        evaluations.evaluate_when_due(lambda: None)
+        evaluate(evaluations)
     while tally.stop_reason() is None:
         state.version, state.env_steps = state.version + 1, state.env_steps + 100
         if tally.evaluation_is_due():
-            evaluations.evaluate_when_due(lambda: None)
+            evaluate(evaluations)
     tally.training_ended()
     evaluations.end_pending(lambda: None)
     evaluations.conclude(lambda: None)
@@ -306,7 +313,7 @@ def test_an_evaluation_begins_again_when_the_run_is_resumed(eval_workers: int) -
     if metrics is None:
         state.version, state.env_steps = 6, 210
         assert tally.evaluation_is_due()
-        metrics = evaluations.evaluate_when_due(lambda: None)
+        metrics = evaluate(evaluations)
     assert metrics is not None
     assert (metrics["eval/mean_reward"], metrics["eval/env_steps"]) == (3.0, 100)
     assert (state.evaluated.version, state.best, fakes.written) == (3, (3.0, 100), [7.0])

@@ -23,6 +23,7 @@ from millrace.learner.algorithm_check.same_bits import first_difference
 from millrace.learner.algorithms import Algorithm, algorithm_class
 from millrace.learner.algorithms.ppo import PPO
 from millrace.learner.between_updates import evaluations
+from millrace.learner.callbacks.callbacks import Callbacks, Watch
 from millrace.learner.config.layers import resolve
 from millrace.learner.interrupts import Interrupts
 from millrace.learner.rollouts.evaluation_dealer import PlayedEpisode, evaluation_of
@@ -91,7 +92,6 @@ IN_MAKE_TEST = (
     "ppo, evaluated beside",
 )  # `make soak` runs the others
 STOP = 6  # the update after which a run is interrupted
-Watch = Callable[[Progress], None]
 
 
 def silent(progress: Progress) -> None:
@@ -199,6 +199,59 @@ def test_a_run_that_is_resumed_without_evaluators_evaluates_first_what_was_besid
     assert len({mean for _, mean in evaluated(folder)}) > 3, "policies cannot be told from each other by their returns"
     for file in ("policy.safetensors", "best.safetensors"):
         assert (folder / file).read_bytes() == (reference / file).read_bytes(), file
+
+
+def test_an_evaluation_that_training_waited_for_has_a_row_after_a_resume_without_evaluators(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """When the evaluation begins again, the next one is due after the same update."""
+    settings = VARIANTS["ppo, evaluated beside"]
+    reference = run(tmp_path / "whole", **{**settings, "eval_workers": 0})
+    end_evaluation = Hub.end_evaluation
+    awaited: list[Hub] = []
+
+    def interrupted(hub: Hub, watch: Callable[[int, int], None]) -> list[PlayedEpisode]:
+        awaited.append(hub)
+        if len(awaited) == 3:
+            raise KeyboardInterrupt
+        return end_evaluation(hub, watch)
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(Hub, "end_evaluation", interrupted)
+        run(tmp_path / "resumed", **settings)
+    folder = folder_of(tmp_path / "resumed")
+    run(tmp_path / "resumed", resume=folder, **{**settings, "eval_workers": 0})
+    assert evaluated(folder) == evaluated(reference)
+
+
+class Ends:
+    """A callback that ends the run in a method, once it has been told of two evaluations."""
+
+    def __init__(self, method: str) -> None:
+        self.told: list[tuple[float, float]] = []
+        self._method = method
+
+    def on_evaluation(self, progress: Progress) -> bool:
+        assert progress.evaluation is not None
+        self.told.append((progress.evaluated.env_steps, progress.evaluation.return_mean))
+        return self._goes_on("on_evaluation")
+
+    def on_rollouts(self, progress: Progress) -> bool:
+        return self._goes_on("on_rollouts")
+
+    def _goes_on(self, method: str) -> bool:
+        return method != self._method or len(self.told) < 2
+
+
+@pytest.mark.parametrize("method", ["on_evaluation", "on_rollouts"])
+def test_a_run_that_a_callback_ends_has_all_results_of_which_it_was_told(tmp_path: Path, method: str) -> None:
+    ends = Ends(method)
+    folder = run(tmp_path, Callbacks([ends]), **VARIANTS["ppo, evaluated beside"])
+    final = [(summary(folder)["env_steps"], summary(folder)["evaluation"]["return_mean"])]
+    assert len(ends.told) == 3, "two, and at the end one more"
+    assert ends.told == evaluated(folder) + (final if method == "on_evaluation" else [])
+    assert summary(folder)["stop_reason"] == f"ended by Ends.{method}"
+    assert summary(folder)["ended_by"] is None, "no evaluation of the final policy ended it"
 
 
 def evaluated(folder: Path) -> list[tuple[float, float]]:
