@@ -21,6 +21,7 @@ from millrace.learner.members.who_may_connect import BindSettings
 from millrace.learner.open_hub import lobby_settings
 from millrace.learner.resume_checks import Resumption, unless_finished
 from millrace.learner.run_folder.progress_file import progress_before
+from millrace.learner.run_folder.run_folder import Interrupted
 from millrace.learner.run_setup import (
     RunSetup,
     known_environment,
@@ -46,7 +47,8 @@ def train(config: Config, resume: Path | None, watch: Watch, env: EnvSpec | None
     """Train a policy. Returns the run folder.
 
     `env`: the environment, unless workers find it by the name in the settings. `elsewhere`: workers are started elsewhere
-    and join at `config.bind`. Raises `UserFacingError`, or `Interrupted` if the user stopped the run.
+    and join at `config.bind`. Raises `UserFacingError`, or `Interrupted` if the user stopped the run, even if training had
+    ended by then.
 
     In a run with shards, rank 0 of the learner processes has the workers and the run folder; the other ranks take part in
     its updates.
@@ -124,6 +126,8 @@ def _train(
             pool.report(run.parts.hub.status)
             setup.announce(pool.bound)
             train_to_the_end(run, 1 if acts else workers)
+        if interrupts.received:  # after training, as in `on_end`: the run is complete, but the caller's program must end
+            raise Interrupted(folder.shown)
         return folder.shown
 
 

@@ -232,6 +232,23 @@ def test_an_interrupt_while_a_callback_runs(tmp_path: Path, whole: Path) -> None
     accounted(summary(folder), lanes=2, rows=ROWS)
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("moment", ["on_evaluation", "on_end"])
+def test_an_interrupt_after_training_ends_the_program_and_the_run_is_complete(
+    tmp_path: Path, moment: str, number: signal.Signals
+) -> None:
+    """A loop that trains one run after another must not begin the next run."""
+    with pytest.raises(Interrupted) as caught:
+        run(tmp_path, Acts(moment, lambda progress: signal.raise_signal(number), updates=UPDATES))
+    folder = caught.value.run
+    told = summary(folder)
+    assert (told["stop_reason"], told["cut_short"], told["updates"]) == ("all steps done", False, UPDATES)
+    assert told["evaluation"] is not None
+    again = Acts()
+    assert run(tmp_path, again, resume=folder) == folder
+    assert again.told == [], "nothing was left to do"
+
+
 def test_a_run_that_another_process_takes_over_ends_without_a_summary(tmp_path: Path) -> None:
     told = Acts("on_update", lambda progress: Path(progress.run, LOCK_FILE).write_bytes(OTHER), updates=4)
     with pytest.raises(RunTakenOver):
