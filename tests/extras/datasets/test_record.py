@@ -578,7 +578,9 @@ def test_rollouts_are_recorded_once_an_update_has_used_them(root: Path, caplog: 
         recorder = TrainingRecorder("ns/countdown-v0", described(run.env), run, "a test")
         for updates in range(2):
             rollouts = collector.collect([Assignment(updates, 0, 0, updates, updates)], 0, 1, no_pulse)
-            recorder.on_rollouts(Progress(updates=updates, rollouts=tuple(rollouts), incarnations=(0,)))
+            recorder.on_rollouts(
+                Progress(updates=updates, rollouts=tuple(rollouts), incarnations=(0,), fresh=(updates == 0,))
+            )
         recorder.on_end(Progress(updates=1 + used, cut_short=True))
         assert f"dataset ns/countdown-v0: {1 + used} training episodes; 0 steps of others" in caplog.messages[-1]
         (root / "ns").rename(root / f"used{used}")
