@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import logging
 import math
+import os
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,7 @@ import msgspec
 from millrace.learner.run_folder.atomic_write import write_atomically
 from millrace.learner.run_folder.progress import ENV_STEPS_KEY, UPDATES_KEY, Progress, Row, named
 from millrace.learner.run_folder.record_file import RecordFile
-from millrace.learner.run_folder.regular_files import MOST_BYTES, read
+from millrace.learner.run_folder.regular_files import MOST_BYTES, open_regular, read
 from millrace.learner.run_folder.results import EVALUATED_AT_KEY, EVALUATION_KEY
 from millrace.protocol.bounds import INVALID, Natural
 from millrace.protocol.errors import RunError
@@ -152,7 +153,9 @@ def _cut_off_rows(path: Path) -> list[dict[str, Any]]:
 
     Empty if the last row is complete, or if it isn't known to which update it belongs.
     """
-    content = read(path, MOST_BYTES)
+    with os.fdopen(open_regular(path), "rb") as file:
+        file.seek(max(0, os.fstat(file.fileno()).st_size - MOST_LINE_BYTES - 2))  # one byte more than the longest line has
+        content = file.read()
     line = content.removesuffix(b"\n").rpartition(b"\n")[2]
     if len(line) > MOST_LINE_BYTES:
         return []

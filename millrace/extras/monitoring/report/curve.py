@@ -51,6 +51,11 @@ class RunRecord(NamedTuple):
         return Curve(self.seed, *curve_points.T) if len(curve_points) else None
 
 
+def evaluated_at(row: Mapping[str, Any]) -> Any:
+    """The env steps of the policy to which the evaluation in a row of metrics belongs."""
+    return row.get(EVALUATED_AT_KEY, row[ENV_STEPS_KEY])
+
+
 def points(rows: Sequence[Mapping[str, Any]], key: str, *, over_time: bool = False) -> Doubles:
     """The values of a metric over env steps: [K, 2] env steps and value, for the K rows that have both.
 
@@ -61,7 +66,7 @@ def points(rows: Sequence[Mapping[str, Any]], key: str, *, over_time: bool = Fal
     def at(row: Mapping[str, Any]) -> Any:
         if over_time:
             return row.get(SECONDS_KEY)
-        return row.get(EVALUATED_AT_KEY, row[ENV_STEPS_KEY]) if key.startswith("eval/") else row[ENV_STEPS_KEY]
+        return evaluated_at(row) if key.startswith("eval/") else row[ENV_STEPS_KEY]
 
     drawn = [(at(row), row[key]) for row in rows if row.get(key) is not None]
     return np.asarray([point for point in drawn if point[0] is not None], np.float64).reshape(-1, 2).clip(*DRAWN)

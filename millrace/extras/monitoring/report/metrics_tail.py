@@ -17,10 +17,10 @@ from typing import Any
 
 import numpy as np
 
+from millrace.extras.monitoring.report.curve import evaluated_at
 from millrace.learner.run_folder.metrics_log import METRICS_FILE, MOST_LINE_BYTES, decoded_row
-from millrace.learner.run_folder.progress import ENV_STEPS_KEY
 from millrace.learner.run_folder.regular_files import MOST_BYTES, open_regular
-from millrace.learner.run_folder.results import EVALUATED_AT_KEY, EVALUATION_KEY, EVALUATION_LENGTH_KEY
+from millrace.learner.run_folder.results import EVALUATION_KEY, EVALUATION_LENGTH_KEY
 from millrace.protocol.arrays import Doubles, Ints
 
 MOST_ROWS = 256  # of a long file, at least this many rows are kept, and at most twice as many: a chart has 500 points
@@ -130,8 +130,7 @@ class _Thinned:
 
 def _evaluation(row: Mapping[str, Any]) -> Sequence[float]:
     """The env steps, return and episode length of the row's evaluation; empty if it has none."""
-    at, returned = row.get(EVALUATED_AT_KEY, row.get(ENV_STEPS_KEY)), row.get(EVALUATION_KEY)
-    if at is None or returned is None:
+    if (returned := row.get(EVALUATION_KEY)) is None or (at := evaluated_at(row)) is None:
         return ()
     length = row.get(EVALUATION_LENGTH_KEY)
     return at, returned, math.nan if length is None else length
