@@ -1,8 +1,8 @@
 """The names of algorithms: a short name for a built-in one, and `module:Class` for your own.
 
-Rules: your module is imported when the settings of its algorithm are first needed. If the class lacks something, a one-line
-error says so then, before a worker is started or a run folder is made. A class that you pass in Python and that can't be
-imported (because it is defined in a notebook or a function) is found in this process only.
+Rules: your module is imported when its algorithm's settings are first needed. If the class lacks something, a one-line error
+says so at that point, before a worker is started or a run folder is created. If you pass a class in Python that can't be
+imported, because it is defined in a notebook or a function, only this process finds it.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ ALGORITHMS = {
     "crossq": "millrace.learner.algorithms.crossq:CrossQ",
     "xqc": "millrace.learner.algorithms.xqc:XQC",
 }
-"""The `module:Class` of each built-in algorithm, which is imported when it is used."""
+"""The `module:Class` of each built-in algorithm. It is imported when it is used."""
 
 NEEDED = (
     "__init__", "policy_spec", "update", "weights", "is_finite", "state_dict", "load_state_dict", "remember", "roll_back",
@@ -50,7 +50,7 @@ NOT_SETTINGS = {"config", "preset", "resume", "log_json", "debug", "progress"}
 """Flags and arguments of `millrace train` and `millrace.train` that are not settings."""
 
 _given: dict[str, type] = {}
-"""The classes that were passed in Python and can't be imported, by name. A newer one replaces one of the same name."""
+"""The classes that were passed in Python and can't be imported, by name. A newer class replaces one with the same name."""
 
 
 def is_own(algo: str) -> bool:
@@ -59,7 +59,7 @@ def is_own(algo: str) -> bool:
 
 
 def settings_record(algo: str) -> type[AlgorithmConfig]:
-    """The class of an algorithm's settings. Raises `UsageError`, with a one-line message, if there is no such algorithm."""
+    """The class of an algorithm's settings. Raises `UsageError`, with a one-line message, if the algorithm doesn't exist."""
     if algo in HYPERPARAMETERS:
         return HYPERPARAMETERS[algo]
     if not is_own(algo):
@@ -75,7 +75,7 @@ def own_class(name: str) -> Any:
 
 
 def name_of(algorithm: type) -> str:
-    """The name of a class, for `Config.algo`. It identifies the class here, and in processes that can import it.
+    """The name of a class, for `Config.algo`. It identifies the class in this process, and in processes that can import it.
 
     Raises `UsageError` if the class lacks something.
     """
@@ -98,13 +98,13 @@ def name_of(algorithm: type) -> str:
 
 
 def moved(before: str, now: str) -> bool:
-    """Whether a run of algorithm `before` may continue with `now`, because the same class was moved to a module."""
+    """Whether a run of algorithm `before` may continue with `now`, because `now` is the same class, moved to a module."""
     module, _, qualname = before.partition(":")
     return (module == "__main__" or "<locals>" in qualname) and is_own(now) and last_part(before) == last_part(now)
 
 
 def with_algorithm(table: dict[str, Any], algo: str | None) -> dict[str, Any]:
-    """The settings of a config.toml, with the algorithm's current name in place of an earlier one."""
+    """The settings from a config.toml, with the algorithm's current name in place of an earlier one."""
     before = str(table.get("algo"))
     if not algo or algo == before or not moved(before, algo):
         return table

@@ -20,15 +20,15 @@ class RunFlags(Config, frozen=True, kw_only=True):
     """All settings of a run, and the flags that say where their defaults come from."""
 
     config: Annotated[Path | None, Flag("PATH")] = None
-    """TOML file of settings. The config.toml of a run folder repeats that run."""
+    """TOML file with settings. To repeat a run, use the config.toml in its run folder."""
     preset: str = "auto"
-    """Preset to use: the name of a whole run (`millrace presets` lists them), or an environment, for the preset of that
-    environment. auto: the preset of ENV, if there is one. none: no preset.
+    """Preset to use: the name of a whole run (`millrace presets` lists them), or an environment whose preset to use. auto:
+    ENV's preset, if there is one. none: no preset.
     """
     resume: Annotated[Path | None, Flag("PATH")] = None
-    """Continue this run from its newest checkpoint. auto: continue the newest run in --run-dir with the same ENV,
-    --algo and --seed, or start a new run if there is none; --config then overrides the settings of the run. Some settings
-    cannot change: see docs/how-to/resume.md.
+    """Continue this run from its newest checkpoint. auto: continue the newest run in --run-dir with the same ENV, --algo and
+    --seed, or start a new run if there is none; --config then overrides the settings of the run that continues. Some
+    settings can't be changed: see docs/how-to/resume.md.
     """
     log_json: bool = False
     """Log to stderr as JSON, one event per line, instead of text."""
@@ -58,9 +58,9 @@ GROUPS = {
         "log_json",
     ),
 }  # fmt: skip
-"""The settings of each group of the help, by its title. `BASIC` and the settings of the algorithm precede the groups."""
+"""The settings in each group of the help, by the group's title. `BASIC` and the algorithm's settings precede the groups."""
 LAYERS = ("config", "preset", "resume", "log_json")
-"""Flags that aren't settings. They say where settings come from, or how logs look."""
+"""Flags that aren't settings. They say where settings come from, or which format logs have."""
 DESCRIPTIONS = {
     "train": "Train a policy on this machine. Flags override --config and presets.",
     "learner": "Listen at --bind and train with the workers that connect. Flags override --config and presets.",
@@ -85,7 +85,7 @@ def read_config(command: str, argv: list[str]) -> tuple[Config, Path | None]:
 
 
 def _read_flags(command: str, argv: list[str], typed: list[Typed], lower: LowerLayers) -> Config:
-    """The settings from the flags on top of the lower layers. The algorithm that these layers name adds its own flags."""
+    """The settings from the flags and the lower layers. The algorithm that the lower layers name adds its own flags."""
     own = fields_of(settings_record(lower.algo))
     fields = fields_of(RunFlags) | own
     given = given_values(fields, typed, command, partial(in_place_of, known=fields, flag=True))

@@ -1,8 +1,8 @@
-"""All settings of a run, in one record. The texts under the fields are the help of the command line. Pure.
+"""All settings of a run, in one record. The texts under the fields are also the command line's help. Pure.
 
-This file has the settings for learning. The base, `RolloutConfig` (learner/config/rollout_config.py), has the settings for
-collecting rollouts: the environment, workers, env copies, lanes, timeouts and the transport. learner/config/layers.py merges
-the settings of a run from presets, files and flags. `GROUPS` in learner/config/command_line.py lists the groups that
+This file has the settings for learning. The base class, `RolloutConfig` (learner/config/rollout_config.py), has the settings
+for collecting rollouts: the environment, workers, env copies, lanes, timeouts and the transport. learner/config/layers.py
+merges a run's settings from presets, files and flags. `GROUPS` in learner/config/command_line.py lists the groups that
 `--help` shows.
 """
 
@@ -37,44 +37,45 @@ class Config(RolloutConfig, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     algorithm: Fixed[AlgorithmConfig] = PPOConfig()
     """Settings of the algorithm."""
     steps: Free[Count] = 100_000
-    """Env steps to train for, summed over all env copies. Training ends before an update that would exceed them."""
+    """Env steps to train for, summed over all env copies. Training ends before an update that would exceed this number."""
     start_from: Annotated[Fixed[str], Flag("PATH", alias="from")] = ""
-    """Start from the policy of this run folder in place of random weights, with its statistics of observations and rewards.
-    A folder with only policy.json and policy.safetensors will do. All other settings are those of the new run, and schedules
-    start from the beginning. A resumed run doesn't read the folder again: see docs/how-to/resume.md.
+    """Start with the policy from this run folder, and its observation and reward statistics, instead of random weights. The
+    folder needs only policy.json and policy.safetensors. All other settings are those of the new run, and schedules start
+    from the beginning. A resumed run doesn't read the folder again: see docs/how-to/resume.md.
     """
     from_parts: Fixed[Literal["auto", "policy", "best", "critic", "all"]] = "auto"
-    """What `--from` takes over. policy: the newest policy and the statistics. best: the policy of the best evaluation.
-    critic: also the critic, the target networks and the temperature. all: also the optimizers. A replay buffer is never
-    taken over. auto: critic with sac, td3, tqc, crossq and xqc if the run has a checkpoint, because their actors
-    immediately follow the critic; otherwise policy.
+    """What `--from` loads. policy: the newest policy and the statistics. best: the policy with the best evaluation. critic:
+    also the critic, the target networks and the temperature. all: also the optimizers. The replay buffer is never loaded.
+    auto: critic for sac, td3, tqc, crossq and xqc if that run has a checkpoint, because their actors follow the critic from
+    the first update on; otherwise policy.
     """
     device: Free[Literal["auto", "cpu", "cuda"]] = "auto"
     """Device of the learner. auto: cuda if PyTorch finds a GPU, else cpu."""
     run_dir: Free[str] = "runs"
-    """Folder in which the run folder is made."""
+    """Folder in which the run folder is created."""
 
     # -------------------------------------------------------------------------------------------- evaluation and targets
 
     eval_episodes: Free[Count | None] = None
-    """Number of greedy episodes in an evaluation. none: 100. Without eval_every, the evaluation at the end has fewer,
-    but at least 10, if 100 episodes could take more than three quarters of the env steps of training.
+    """Number of greedy episodes in an evaluation. none: 100. If eval_every is 0 and 100 episodes could take more than three
+    quarters as many env steps as training, the final evaluation has fewer, but at least 10.
     """
     eval_every: Free[Natural] = 0
     """Env steps between evaluations during training. 0: evaluate only at the end."""
     eval_workers: Free[Natural] = 0
     """Number of workers that only evaluate, so that training continues during evaluations. `millrace train` starts them in
-    addition to workers; `millrace learner` doesn't wait for any, and uses those that `millrace worker --evaluate` starts.
-    The result counts at the next evaluation, or at the end, when the learner waits for it. If no such worker is left by
-    then, the other workers play the episodes. 0: all workers evaluate, and training waits.
+    addition to the other workers; `millrace learner` waits for none and uses those that `millrace worker --evaluate` starts.
+    The result of an evaluation is used when the next one is due, or at the end of training; the learner waits for it then.
+    If no evaluation worker is left by then, the other workers play the episodes. 0: all workers evaluate, and training
+    waits.
     """
     eval_copies: Free[Annotated[int, Meta(ge=1, le=MAX_SEEDS)]] = 4
-    """Number of evaluation episodes that a worker plays at the same time, each on its own env copy. The last bits of results
-    may depend on this number. Results do not depend on the number of workers.
+    """Number of evaluation episodes that a worker plays at the same time, each on its own env copy. This number may change
+    the last bits of results. The number of workers doesn't change them.
     """
     eval_max_steps: Free[Count] = 1_000_000
-    """Largest number of env steps of one evaluation. Each episode gets an equal share: with 100 episodes, an episode that
-    reaches 10000 steps is cut. Its return up to that step counts, and the result says how many episodes were cut.
+    """Largest number of env steps in one evaluation. Each episode gets an equal share. With the default and 100 episodes, an
+    episode is cut after 10,000 steps. Its return up to that step counts, and the result says how many episodes were cut.
     """
     target_return: Free[float | None] = None
     """Stop as soon as the mean return of an evaluation is at least this. Needs eval_every."""
@@ -84,39 +85,41 @@ class Config(RolloutConfig, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     # ---------------------------------------------------------------------------------------------------------- self-play
 
     self_play: Fixed[Natural] = 0
-    """Self-play in an environment of several agents: the policy plays one team, and opponents play the others. They are
-    drawn from this many of the policy's newest snapshots. 0: the policy plays all agents, or meets only your own opponents.
+    """Self-play in a multi-agent environment: the policy plays one team, and opponents play the others. The opponents are
+    drawn from this many of the policy's newest snapshots. 0: the policy plays all agents, or only against your own
+    opponents.
     """
     self_play_save_steps: Free[Count] = 20_000
     """Env steps between two snapshots."""
     self_play_latest: Free[Annotated[float, Meta(ge=0, le=1)]] = 0.5
     """Share of the rollouts in which the policy plays against its newest version instead of a snapshot."""
     opponents: Annotated[Fixed[tuple[str, ...]], Flag("MODULE:FACTORY ...")] = ()
-    """Your own opponents. They are drawn like the snapshots, and evaluations are played against them. Without self_play the
-    policy meets only them. docs/how-to/self_play.md shows what the factory returns.
+    """Your own opponents. They are drawn like the snapshots, and evaluations are played against them. Without self_play, the
+    policy plays only against them. docs/how-to/self_play.md shows what the factory returns.
     """
     teams: Annotated[Fixed[tuple[str, ...]], Flag("PATTERN ...")] = ()
-    """The teams, all of the same size. Give a pattern of its agents' names for each, as in "red_*" "blue_*". Default: each
-    agent is a team. In different env copies, the policy plays different teams.
+    """One pattern for each team, which matches the names of its agents, as in "red_*" "blue_*". All teams must have the same
+    size. Default: each agent is a team of its own. The policy plays different teams in different env copies.
     """
 
     # ---------------------------------------------------------------------------------------------- the learner's process
 
     inference: Free[Literal["workers", "learner"]] = "workers"
-    """Where the policy acts. workers: in each worker. learner: in a thread of the learner's process, for half of the env
-    copies while the other half steps; workers then only step the environments.
+    """Where the policy computes actions. workers: in each worker. learner: in a thread of the learner's process, for half of
+    the env copies while the other half steps; workers then only step the environments.
     """
     torch_threads: Free[Count | None] = None
     """Number of PyTorch threads in the learner. none: chosen when the run starts, and kept in its config.toml. The choice is
-    1; with images, an encoder or a layer of 512 x 512 weights it is one for each 34 million multiply-adds of a minibatch's
-    forward pass, at most one for each core. If max_lag is above 0, each local worker then keeps one core, unless this would
-    leave half of the cores or less to the learner. With shards it is 1. Another number changes the last bits of results.
+    1, except with images, an encoder or a layer of at least 512 x 512 weights: then it is one thread for every 34 million
+    multiply-adds in a minibatch's forward pass, but at most one for each core. If max_lag is above 0, one of these cores is
+    left to each local worker, unless the learner would get only half of the cores or fewer. With shards, the choice is
+    always 1. Another number changes the last bits of results.
     """
 
     shards: Fixed[Count] = 1
-    """Number of parts of a batch whose gradients are computed separately, for several learner processes (ppo, a2c, impala,
-    reinforce). torchrun starts the processes; their number must divide the number of shards, and doesn't change the
-    results. Must divide lanes. See docs/how-to/shards.md.
+    """Number of parts of a batch whose gradients are computed separately, so that several learner processes can share the
+    work (ppo, a2c, impala, reinforce). It must divide lanes. torchrun starts the processes. Their number must divide the
+    number of shards, and doesn't change the results. See docs/how-to/shards.md.
     """
     shard_timeout_s: Free[Positive] = 600.0
     """Seconds that a learner process waits for the others in an update, or for rank 0 between updates, such as during a
@@ -128,8 +131,8 @@ class Config(RolloutConfig, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     """
 
     grace_s: Free[NotNegative] = 30.0
-    """Seconds from SIGTERM, SIGHUP or Ctrl-C to the end of the process. The current update gets at most half of them; then
-    it is undone, and the state before it is saved. 0: wait for the update, however long it takes.
+    """Seconds from SIGTERM, SIGHUP or Ctrl-C to the end of the process. The current update gets at most half of this time;
+    if it takes longer, it is undone, and the state before it is saved. 0: wait for the update, however long it takes.
     """
 
     callbacks: Annotated[Free[tuple[str, ...]], Flag("MODULE:FACTORY ...")] = ()
@@ -140,24 +143,24 @@ class Config(RolloutConfig, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     # -------------------------------------------------------------------------------------------------------------- files
 
     checkpoint_every_s: Free[NotNegative] = 60.0
-    """Seconds between checkpoints. There is also one after the first update and one before each evaluation. 0: after each
-    update.
+    """Seconds between checkpoints. A checkpoint is also written after the first update and before each evaluation. 0: after
+    each update.
     """
     keep_checkpoints: Free[Count] = 3
     """Number of newest checkpoints to keep."""
     tensorboard: Free[bool] = False
-    """Also write the metrics as TensorBoard events, to the folder tensorboard of the run folder
+    """Also write the metrics as TensorBoard events, to the folder tensorboard in the run folder
     (pip install tensorboard).
     """
     record: Free[str] = ""
-    """Write all whole training episodes to the Minari dataset with this id, such as cartpole/ppo-v0
+    """Write all complete training episodes to the Minari dataset with this id, such as cartpole/ppo-v0
     (pip install 'minari[hdf5]' pillow). A resumed run writes another dataset, with the next free version.
     """
 
     prior: Fixed[str] = ""
-    """Id of a Minari dataset to learn from in addition, such as cartpole/ppo-v0 (pip install 'minari[hdf5]' pillow). With
+    """Id of a Minari dataset to learn from as well, such as cartpole/ppo-v0 (pip install 'minari[hdf5]' pillow). With
     clone_epochs, the run begins with a policy that imitates the dataset. Algorithms with a replay buffer draw a share of
-    each minibatch from the dataset, which prior_share sets.
+    each minibatch, set by prior_share, from the dataset.
     """
 
     def to_toml(self) -> str:

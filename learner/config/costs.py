@@ -20,7 +20,7 @@ PASSES = 3  # the cost of a forward and a backward pass, in forward passes; a ba
 
 
 def minibatch_rows(config: Config) -> int:
-    """The number of rows in a minibatch: all rows of an update, if no setting divides them into minibatches."""
+    """The number of rows in a minibatch. Without a setting that divides updates into minibatches, all rows of an update."""
     batch_size = getattr(config.algorithm, "batch_size", None)
     if isinstance(batch_size, int):
         return batch_size

@@ -30,8 +30,8 @@ def final_evaluation_size(
     """The size of the evaluation after training.
 
     `env_steps` is the number of env steps in training. `episode_length` is the mean length of the last training episodes, in
-    env steps, or None if none has ended. `time_limit` is the number of env steps after which the environment truncates an
-    evaluation episode, or None if it doesn't. The size depends on these counts, and not on seconds, so that a repeated run
+    env steps, or None if no episode has ended. `time_limit` is the number of env steps after which the environment truncates
+    an evaluation episode, or None if it doesn't. The size depends on these counts, not on seconds, so that a repeated run
     gives the same result.
     """
     if config.eval_episodes is not None or config.eval_every:
@@ -39,7 +39,7 @@ def final_evaluation_size(
     budget = 3 * env_steps // 4
     most = config.eval_max_steps
     length = time_limit or episode_length
-    if length is None:  # no episode has ended, so episodes may have no end
+    if length is None:  # no episode has ended, so episodes may never end
         return EvaluationSize(FEWEST_EPISODES, max(min(most, budget), 1))
     episodes = min(max(int(budget / max(length, 1.0)), FEWEST_EPISODES), MOST_EPISODES)
     if time_limit is not None:

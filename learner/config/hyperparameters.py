@@ -1,6 +1,6 @@
-"""The settings (hyperparameters) of each algorithm. The texts under the fields are the help of the command line.
+"""The settings (hyperparameters) of each algorithm. The texts under the fields are also the command line's help.
 
-They are plain data, separate from the algorithms, so that reading a command line needs no torch. Your own algorithm names
+The settings are plain data, separate from the algorithms, so reading a command line needs no torch. Your own algorithm names
 its record in its attribute `Config` (learner/config/algorithm_names.py).
 """
 
@@ -20,16 +20,16 @@ Optimizer = Literal["rmsprop", "adam"]
 
 
 class AlgorithmConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Settings that every algorithm has. The record of each algorithm derives from this one.
+    """Settings that every algorithm has. Each algorithm's record derives from this one.
 
-    Every field has a default. Its type says which values are allowed, and whether a resumed run may change the value:
+    Every field has a default. Its type says which values are allowed, and whether a resumed run may change them:
     `Free[...]`, `Adaptable[...]` or `Fixed[...]` (learner/config/resume_rules.py).
     """
 
     rollout_steps: Free[Count] = 128
     """T, the number of steps of each env copy in a rollout."""
     net: Fixed[tuple[Count, ...]] = (64, 64)
-    """Sizes of the hidden layers of the actor, and likewise of the critic, or of the Q-network."""
+    """Sizes of the hidden layers of the actor, and likewise of the critic; or of the Q-network."""
     activation: Fixed[Literal["tanh", "relu"]] = "tanh"
     """Activation function of the hidden layers."""
     encoder: Fixed[str | None] = None
@@ -58,7 +58,7 @@ class PolicyGradientConfig(AlgorithmConfig, frozen=True):
     ent_coef: Free[NotNegative] = 0.0
     """Weight of the entropy bonus in the loss."""
     vf_coef: Free[NotNegative] = 0.5
-    """Weight of the value loss in the loss."""
+    """Weight of the value loss in the total loss."""
     max_grad_norm: Free[Positive] = 0.5
     """Clip the norm of the gradient to this."""
     log_std_init: Fixed[Annotated[float, msgspec.Meta(ge=-20, le=20)]] = 0.0
@@ -66,7 +66,7 @@ class PolicyGradientConfig(AlgorithmConfig, frozen=True):
     normalize_rewards: Fixed[bool] = False
     """Divide rewards by the running standard deviation of the discounted return, and clip them to ±10."""
     clone_epochs: Free[Natural] = 0
-    """Number of epochs of cloning on the dataset of --prior, before the first rollouts are collected: the actor learns the
+    """Number of epochs of cloning on the --prior dataset, before the first rollouts are collected: the actor learns the
     dataset's actions, the critic its returns. Needs --prior.
     """
 
@@ -100,7 +100,7 @@ class PPOConfig(ActorCriticConfig, frozen=True):
 
     normalize_observations: Fixed[bool] = True
     """Normalize observations, except images: subtract the running mean, divide by the running standard deviation, clip to
-    ±10. docs/how-to/algorithms.md shows why PPO does by default.
+    ±10. docs/how-to/algorithms.md shows why PPO does this by default.
     """
     normalize_rewards: Fixed[bool] = True
     """Divide rewards by the running standard deviation of the discounted return, and clip them to ±10."""
@@ -109,7 +109,7 @@ class PPOConfig(ActorCriticConfig, frozen=True):
     clip_range_schedule: Free[Schedule] = "constant"
     """linear: clip_range falls to zero over the run."""
     clip_range_vf: Free[Positive | None] = None
-    """Clip the change of a value in an update to this, in units of (normalized) reward. none: no clipping."""
+    """Clip each value's change in an update to this, in units of (normalized) reward. none: no clipping."""
     target_kl: Free[Positive | None] = None
     """End an update when the KL divergence from the old policy exceeds 1.5 times this. none: never."""
 
@@ -130,7 +130,7 @@ class A2CConfig(RecurrentConfig, frozen=True):
 
 
 class IMPALAConfig(RecurrentConfig, frozen=True):
-    """Actor-critic with V-trace, which corrects for rollouts of older weights (max_lag above 0; Espeholt et al. 2018)."""
+    """Actor-critic with V-trace, which corrects for rollouts with older weights (max_lag above 0; Espeholt et al. 2018)."""
 
     rollout_steps: Free[Count] = 32
     """T, the number of steps of each env copy in a rollout."""
@@ -145,8 +145,8 @@ class IMPALAConfig(RecurrentConfig, frozen=True):
     vtrace_lambda: Free[Fraction] = 1.0
     """λ of V-trace. 1: as in the paper. 0: one step."""
     rho_bar: Free[Positive] = 1.0
-    """ρ̄ of V-trace: importance weights of TD errors are clipped to this. The larger it is, the closer the
-    learned values are to those of the newest policy (without clipping, they are exactly those).
+    """ρ̄ of V-trace: importance weights of TD errors are clipped to this. The larger ρ̄ is, the closer the learned values
+    are to the newest policy's values; without clipping, they are the same.
     """
     c_bar: Free[Positive] = 1.0
     """c̄ of V-trace: importance weights of traces are clipped to this. It determines how far back the effect of a TD error
@@ -158,15 +158,15 @@ class REINFORCEConfig(PolicyGradientConfig, frozen=True):
     """Monte Carlo policy gradient on whole episodes (Williams 1992)."""
 
     rollout_steps: Fixed[Count] = 1001
-    """T, the steps of each env copy in a rollout. Must be longer than any episode."""
+    """T, the number of steps of each env copy in a rollout. Must be larger than the length of any episode."""
     learning_rate: Free[Positive] = 2e-3
     """Learning rate of the optimizer."""
     normalize_rewards: Fixed[bool] = True
-    """Divide rewards by the running standard deviation of the discounted return, and clip them to ±10. Otherwise the loss of
-    the baseline dominates the gradient.
+    """Divide rewards by the running standard deviation of the discounted return, and clip them to ±10. Without this, the
+    baseline's loss dominates the gradient.
     """
     baseline: Free[bool] = True
-    """Subtract the value that the critic predicts from the return."""
+    """Subtract the critic's value estimate from the return."""
     normalize_returns: Free[bool] = True
     """Normalize the returns of each batch (minus the baseline) to mean 0 and standard deviation 1."""
 
@@ -179,9 +179,9 @@ class OffPolicyConfig(AlgorithmConfig, frozen=True):
     activation: Fixed[Literal["tanh", "relu"]] = "relu"
     """Activation function of the hidden layers."""
     core: Fixed[Literal["lstm", "gru"] | None] = None
-    """Recurrent layer in front of the hidden layers. A gradient step then takes whole sequences: the rollout_steps steps of
-    an env copy, preceded by its previous rollout as burn-in. Actor and critics share the layer, and the critics' loss trains
-    it.
+    """Recurrent layer in front of the hidden layers. A gradient step then uses whole sequences: the rollout_steps steps of
+    an env copy, preceded by the copy's previous rollout as burn-in. Actor and critics share the layer, and the critics' loss
+    trains it.
     """
     core_size: Fixed[Count] = 64
     """Number of units of the recurrent layer."""
@@ -194,38 +194,38 @@ class OffPolicyConfig(AlgorithmConfig, frozen=True):
     learning_starts: Free[Natural] = 1000
     """Number of env steps before the first gradient step."""
     replay_size: Fixed[Count] = 100_000
-    """Capacity of the replay buffer in transitions; the newest are kept. The final observation of a truncated episode takes
-    the place of a transition.
+    """Capacity of the replay buffer, in transitions; the newest are kept. The final observation of a truncated episode takes
+    up the space of one transition.
     """
     priority_alpha: Fixed[Fraction] = 0.0
-    """α of prioritized replay: how much the probability that a transition is drawn depends on its last TD error. 0: not at
+    """α of prioritized replay: how strongly the probability of drawing a transition depends on its last TD error. 0: not at
     all. 1: in proportion. Schaul et al. 2016 use 0.6.
     """
     priority_beta: Free[Fraction] = 0.4
-    """Initial β of prioritized replay: how much importance weights correct the bias. It grows to 1 (fully) over the run."""
+    """Initial β of prioritized replay: how much of the bias importance weights correct. It grows to 1 (all) over the run."""
     prior_share: Free[Fraction] = 0.5
     """Share of each minibatch that is prior data, in a run with --prior (Ball et al. 2023 use 0.5)."""
     prior_steps: Free[Natural] = 0
     """Number of gradient steps on prior data alone, before the first rollouts are collected. Needs --prior."""
     hindsight: Fixed[Fraction] = 0.0
-    """Hindsight experience replay: the share of the transitions of a minibatch whose goal is replaced by a goal that was
-    achieved later in the episode. 0: off. Andrychowicz et al. 2017 use 0.8. Needs observations with achieved_goal and
-    desired_goal, and goal_reward.
+    """Hindsight experience replay: the share of a minibatch's transitions whose goal is replaced by a goal that was achieved
+    later in the episode. 0: off. Andrychowicz et al. 2017 use 0.8. Needs goal_reward, and observations with achieved_goal
+    and desired_goal.
     """
     goal_reward: Annotated[Free[str | None], Flag("NAME")] = None
     """How the environment computes rewards from achieved and desired goals, for hindsight. sparse:0.05: 0 within this
     distance of the goal, else -1. success:0.45: 1 within this distance, else 0. dense: minus the distance. Or your own
-    function of two arrays [B, G] that returns an array [B], such as my_module:reward.
+    function, such as my_module:reward, which takes two arrays [B, G] and returns an array [B].
     """
     goal_ends: Free[Positive | None] = None
-    """The distance from the goal at which an episode terminates, for hindsight. none: it doesn't terminate at its goal."""
+    """The distance from the goal at which an episode terminates, for hindsight. none: reaching the goal doesn't end it."""
     n_step: Free[Count] = 1
     """Number of rewards in a target before it bootstraps. With several agents, each agent's own steps count."""
     tau: Free[Annotated[float, msgspec.Meta(gt=0, le=1)]] = 0.005
-    """τ of the polyak update: the fraction by which the target network moves in each gradient step."""
+    """τ of the polyak update: the fraction by which each gradient step moves the target network toward the network."""
     normalize_rewards: Fixed[bool] = False
-    """Divide rewards by the running standard deviation of the discounted return, when they are drawn from the buffer, and
-    clip them to ±10; with n_step, this clips the sum of n rewards.
+    """When rewards are drawn from the buffer, divide them by the running standard deviation of the discounted return, and
+    clip them to ±10; with n_step, the sum of n rewards is clipped.
     """
 
 
@@ -237,8 +237,8 @@ class QLearningConfig(OffPolicyConfig, frozen=True):
     amsgrad: Fixed[bool] = False
     """Use the AMSGrad variant of the optimizer."""
     gradient_steps: Free[Count] = 64
-    """Number of gradient steps in an update. There is one update for every envs x rollout_steps env steps, so this sets the
-    replay ratio.
+    """Number of gradient steps in an update. There is one update for every envs x rollout_steps env steps, so this setting
+    determines the replay ratio.
     """
     double: Free[bool] = True
     """Double Q-learning: the network chooses the next action, and the target network evaluates it."""
@@ -247,8 +247,8 @@ class QLearningConfig(OffPolicyConfig, frozen=True):
     target_every: Free[Count] = 250
     """Number of gradient steps between two updates of the target network."""
     tau: Free[Annotated[float, msgspec.Meta(gt=0, le=1)]] = 1.0
-    """Fraction by which an update moves the target network. 1: it becomes a copy of the network. With a small fraction, such
-    as 0.005, take target_every 1 (polyak averaging).
+    """Fraction by which each update of the target network moves it toward the network. 1: it becomes a copy. With a small
+    fraction, such as 0.005, set target_every to 1 (polyak averaging).
     """
     epsilon_start: Free[Fraction] = 1.0
     """Initial probability ε of a random action."""
@@ -257,20 +257,20 @@ class QLearningConfig(OffPolicyConfig, frozen=True):
     epsilon_schedule: Free[Literal["linear", "exponential"]] = "linear"
     """How ε falls from its initial to its final value."""
     epsilon_steps: Free[Count] = 10_000
-    """Number of env steps, summed over all env copies, over which ε falls. With exponential, the number after which the
-    distance of ε from its final value is 1/e of what it was.
+    """Number of env steps, summed over all env copies, over which ε falls. With exponential, the number of env steps after
+    which the difference between ε and its final value has fallen to 1/e of what it was.
     """
     max_grad_norm: Free[Positive | None] = None
     """Clip the norm of the gradient to this. none: no clipping."""
     max_grad_value: Free[Positive | None] = None
-    """Clip each entry of the gradient to ± this, before its norm is clipped. none: no clipping."""
+    """Clip each entry of the gradient to ± this value, before the gradient's norm is clipped. none: no clipping."""
 
 
 class DQNConfig(QLearningConfig, frozen=True):
-    """Deep Q-learning (Mnih et al. 2015), with the usual extensions."""
+    """Deep Q-learning (Mnih et al. 2015), with the common extensions."""
 
     loss: Free[Literal["huber", "squared"]] = "huber"
-    """Loss of the TD error. huber: squared up to 1 and linear beyond."""
+    """Loss function of the TD error. huber: squared up to 1 and linear beyond."""
 
 
 class RainbowConfig(QLearningConfig, frozen=True):
@@ -285,23 +285,23 @@ class RainbowConfig(QLearningConfig, frozen=True):
     learning_rate_schedule: Free[Schedule] = "linear"
     """linear: the learning rate falls to zero over the run."""
     priority_alpha: Fixed[Fraction] = 0.5
-    """α of prioritized replay: how much the probability that a transition is drawn depends on its last TD error. 0: not at
+    """α of prioritized replay: how strongly the probability of drawing a transition depends on its last TD error. 0: not at
     all. 1: in proportion.
     """
     n_step: Free[Count] = 3
     """Number of rewards in a target before it bootstraps. With several agents, each agent's own steps count."""
     core: Fixed[Literal["lstm", "gru"] | None] = None
-    """Must be none: Rainbow can't train a recurrent policy, dqn can."""
+    """Must be none, because rainbow can't train a recurrent policy. dqn can."""
     quantiles: Fixed[Annotated[int, msgspec.Meta(ge=2)]] = 16
     """Number of quantiles of the return that are learned for each action."""
     batch_norm: Fixed[bool] = True
-    """Use batch normalization for the inputs and before each activation of the hidden layers (Bhatt et al. 2024)."""
+    """Use batch normalization on the inputs and before each activation of the hidden layers (Bhatt et al. 2024)."""
     dueling: Fixed[bool] = True
     """Dueling network: an action value is the value of the state plus the action's advantage minus the mean advantage."""
     target_every: Free[Count] = 1
     """Number of gradient steps between two updates of the target network."""
     tau: Free[Annotated[float, msgspec.Meta(gt=0, le=1)]] = 0.005
-    """Fraction by which an update moves the target network."""
+    """Fraction by which each update of the target network moves it toward the network."""
     epsilon_end: Free[Fraction] = 0.02
     """Final probability ε of a random action."""
     max_grad_norm: Free[Positive | None] = 10.0
@@ -314,25 +314,24 @@ class ContinuousConfig(OffPolicyConfig, frozen=True):
     rollout_steps: Free[Count] = 8
     """T, the number of steps of each env copy in a rollout."""
     net: Fixed[tuple[Count, ...]] = (256, 256)
-    """Sizes of the hidden layers: of the actor and of each critic."""
+    """Sizes of the hidden layers of the actor and of each critic."""
     batch_size: Free[Count] = 256
     """Number of transitions in a gradient step. With core, as many sequences as make up this number, but at least 16."""
     learning_starts: Free[Natural] = 100
     """Number of env steps before the first gradient step. Until then, actions are drawn uniformly."""
     replay_size: Fixed[Count] = 1_000_000
-    """Capacity of the replay buffer in transitions; the newest are kept. The final observation of a truncated episode takes
-    the place of a transition.
+    """Capacity of the replay buffer, in transitions; the newest are kept. The final observation of a truncated episode takes
+    up the space of one transition.
     """
     clone_epochs: Free[Natural] = 0
-    """Number of epochs of cloning on the dataset of --prior, before prior_steps and the first rollouts: the actor learns the
+    """Number of epochs of cloning on the --prior dataset, before prior_steps and the first rollouts: the actor learns the
     dataset's actions. Needs --prior.
     """
     updates_per_step: Free[Annotated[float, msgspec.Meta(gt=0, le=1e6)]] = 1.0
-    """Replay ratio: gradient steps for each env step after learning_starts. It is exact, whatever the size of the rollouts.
-    """
+    """Replay ratio: gradient steps per env step after learning_starts. It is exact for any size of rollouts."""
     random_shift: Free[Annotated[int, msgspec.Meta(ge=0, le=64)]] = 4
-    """Largest random shift, in pixels, by which images are moved each time they are in a minibatch (DrQ-v2). It has no
-    effect on observations without images.
+    """Largest random shift, in pixels, of an image each time it is in a minibatch (DrQ-v2). It has no effect on observations
+    without images.
     """
 
 
@@ -340,9 +339,9 @@ class SACConfig(ContinuousConfig, frozen=True):
     """Soft actor-critic (Haarnoja et al. 2018) with two critics and an automatic temperature."""
 
     ent_coef: Fixed[Positive | None] = None
-    """Temperature α: the weight of the entropy. none: learned, so that the entropy stays near target_entropy."""
+    """Temperature α: the weight of the entropy. none: α is learned so that the entropy stays near target_entropy."""
     target_entropy: Free[float | None] = None
-    """The entropy at which a learned temperature aims. none: minus the dimension of the action."""
+    """The entropy that a learned temperature aims for. none: minus the dimension of the action."""
 
 
 class TQCConfig(SACConfig, frozen=True):
@@ -353,7 +352,7 @@ class TQCConfig(SACConfig, frozen=True):
     quantiles: Fixed[Count] = 25
     """Number of quantiles that each critic learns."""
     dropped_quantiles: Free[Natural] = 2
-    """How many of the highest quantiles targets leave out for each critic, so that values are not overestimated."""
+    """Number of each critic's highest quantiles that are left out of targets, so that values are not overestimated."""
 
 
 class NormalizedConfig(SACConfig, frozen=True):
@@ -366,7 +365,7 @@ class NormalizedConfig(SACConfig, frozen=True):
     learning_starts: Free[Natural] = 5000
     """Number of env steps before the first gradient step. Until then, actions are drawn uniformly."""
     policy_delay: Free[Count] = 3
-    """Number of gradient steps of the critics for each step of the actor and of the temperature."""
+    """Number of the critics' gradient steps for each step of the actor and the temperature."""
 
 
 class CrossQConfig(NormalizedConfig, frozen=True):
@@ -381,15 +380,15 @@ class CrossQConfig(NormalizedConfig, frozen=True):
 
 
 class XQCConfig(NormalizedConfig, frozen=True):
-    """XQC (Palenicek et al. 2025): batch normalization, weights of norm 1, critics of a distribution of returns."""
+    """XQC (Palenicek et al. 2025): batch normalization, weights of norm 1, and critics that learn a return distribution."""
 
     atoms: Fixed[Annotated[int, msgspec.Meta(ge=2)]] = 101
-    """Number of returns whose probabilities a critic learns, equally spaced from -return_bound to return_bound."""
+    """Number of returns, equally spaced from -return_bound to return_bound, whose probabilities a critic learns."""
     return_bound: Fixed[Positive] = 5.0
-    """Largest return, in units of scaled reward, that a critic can learn."""
+    """Largest absolute return, in units of scaled reward, that a critic can learn."""
     normalize_rewards: Fixed[bool] = True
-    """Divide rewards by the running standard deviation of the discounted return, or by more, so that neither a discounted
-    return so far nor the value of going on after a truncated episode exceeds return_bound.
+    """Divide rewards by the running standard deviation of the discounted return, or by more if necessary, so that neither
+    the discounted return so far nor the value of continuing after a truncated episode exceeds return_bound.
     """
 
 
@@ -401,11 +400,11 @@ class TD3Config(ContinuousConfig, frozen=True):
     exploration_noise: Free[NotNegative] = 0.1
     """Standard deviation of the noise that workers add to actions, which are in [-1, 1]."""
     policy_delay: Free[Count] = 2
-    """Number of gradient steps of the critics for each step of the actor and of the target networks."""
+    """Number of the critics' gradient steps for each step of the actor and the target networks."""
     target_noise: Free[NotNegative] = 0.2
-    """Standard deviation of the noise that is added to the actions of targets."""
+    """Standard deviation of the noise that is added to the target actor's actions."""
     target_noise_clip: Free[NotNegative] = 0.5
-    """Clip the noise of targets to ± this."""
+    """Clip target_noise to ± this value."""
 
 
 HYPERPARAMETERS: dict[str, type[AlgorithmConfig]] = {

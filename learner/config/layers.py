@@ -1,14 +1,14 @@
 """The layers that a run's settings come from, merged into one record. Pure except for reading TOML files.
 
-The layers are, from the weakest to the strongest: the defaults of the records, the preset of (algorithm, environment), a
-named preset, a TOML file, and flags or keyword arguments. In a resumed run, its config.toml replaces the presets and the
-file; with `--resume auto`, the file comes between the config.toml and the flags.
+The layers are, from the weakest to the strongest: the records' defaults, the preset for the algorithm and environment, a
+named preset, a TOML file, and flags or keyword arguments. When a run is resumed, its config.toml replaces the presets and
+the file; with `--resume auto`, the file comes between the config.toml and the flags.
 
 A setting has one name everywhere: the field `learning_rate` is the TOML key `learning_rate` and the flag `--learning-rate`.
 The settings of the algorithm are in a TOML table named after it, such as [ppo].
 
 Rule: a layer is a dictionary that knows its source. Layers are merged as dictionaries and converted to a record once, so
-that each value is checked once, and an error names the layer that the value comes from.
+each value is checked once, and an error names the layer that the value comes from.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class SettingsLayer(NamedTuple):
     """The settings from one source. The run's and the algorithm's settings are in one mapping."""
 
     where: str
-    """the beginning of errors: a file, `preset NAME` or `train`; empty for flags, whose names say enough"""
+    """what its errors begin with: a file, `preset NAME` or `train`; empty for flags, whose names say enough"""
     settings: Mapping[str, Any]
 
     def origin(self, field: FlagField) -> str:
@@ -48,7 +48,7 @@ class SettingsLayer(NamedTuple):
         return f"{self.where}: {field.name}" if self.where else field.written
 
     def without_tables(self) -> SettingsLayer:
-        """The layer without the arguments of the environment."""
+        """The layer without the environment's arguments."""
         return SettingsLayer(self.where, {name: value for name, value in self.settings.items() if name not in TABLES})
 
 
@@ -70,7 +70,7 @@ class LowerLayers(NamedTuple):
     def below(self, given: SettingsLayer) -> list[SettingsLayer]:
         """The layers below `given`, which holds the flags or keyword arguments, and may name the environment.
 
-        Raises `UsageError` if a resumed run has another environment, or if there is no such preset.
+        Raises `UsageError` if the run to resume has another environment, or if the preset doesn't exist.
         """
         env = str(given.settings.get("env", ""))
         if self.resume is not None and env and not moved(str(self.file.settings.get("env")), env):
@@ -124,7 +124,7 @@ def layers_of_keywords(
 
 
 def config_from_toml(text: str, where: str = "config.toml") -> Config:
-    """Read settings that `Config.to_toml` wrote. Missing ones get their defaults; no preset is used.
+    """Read settings that `Config.to_toml` wrote. Missing settings get their defaults; no preset is used.
 
     `where` is the file's name for error messages. Raises `UsageError` if the text or a setting is not valid.
     """
@@ -134,7 +134,7 @@ def config_from_toml(text: str, where: str = "config.toml") -> Config:
 def config_of_run(run: Path, algo: str | None = None) -> Config:
     """The settings of a run folder, from its config.toml. Raises `UsageError` if they are not valid.
 
-    `algo` is the current name of its algorithm, if the name may have changed (`algorithm_names.moved`).
+    `algo` is the current name of the run's algorithm, if the name may have changed (`algorithm_names.moved`).
     """
     table = with_algorithm(read_config(run), algo)
     return settings_of_run(_file_alone(table, str(run / CONFIG_FILE)), NOTHING)
@@ -175,7 +175,7 @@ def layers_of_run(run: Path, algo: str | None) -> LowerLayers:
 
 
 def _file_alone(table: dict[str, Any], where: str) -> LowerLayers:
-    """The lower layers that consist of a file alone, without a preset."""
+    """Lower layers that consist only of a file, without a preset."""
     algo = _algorithm_of_file(table, where)
     return LowerLayers(algo, "none", NOTHING, _layer_of_file(table, algo, where), None)
 
@@ -196,8 +196,8 @@ def settings_of_run(lower: LowerLayers, given: SettingsLayer) -> Config:
 def merged(algo: str, layers: Sequence[SettingsLayer]) -> Config:
     """Merge these layers, from the weakest to the strongest, into one record.
 
-    Each setting is checked by itself; raises `UsageError` for the first that is unknown or not valid. `env_kwargs` and
-    `eval_env_kwargs` are merged entry by entry.
+    Each setting is checked on its own. Raises `UsageError` for the first setting that is unknown or not valid. `env_kwargs`
+    and `eval_env_kwargs` are merged entry by entry.
     """
     record = settings_record(algo)
     fields = fields_of(Config) | fields_of(record)

@@ -1,7 +1,7 @@
 """How many worker processes a run starts on this machine, and whether its lanes keep them busy.
 
-Rule: results don't depend on the number of workers, so it may be chosen to suit the machine. They do depend on the number of
-lanes, so a better number of lanes is only suggested. Pure, except for counting this machine's cores.
+Rule: results don't depend on the number of workers, so this number may be chosen to suit the machine. Results do depend on
+the number of lanes, so a better number of lanes is only suggested. Pure, except for counting this machine's cores.
 """
 
 from __future__ import annotations
@@ -11,15 +11,15 @@ from millrace.protocol.machine.cpu_cores import usable_cores
 
 
 def enough_workers(lanes: int, workers: int) -> int:
-    """The least number of workers with which the busiest one has no more lanes than with `workers` workers."""
+    """The smallest number of workers with which the busiest worker has no more lanes than with `workers` workers."""
     return -(-lanes // -(-lanes // workers))
 
 
 def local_workers(config: RolloutConfig, cores: int | None = None) -> int:
     """The number of worker processes. Unless the settings give it, one for each core, but at most one for each lane.
 
-    The number is lower if fewer workers are as fast: with 4 lanes, 2 workers are as fast as 3, one of which would step two
-    lanes. `cores` is the number of cores; None means all that this process may use.
+    The number is lower if fewer workers are as fast. For example, with 4 lanes, 2 workers are as fast as 3, because one of
+    the 3 would step two lanes. `cores` is the number of cores; None means all cores that this process may use.
     """
     if config.workers is not None:
         return config.workers
@@ -28,7 +28,7 @@ def local_workers(config: RolloutConfig, cores: int | None = None) -> int:
 
 
 def chosen_workers(config: RolloutConfig, cores: int) -> str:
-    """A clause that tells the user how many workers were chosen, and why; empty if the settings give the number."""
+    """A clause that tells the user how many workers were chosen and why; empty if the settings give the number."""
     if config.workers is not None:
         return ""
     workers = local_workers(config, cores)

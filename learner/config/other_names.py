@@ -1,6 +1,6 @@
-"""Names of settings in other libraries that users often type here, and the names that millrace uses. Pure.
+"""Setting names from other libraries that users often type here, and the names that millrace uses instead. Pure.
 
-Rule: a setting is listed here only if its values mean the same in millrace. docs/how-to/moving_from.md has other names.
+Rule: a setting is listed here only if its values mean the same in millrace. docs/how-to/moving_from.md has the other names.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ OUR_NAME = {
 def in_place_of(name: str, known: Collection[str], *, flag: bool = False) -> str:
     """The end of an error about an unknown setting `name`. It says which name to use instead; empty if that isn't known.
 
-    `known` are the settings of this run. `flag` says that the name was given as a flag, not as a keyword argument.
+    `known` are this run's settings. `flag` is True if the name was given as a flag, False if as a keyword argument.
     """
     if name not in OUR_NAME:
         return algorithms_with(name)

@@ -21,7 +21,7 @@ NAMED = "named"  # the table of presets.toml that holds the whole runs
 
 
 class Preset(NamedTuple):
-    """A whole run by name: environment, algorithm and settings."""
+    """A whole run that has a name: environment, algorithm and settings."""
 
     about: str
     """the line that `millrace presets` shows"""
@@ -52,16 +52,16 @@ def environment_name(env: str, env_kwargs: Mapping[str, Any], algo: str) -> str:
 
 
 def added(table: Mapping[str, object], default: Mapping[str, object]) -> list[str]:
-    """The entries of a table that differ from its default: names and values in turn, as the words of a flag."""
+    """The entries of a table that differ from its default: names and values alternate, as in a flag's words."""
     return [word for key, value in table.items() if default.get(key) != value for word in (key, written(value))]
 
 
 def origin(config: Config) -> str:
     """Where the settings of a new run come from, as one line for the user.
 
-    The preset counts as used if some setting has the preset's value and that value differs from the default. Without a
-    preset, the line names the settings of the algorithm that differ from the defaults; these were given by the user, or come
-    from a file or from the preset of another environment.
+    The preset counts as used if at least one setting has the preset's value and that value differs from the default. Without
+    a preset, the line names the algorithm's settings that differ from the defaults. The user gave these settings, or they
+    come from a file or from another environment's preset.
     """
     preset = environment_presets(config.algo).get(config.env)
     mine = _settings(config)
@@ -83,7 +83,7 @@ def _agrees(mine: Any, preset: Any) -> bool:
 
 
 def _settings(config: Config) -> dict[str, Any]:
-    """The settings of the run and of the algorithm, in the types of TOML."""
+    """The settings of the run and the algorithm, converted to TOML types."""
     settings: dict[str, Any] = msgspec.to_builtins(config)
     algorithm: dict[str, Any] = settings.pop("algorithm")
     return {name: list(value) if isinstance(value, tuple) else value for name, value in (settings | algorithm).items()}

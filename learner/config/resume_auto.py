@@ -1,7 +1,7 @@
 """The settings of `--resume auto`, which continues the newest run with these settings, or starts a new run.
 
-Rule: the settings of the file and the flags, or keyword arguments, override those in the run's config.toml. So an edited
-file takes effect, and a setting that a resumed run can't change is refused wherever it is named. The file is read once,
+Rule: settings from the file, and from flags or keyword arguments, override those in the run's config.toml. An edited file
+therefore takes effect, and a change that a resumed run can't make is refused wherever it comes from. The file is read once,
 because it may be a pipe.
 """
 
@@ -16,10 +16,10 @@ from millrace.learner.run_folder.newest_run import newest_run
 
 
 def settings_with_newest_run(lower: LowerLayers, above: Callable[[LowerLayers], Config]) -> tuple[Config, Path | None]:
-    """The settings, and the run to resume; None if there is none, so that a new run begins.
+    """The settings, and the run to resume; None if there is no such run, so a new run begins.
 
-    `lower` are the layers of a new run. `above` returns the settings on top of lower layers. Raises `UsageError` if a
-    setting or a file is not valid.
+    `lower` are the lower layers of a new run. `above` merges the given lower layers with the flags or keyword arguments.
+    Raises `UsageError` if a setting or a file is not valid.
     """
     config = above(lower)
     run = newest_run(config)

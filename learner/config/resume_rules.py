@@ -1,7 +1,7 @@
 """Whether a resumed run may change a setting: each field is declared free, adaptable or fixed. Pure.
 
 Rule: a setting is fixed if another value would change the meaning of the saved weights or of the saved state. `Config` and
-the records of hyperparameters declare each field as `Free[...]`, `Adaptable[...]` or `Fixed[...]`. A resumed run keeps the
+the hyperparameter records declare each field as `Free[...]`, `Adaptable[...]` or `Fixed[...]`. A resumed run keeps the
 settings in its config.toml, except those that you change; changing a fixed setting is refused.
 """
 
@@ -44,9 +44,9 @@ class Change(NamedTuple):
 def declared(record: type[msgspec.Struct], *, by_type: bool = False) -> dict[str, OnResume]:
     """For each setting of a record, in the order of the fields, what a resumed run does if the setting changes.
 
-    With `by_type`, for user-defined records, a field need not be declared. An undeclared float is free, because it is
-    usually a coefficient; any other field is fixed, because the shape of the weights or of the saved state may depend on it.
-    But if an undeclared field overrides a field of a base class, it keeps the declaration of that field.
+    With `by_type`, for user-defined records, fields may be undeclared. If such a field overrides a field of a base class, it
+    keeps that field's declaration. Otherwise, a float is free, because it is usually a coefficient, and any other field is
+    fixed, because the shape of the weights or of the saved state may depend on it.
 
     Raises TypeError for a field with no declaration or with several, and NameError for a type that cannot be found.
     """
@@ -64,7 +64,7 @@ def changes(run: msgspec.Struct, given: msgspec.Struct) -> Iterator[Change]:
 
 
 def refusal(changed: list[Change]) -> str:
-    """One line of text with the changed settings that are fixed, and their values; empty if there are none."""
+    """One line of text with the fixed settings that were changed, and their values; empty if there are none."""
     fixed = [change for change in changed if change.on_resume is OnResume.FIXED]
     return "; ".join(
         f"{one.name}: expected {_shown(one.run)} as in its config.toml, got {_shown(one.given)}" for one in fixed

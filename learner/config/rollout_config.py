@@ -1,6 +1,6 @@
 """The settings for collecting rollouts, such as the environment, the env copies, the workers and the timeouts. Pure.
 
-A training run has these settings and those of `Config`. A `RolloutService` for your own training loop has only these.
+A training run also has the settings of `Config`. A `RolloutService` for your own training loop has only these.
 """
 
 from __future__ import annotations
@@ -35,26 +35,26 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     env: Annotated[Fixed[str], Flag(positional=True)] = ""
     """Environment id for gymnasium.make, such as CartPole-v1, ALE/Pong-v5 or my_package.envs:MyEnv-v0."""
     env_kwargs: Fixed[dict[str, Scalar]] = {}
-    """Keyword arguments for gymnasium.make: NAME VALUE NAME VALUE ... Values are numbers, true, false or text. Texts may use
-    each env copy's number, slot, lane and copy, as in port "{5000 + slot}".
+    """Keyword arguments for gymnasium.make: NAME VALUE NAME VALUE ... Values are numbers, true, false or text. In text, each
+    env copy's number, slot, lane and copy can be used, as in port "{5000 + slot}".
     """
     eval_env_kwargs: Fixed[dict[str, Scalar]] = {}
-    """Keyword arguments for env copies of evaluations, in addition to env_kwargs; they override those of the same name."""
+    """Additional keyword arguments for evaluation copies. They override arguments of the same name in env_kwargs."""
     wrappers: Annotated[Fixed[tuple[str, ...]], Flag("MODULE:CLASS ...")] = ()
-    """Wrappers of every env copy, including those of evaluations, such as gymnasium.wrappers:FlattenObservation. Arguments
-    must be literals: "my_module:Scale(by=0.5)". The first one is the innermost.
+    """Wrappers for every env copy, including evaluation copies, such as gymnasium.wrappers:FlattenObservation. Arguments
+    must be literals: "my_module:Scale(by=0.5)". The first wrapper is the innermost.
     """
     seat_id: Fixed[bool] = False
-    """In an environment of several agents, add to each agent's observations which agent it is."""
+    """In a multi-agent environment, add the number of the agent's seat to its observations."""
     critic_keys: Annotated[Fixed[tuple[str, ...]], Flag("KEY ...")] = ()
     """Keys of a Dict observation that only the critic sees: the policy acts without them (ppo, a2c, impala, reinforce). For
     PettingZoo, the key state is the environment's state().
     """
     seed: Fixed[Annotated[int, Meta(ge=0)]] = 1
-    """Seed of all random numbers of the run."""
+    """Seed of all the run's random numbers."""
     workers: Free[Count | None] = None
     """Number of worker processes on this machine (train only). none: one for each core, but at most one for each lane. Use
-    more if env steps wait for something other than the CPU; a run without this setting says so.
+    more if env steps wait for something other than the CPU; a run without this setting tells you when they do.
     """
     envs: Adaptable[Count] = 8
     """Number of env copies, summed over all workers. Must be a multiple of lanes."""
@@ -67,17 +67,18 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     """
     max_lag: Free[Natural] = 0
     """Lag of the rollouts: after the first updates, rollouts are collected with weights that are exactly this many versions
-    older than the learner's. 0: workers and learner take turns. Above 0: both run at the same time, for which impala, dqn,
-    sac and td3 are made. Runs are reproducible with any lag.
+    older than the learner's. 0: workers and learner take turns. Above 0: they work at the same time; impala, dqn, sac and
+    td3 are designed for this. Runs are reproducible with any lag.
     """
     vector: Annotated[Free[str], Flag(f"{{{','.join(KINDS)}}}|NAME")] = "loop"
     """How the env copies of a lane are stepped. loop: one after another. native: by the environment's own vector version.
-    envpool: by envpool (pip install envpool). native and envpool use other random numbers than loop. Packages can add
-    kinds.
+    envpool: by envpool (pip install envpool). native and envpool don't use the same random numbers as loop. Packages can
+    add other kinds.
     """
     acting_dtype: Free[ActingDtype] = "float32"
-    """Precision in which workers act; the learner always computes in float32. bfloat16 halves the size of the weights that
-    are sent. With images it halves the time of acting on CPUs with AMX; on others it is slower.
+    """Precision in which workers compute actions; the learner always computes in float32. bfloat16 halves the size of the
+    weights that are sent. With images, it also halves the time to compute actions on CPUs with AMX; on other CPUs, it is
+    slower than float32.
     """
     info_keys: Free[tuple[str, ...]] = ()
     """Names of numbers that the environment reports in info at the end of an episode, such as is_success distance. Their
@@ -89,9 +90,9 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     Dict observation has the key. none: all actions are allowed, and the key is an observation.
     """
     max_env_copies: Free[Natural] = 0
-    """Largest number of env copies of the run on all machines together, for example because of floating licences. It
-    includes the copies for evaluations, which are then played on as few workers as needed. 0: no limit. To limit one
-    machine, set the variable MILLRACE_COPIES_PER_MACHINE.
+    """Largest number of env copies that the run has on all machines together, for example because of floating licences. It
+    includes evaluation copies; evaluations are then played on as few workers as needed. 0: no limit. To limit the env copies
+    on one machine, set the environment variable MILLRACE_COPIES_PER_MACHINE.
     """
     min_workers: Free[Natural] = 0
     """Start training when this many workers have joined. 0: wait for all local workers (train) or one worker
@@ -99,18 +100,19 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     """
     launched_workers: Free[Natural] = 0
     """Number of workers that a launcher starts for this learner (learner only; `millrace launch` sets it). If this many
-    different workers say that the environment cannot be made, the run ends with their reason. 0: wait for another worker.
+    different workers report that they can't create the environment, the run ends and prints their reason. 0: wait for
+    another worker.
     """
 
     # ----------------------------------------------------------------------------------------------------------- network
 
     transport: Free[Literal["inproc", "ipc", "tcp"]] = "ipc"
-    """How local workers are connected (train only). inproc: as threads of this process, which then runs the environment.
-    ipc: local sockets. tcp: TCP on 127.0.0.1.
+    """How local workers are connected (train only). inproc: as threads of this process, which then also runs the
+    environment. ipc: by local sockets. tcp: by TCP on 127.0.0.1.
     """
     bind: Free[str] = "tcp://127.0.0.1:5555"
-    """Address at which the learner listens for workers (learner only). With tcp://0.0.0.0:5555 other machines can join; this
-    needs keys.
+    """Address at which the learner listens for workers (learner only). With tcp://0.0.0.0:5555, workers on other machines
+    can join; this needs keys.
     """
     advertise: Free[str] = ""
     """Host name or IP address of this machine for workers on other machines (learner only). Default: the name of this
@@ -125,16 +127,17 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     """
     metrics_bind: Free[str] = ""
     """HOST:PORT at which Prometheus can read the metrics, such as 127.0.0.1:9464 (pip install prometheus-client). With
-    0.0.0.0:9464 anyone in the network can read them. Default: no metrics are served.
+    0.0.0.0:9464, anyone on the network can read them. Default: no metrics are served.
     """
     dashboard: Free[bool] = False
-    """Show the run in a browser while it trains: its page is served on this machine, and the address is printed."""
+    """Show the run in a browser while it trains. This machine serves the page, and the learner prints its address."""
 
     # --------------------------------------------------------------------------------------------- timeouts and failures
 
     worker_timeout_s: Free[Positive] = 5.0
     """A worker that has been silent for this many seconds counts as lost, and other workers take over its lanes. A worker
-    is not silent while its supervisor says that its environment, or your policy, is busy, however long that takes.
+    doesn't count as silent while its supervisor reports that the environment, or your policy, is busy, however long that
+    takes.
     """
     lost_lanes: Free[Literal["continue", "restart"]] = "continue"
     """What happens to running episodes when their worker is lost, when lanes move to another worker, and when the run is
@@ -143,33 +146,34 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     restart: new episodes begin.
     """
     replay_limit: Free[Natural] = 1000
-    """Longest episode, in steps, that is replayed so that it can continue. In place of a longer one, a new episode begins.
-    Replaying an episode takes as long as its steps took, without the policy.
+    """Longest episode, in steps, that is replayed so that it can continue. A longer one is replaced by a new episode.
+    Replaying an episode takes as long as its steps took, without the time to compute actions.
     """
     restart_episodes: Free[Natural] = 0
-    """Number of episodes after which each env copy is closed and created again, including in evaluations, for simulators
-    that grow or slow down the longer they run. The new copy continues with the seed and the random numbers of the old one,
-    and with its saved state if it has save_state, so results don't change if the environment is deterministic given its
-    seed. 0: never.
+    """Number of episodes after which each env copy, including evaluation copies, is closed and created again. Use it for
+    simulators that need more memory or slow down the longer they run. The new copy continues with the seed and the random
+    numbers of the old one, and with its saved state if the environment has save_state. If the environment is deterministic
+    given its seed, results don't change. 0: never.
     """
     no_workers_timeout_s: Free[Positive] = 600.0
-    """Write a checkpoint and end the run if there has been no worker for this many seconds. A run whose workers are all
-    local ends at once when none is left.
+    """Write a checkpoint and end the run if there has been no worker for this many seconds. If all workers are local, the
+    run ends as soon as none is left.
     """
     start_timeout_s: Free[NotNegative] = 600.0
-    """A worker process, wherever it was started, is restarted if making or resetting one env copy, or making the policy with
-    all that it imports, takes longer than this many seconds. 0: never.
+    """A worker process, on any machine, is restarted if it takes longer than this many seconds to create or reset one env
+    copy, or to create the policy with everything that it imports. 0: never.
     """
     step_timeout_s: Free[NotNegative] = 600.0
-    """A worker process, wherever it was started, is restarted if one step of an env copy, or one call of a policy that you
-    wrote (an `OwnPolicy`, an opponent, an encoder), takes longer than this many seconds. 0: never.
+    """A worker process, on any machine, is restarted if one step of an env copy, or one call to a policy that you wrote (an
+    `OwnPolicy`, an opponent, an encoder), takes longer than this many seconds. 0: never.
     """
     max_env_failures: Free[Natural] = 3
-    """How many failures the run survives. Either of two counts ends it. In a row: more than this, or more than 10, in one
-    lane without a rollout in between (a failure after env steps counts as a quarter). Within an hour: more failures after
-    env steps than this × (1 + env copies × h + w / 30), where h is the hours since the learner began, at most 1, and w the
-    seconds that the failed workers had worked before. A failure is an exception or an unusable result of the environment or
-    of an `OwnPolicy`, or a worker process that ends unexpectedly, because the environment may have ended it.
+    """How many failures the run survives. A failure is an exception or an unusable result from the environment or an
+    `OwnPolicy`, or the unexpected end of a worker process, because the environment may have caused it. Either of two counts
+    ends the run. In a row: more than this number, or more than 10, in one lane without a rollout in between; a failure after
+    env steps counts as a quarter. Within an hour: more failures after env steps than this × (1 + env copies × h + w / 30),
+    where h is the number of hours since the learner began, at most 1, and w is the number of seconds that the failed workers
+    had worked before they failed.
     """
 
     def all_wrappers(self, given: Sequence[WrapperLike] | None = None) -> list[WrapperLike]:
@@ -181,7 +185,7 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
         ]
 
     def call_timeouts(self) -> CallTimeouts:
-        """How long one call of an env copy may take."""
+        """How long one call to an env copy may take."""
         return CallTimeouts(self.start_timeout_s, self.step_timeout_s)
 
     def most_repeated_steps(self) -> int:
@@ -189,9 +193,9 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
         return self.replay_limit if self.lost_lanes == "continue" else -1
 
     def stall_timeout_s(self) -> float:
-        """The run ends after this many seconds without a finished env step, reset or construction. Each takes less time."""
+        """The run ends if no env step, reset or construction finishes for this many seconds. Each of them takes less time."""
         return max(STALL_TIMEOUT_S, self.call_timeouts().longest_s())
 
     def heartbeat_s(self) -> float:
-        """Seconds between a worker's heartbeats: so few that the worker doesn't count as silent even if some arrive late."""
+        """Seconds between a worker's heartbeats: so few that a worker doesn't count as silent if some arrive late."""
         return min(HEARTBEAT_S, self.worker_timeout_s / 5)

@@ -1,4 +1,4 @@
-"""Checks of settings that types can't express. Each error is one line: the setting, what was expected, what was given."""
+"""Checks on settings that types can't express. Each error is one line: the setting, what was expected, what was given."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ LARGEST_SEED = 2**64 - 1  # the largest seed that PyTorch accepts
 
 
 def validate(config: Config) -> None:
-    """Raise `UsageError` if these settings, each valid by itself, don't make a valid run together."""
+    """Raise `UsageError` if these settings, each valid on its own, don't make a valid run together."""
     if not config.env:
         raise UsageError("which environment? expected one that gymnasium.make takes, as in: millrace train CartPole-v1")
     check_rollout_settings(config)
@@ -64,7 +64,7 @@ def check_text(name: str, value: object, origin: str) -> None:
 
     A command line may contain any bytes. `origin` is how an error refers to the setting.
     """
-    if name == "run_dir":  # the check of the folder has a better error, which says what to do
+    if name == "run_dir":  # the folder's own check has a better error, which says what to do
         return
     for text in value if isinstance(value, tuple | list) else (value,):
         if isinstance(text, str) and any("\ud800" <= character <= "\udfff" for character in text):
@@ -72,7 +72,7 @@ def check_text(name: str, value: object, origin: str) -> None:
 
 
 def check_numbers(record: msgspec.Struct, origins: Mapping[str, str]) -> None:
-    """Raise `UsageError` for NaN, and for a whole number that is too large for a message.
+    """Raise `UsageError` for NaN, and for an integer that is too large for a message.
 
     `origins` says how an error refers to each setting that was given.
     """
@@ -86,12 +86,12 @@ def check_numbers(record: msgspec.Struct, origins: Mapping[str, str]) -> None:
 
 
 def check_copies(config: Config, limit: str, most: int) -> None:
-    """Raise `UsageError` if the run needs more than `most` env copies (0 for any number).
+    """Raise `UsageError` if the run needs more than `most` env copies. 0 allows any number.
 
-    `limit` names the setting or the variable that gives this number.
+    `limit` is the name of the setting or variable that `most` comes from.
     """
     # Each worker that evaluates keeps its env copies. Without eval_workers, one worker evaluates. With them, one more worker
-    # must be able to evaluate, in case they are lost.
+    # must be able to evaluate, in case all of them are lost.
     evaluate = min(config.eval_copies, evaluation_size(config).episodes) * (config.eval_workers + 1)
     if 0 < most < config.envs + evaluate:
         raise UsageError(
@@ -103,7 +103,7 @@ def check_copies(config: Config, limit: str, most: int) -> None:
 def workers_to_wait_for(config: RolloutConfig, local: int | None) -> int:
     """How many workers must have joined before collection starts. Raises `UsageError` if that many can't join.
 
-    `local` is the number of workers that this machine starts, if no others can join; None if workers start elsewhere.
+    If no other workers can join, `local` is the number of workers that this machine starts; otherwise it is None.
     """
     if local is None:
         return config.min_workers or 1
@@ -116,8 +116,10 @@ def workers_to_wait_for(config: RolloutConfig, local: int | None) -> int:
 
 
 def unused_setting(config: Config) -> str:
-    """A line for the user if a setting has no effect: the run ends before the first gradient step, or a setting needs
-    evaluations during training, and there are none. Otherwise empty.
+    """A line for the user if a setting has no effect; otherwise empty.
+
+    A setting has no effect if the run ends before the first gradient step, or if the setting needs evaluations during
+    training and there are none.
     """
     if isinstance(config.algorithm, OffPolicyConfig) and config.steps <= config.algorithm.learning_starts:
         return (
