@@ -1,4 +1,4 @@
-"""The learner: the training loop, the coordinator of the workers and the algorithms. Read train.py first.
+"""The learner: the training loop, the workers' coordinator and the algorithms. Read train.py first.
 
 This package never imports millrace.workers.
 """

@@ -1,4 +1,4 @@
-"""The spaces and the time limit of an environment, in the form that a run needs. Pure; imports no torch."""
+"""An environment's spaces and time limit, in the form that a run needs. Pure; imports no torch."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
 
 
 class EnvSpaces(NamedTuple):
-    """The spaces and the time limit of an environment."""
+    """An environment's spaces and time limit."""
 
     observation: tuple[Leaf, ...]
     action: ActionSpec
     max_episode_steps: int | None
-    """The time limit of an episode in env steps; None if there is none, or if it is not known."""
+    """The time limit of an episode, in env steps; None if there is none, or if it is not known."""
     masked: bool = False
     """Whether the run uses action masks. A mask in an observation isn't part of `observation`."""
     seats: tuple[str, ...] = ()
-    """The names of its agents, each of which has these spaces; empty for a gymnasium environment."""
+    """The names of the agents, each of which has these spaces; empty for a gymnasium environment."""
     takes_turns: bool = False
-    """Whether a seat may have to wait for others between two of its actions."""
+    """Whether a seat may have to wait for other seats between two of its actions."""
     critic: tuple[Leaf, ...] = ()
-    """Additional arrays of an observation, which only the critic sees."""
+    """Additional observation arrays that only the critic sees."""
 
     @staticmethod
     def of_description(
@@ -71,5 +71,5 @@ class EnvSpaces(NamedTuple):
 
     @staticmethod
     def of_policy(policy: PolicySpec, seats: tuple[str, ...] = ()) -> EnvSpaces:
-        """The spaces for which a policy was made."""
+        """The spaces that a policy was created for."""
         return EnvSpaces(policy.observation, policy.action, None, seats=seats, critic=policy.critic)

@@ -1,7 +1,7 @@
 """The objects in extras that settings and public functions start. The core imports an extra only when it is needed.
 
 Rule: each entry is `module:name`. The core defines the type of each object, and the caller declares it. The core has
-similar tables for the other contributions of extras: commands (`millrace/cli/commands.py`), kinds of env copies
+similar tables for what else extras contribute: commands (`millrace/cli/commands.py`), kinds of env copies
 (`protocol/envs/kinds_of_copies.py`) and environments (`protocol/env_spec.py`). It names extras nowhere else.
 """
 
@@ -47,7 +47,7 @@ NEEDED_BY = {
 
 
 def check_packages(config: Config) -> None:
-    """Raise `UsageError` if a setting needs a package that is not installed. Quick, because it imports nothing."""
+    """Raise `UsageError` if a setting needs a package that is not installed. This is quick, because it imports nothing."""
     for setting, (modules, install) in NEEDED_BY.items():
         missing = [module for module in modules if find_spec(module) is None]
         if getattr(config, setting) and missing:

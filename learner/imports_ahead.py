@@ -17,18 +17,18 @@ THREAD = "imports"
 
 
 class ImportsAhead:
-    """The imports of one run, which begin when this object is made."""
+    """The imports that one run needs. They begin when this object is created."""
 
     def __init__(self, algo: str) -> None:
         # The module of a user-defined algorithm has already been imported, for its settings.
         self._modules = (*MODULES, ALGORITHMS[algo].partition(":")[0]) if algo in ALGORITHMS else MODULES
         self._error: BaseException | None = None
-        # It isn't a daemon, because ending a thread in the middle of importing PyTorch can crash the process.
+        # Not a daemon, because ending a thread in the middle of importing PyTorch can crash the process.
         self._thread = threading.Thread(target=self._import, name=THREAD)
         self._thread.start()
 
     def wait(self, check_interrupt: Callable[[], None]) -> None:
-        """Wait until everything is imported. Raises the exception of an import, or that of `check_interrupt`."""
+        """Wait until everything is imported. Raises any exception from an import or from `check_interrupt`."""
         while self._thread.is_alive():
             self._thread.join(POLL_S)
             check_interrupt()

@@ -1,9 +1,9 @@
-"""Handles SIGINT, SIGTERM and SIGHUP in a learner: the first one ends the run, within the grace time if there is one.
+"""Handles SIGINT, SIGTERM and SIGHUP in a learner: the first signal ends the run, within the grace time if there is one.
 
 Rule: after the first signal, the current update may still finish; `time_is_up` says when it must be abandoned, so that the
 rest of the grace time is enough to save. A second SIGINT (Ctrl-C) ends the run at once. If there is a grace time, further
 SIGTERMs and SIGHUPs change nothing, because they are often sent both to a process and to its group, and the time is limited
-anyway. SIGHUP means that the terminal is gone. A learner that was started to ignore it (`nohup`) goes on ignoring it.
+anyway. SIGHUP means that the terminal is gone. A learner that was started to ignore SIGHUP (`nohup`) keeps ignoring it.
 
 Rule: where there is nothing to save, a signal ends the program as well, with the same exit code (`stopped_by_signals`).
 """
@@ -29,8 +29,9 @@ Handler = Callable[[int, FrameType | None], None] | signal.Handlers
 class Stopped(KeyboardInterrupt):
     """A signal has stopped the program.
 
-    It is a separate class, because after a plain KeyboardInterrupt has passed through `exec`, for example in the definition
-    of a dataclass, Python ends as if the signal had killed it, whatever the program does with the exception.
+    It is a separate class because of how Python treats a plain KeyboardInterrupt that has passed through `exec`, for example
+    in the definition of a dataclass: Python then ends as if the signal had killed it, even if the program handles the
+    exception.
     """
 
 
@@ -38,8 +39,8 @@ class Stopped(KeyboardInterrupt):
 def stopped_by_signals() -> Iterator[None]:
     """Inside this context, the first signal raises `Stopped`.
 
-    Later signals are ignored, because they would only cut the clean-up short. Blocked signals are delivered on entry. After
-    the exit, signals stay ignored, because Python would remove any other handler when the interpreter ends.
+    Later signals are ignored, because they would only cut the clean-up short. Signals that were blocked are delivered on
+    entry. After the exit, signals stay ignored, because Python would remove any other handler when the interpreter ends.
     """
     global _stopped
 
@@ -59,7 +60,7 @@ def stopped_by_signals() -> Iterator[None]:
 
 
 def _set(handler: Handler) -> dict[int, Any]:
-    """Set the handler of the signals, except of SIGHUP if it is ignored. Returns the previous handlers."""
+    """Set the handler for the signals, except for SIGHUP if it is ignored. Returns the previous handlers."""
     heeded = [each for each in SIGNALS if each != signal.SIGHUP or signal.getsignal(each) != signal.SIG_IGN]
     return {each: signal.signal(each, handler) for each in heeded}
 
@@ -90,7 +91,7 @@ class Interrupts:
         return max(0.0, min(seconds, self._end_s - monotonic()))
 
     def time_is_up(self, save_s: float) -> bool:
-        """Whether the current update must be abandoned. `save_s` is the longest time that a checkpoint took so far."""
+        """Whether the current update must be abandoned. `save_s` is the longest time that a checkpoint has taken so far."""
         for_saving_s = max(FOR_SAVING * self._grace_s, SAVE_TAKES * save_s)
         return self.received and self._end_s < math.inf and monotonic() > self._end_s - for_saving_s
 
@@ -100,4 +101,4 @@ class Interrupts:
             self._end_s = monotonic() + self._grace_s
             for each, handler in self._handlers_before.items():
                 if each == signal.SIGINT or math.isinf(self._grace_s):
-                    signal.signal(each, handler)  # a second signal goes to the handler that was set before
+                    signal.signal(each, handler)  # a second signal goes to the previous handler

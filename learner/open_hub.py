@@ -1,4 +1,4 @@
-"""Makes the hub of a run from its settings, for millrace's training and for your own loop.
+"""Creates a run's hub from its settings, for millrace's training and for your own loop.
 
 It imports no torch. This file doesn't know who starts worker processes: the launchers in `millrace` pass in a
 `WorkerProcesses`, along with the lobby.
@@ -33,11 +33,11 @@ def open_hub(
     past: PastRollouts | None = None,
     opponents: OpponentPool | None = None,
 ) -> Hub:
-    """Open the hub of a run, which takes over the lobby's workers and serves those that join later.
+    """Open the hub of a run, which takes over the lobby's workers and serves workers that join later.
 
-    An update uses one rollout of each lane. `check_interrupt` is called while the hub waits, and an exception that it raises
-    ends the wait. `observer` is called each time the hub has listened. `past` is from the checkpoint of a resumed run.
-    `opponents` is the pool of a run with teams.
+    An update uses one rollout from each lane. `check_interrupt` is called while the hub waits, and an exception that it
+    raises ends the wait. `observer` is called each time the hub has listened. In a resumed run, `past` comes from the
+    checkpoint. In a run with teams, `opponents` is the pool of opponents.
     """
     past = past or PastRollouts(Ledger(), ())
     rounds = Rounds(config.max_lag, past.rounds.next, past.rounds.versions)
@@ -63,7 +63,7 @@ def open_hub(
 
 
 def lobby_settings(config: RolloutConfig, progress: RunProgress = NO_PROGRESS) -> LobbySettings:
-    """The settings that matter before the run begins. `progress` says how far a resumed run has got."""
+    """The settings that matter before the run begins. In a resumed run, `progress` says how far the run has got."""
     return LobbySettings(
         wait=WaitSpec(config.call_timeouts(), config.heartbeat_s()),
         worker_timeout_s=config.worker_timeout_s,

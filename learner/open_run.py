@@ -1,7 +1,7 @@
 """Assembles a run: the algorithm, the hub, and everything that happens between two updates.
 
-This file imports PyTorch. `learner/run_setup.py` has the parts that must exist earlier. For a resumed run, nothing is
-written before all checks have passed.
+This file imports PyTorch. `learner/run_setup.py` has the parts of a run that must exist before. For a resumed run, nothing
+is written before all checks have passed.
 """
 
 from __future__ import annotations
@@ -55,14 +55,15 @@ log = logging.getLogger("millrace.learner")
 
 
 def open_run(setup: RunSetup, lobby: Lobby, watch: Watch, observer: HubObserver) -> OpenRun:
-    """Open the run of this setup, with the workers in the lobby. Its folder must be ready. Raises `MillraceError`.
+    """Open the run described by this setup, with the workers in the lobby. The run folder must be ready.
 
-    `watch` are the callbacks of the run, or a function to call after each update. `observer` is called each time the hub has
-    listened. For a resumed run, nothing is written before all checks have passed.
+    `watch` is the run's callbacks, or a function to call after each update. `observer` is called each time the hub has
+    listened. For a resumed run, nothing is written before all checks have passed. Raises `MillraceError` if the run can't
+    be opened.
     """
     callbacks = Callbacks.of(watch).with_named(setup.config.callbacks)
     if setup.config.tensorboard:
-        callbacks.add(started_by("tensorboard")(setup.folder))  # last, so that it gets the numbers that other callbacks log
+        callbacks.add(started_by("tensorboard")(setup.folder))  # last, so that it gets what the other callbacks log
     if line := unused_setting(setup.config):
         log.warning("%s", line)
     with naming_run(setup.folder.shown if setup.resumed else None):
@@ -122,7 +123,7 @@ def _why_no_attributes(vector: str) -> str:
 
 
 def _opponent_pool(config: Config, spec: RunSpec, state: PoolState) -> OpponentPool | None:
-    """The opponents of the run; None if the policy plays all agents itself."""
+    """The run's opponents; None if the policy plays all agents itself."""
     if not spec.teams:
         return None
     settings = PoolSettings(
@@ -138,7 +139,7 @@ def _opponent_pool(config: Config, spec: RunSpec, state: PoolState) -> OpponentP
 
 
 def _use_threads(setup: RunSetup, policy: PolicySpec, processes: WorkerProcesses) -> RunSetup:
-    """Let PyTorch use the run's number of threads. Returns the setup with that number."""
+    """Set PyTorch's number of threads for the run. Returns the setup with this number."""
     config = setup.config
     if config.torch_threads is None and config.shards > 1:
         config = msgspec.structs.replace(config, torch_threads=1)  # because several processes share a machine's cores
@@ -161,9 +162,9 @@ def _use_threads(setup: RunSetup, policy: PolicySpec, processes: WorkerProcesses
 
 
 def _new_algorithm(setup: RunSetup, spec: RunSpec) -> tuple[Algorithm, PriorData | None]:
-    """Make the algorithm of a run, and its prior data if there are any.
+    """Create a run's algorithm, and its prior data if the settings name any.
 
-    The algorithm of a new run starts from another run if the settings say so; that of a resumed run is restored later.
+    A new run's algorithm starts from another run if the settings say so; a resumed run's algorithm is restored later.
     """
     config = setup.config
     folder = setup.folder
@@ -191,7 +192,7 @@ def _new_algorithm(setup: RunSetup, spec: RunSpec) -> tuple[Algorithm, PriorData
 
 @dataclass(frozen=True)
 class _InterruptiblePrior:
-    """Prior data that calls `check` after it has read each episode, so that an exception of `check` can end the reading."""
+    """Prior data that calls `check` after reading each episode, so that an exception from `check` can end the reading."""
 
     data: PriorData
     check: Callable[[], None]

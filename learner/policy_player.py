@@ -1,4 +1,4 @@
-"""A learner that doesn't train, but has workers play episodes with the policy of a run folder.
+"""A learner that doesn't train, but has workers play episodes with a policy from a run folder.
 
 Rule: the policy is published once, as version 1; a policy that plays against it is published as version 0. The learner's
 process runs no environment code. Timeouts and the number of allowed failures are the same as in training.
@@ -44,7 +44,7 @@ class SavedPolicy(NamedTuple):
     parameters: Floats
     buffers: Floats
     facts: tuple[str, ...] = ()
-    """the names of the numbers that the run logs for each episode"""
+    """the names of the values that the run logs for each episode"""
     masked: bool = False
     """whether the environment says which actions are allowed"""
     seats: tuple[str, ...] = ()
@@ -58,14 +58,14 @@ class SavedPolicy(NamedTuple):
 def saved_policy(
     run: Path, which: Which = "final", *, env: EnvLike | None = None, wrappers: Sequence[WrapperLike] | None = None
 ) -> SavedPolicy:
-    """Read a policy of a run folder, and find its environment and wrappers by the names that the run has saved.
+    """Read a policy from a run folder, and find its environment and wrappers by the names that the run has saved.
 
-    `env` and `wrappers` override them. Raises `UsageError`, with a one-line message, if the policy cannot be read, or if the
-    environment or a wrapper cannot be found.
+    `env` and `wrappers` override these names. Raises `UsageError`, with a one-line message, if the policy cannot be read, or
+    if the environment or a wrapper cannot be found.
     """
     card, parameters, buffers = RunFolder.open_policy(run).read_policy(which)
     refuse_modules_in(run, (*([card.env] if env is None else []), *(card.wrappers if wrappers is None else [])))
-    # The wrappers that other settings add belong to the policy, whose observations have their parts.
+    # The wrappers that other settings add are always kept, because the policy's observations contain what they add.
     of_settings = [wrapper for wrapper in card.wrappers if wrapper in (SEAT_ID, WITH_STATE)]
     outer = card.wrappers if wrappers is None else [*wrappers, *of_settings]
     spec = EnvSpec.of(card.env if env is None else env, card.env_kwargs, outer, card.eval_env_kwargs)
@@ -73,7 +73,7 @@ def saved_policy(
 
 
 class PolicyPlayer:
-    """Plays episodes of a saved policy with the workers that join in a lobby."""
+    """Plays episodes of a saved policy on the workers that join a lobby."""
 
     def __init__(
         self,
@@ -86,9 +86,9 @@ class PolicyPlayer:
     ) -> None:
         """`settings` has the timeouts and the number of allowed failures.
 
-        `check_interrupt` is called while this waits, and an exception that it raises ends the wait. `watch` is called
-        several times a second with a line that says how far the episodes have got. `described` is the environment, if a
-        worker has already described it. Raises `UsageError` if one policy cannot play against the other.
+        `check_interrupt` is called while this object waits, and an exception that it raises ends the wait. `watch` is called
+        several times a second with a line that says how far the episodes have got. `described` is the environment's
+        description, if a worker has already made one. Raises `UsageError` if one policy cannot play against the other.
         """
         self.policy = policy
         if policy.against is not None:
@@ -108,7 +108,7 @@ class PolicyPlayer:
 
     @property
     def facts(self) -> tuple[str, ...]:
-        """The names of the facts of the episodes that were played."""
+        """The names of the facts that are logged for the episodes that were played."""
         return self.policy.facts if self._hub is None else self._hub.coordinator.run.facts
 
     @property
@@ -117,9 +117,9 @@ class PolicyPlayer:
         return 0 if self._hub is None else len(self._hub.snapshot().roles)
 
     def describe(self, render_mode: str | None = None) -> DescribedEnv:
-        """Have a worker describe the environment of evaluations. Call this before the first `play`.
+        """Have a worker describe the environment that evaluations use. Call this before the first `play`.
 
-        Raises `UserFacingError` if that fails.
+        Raises `UserFacingError` if no worker can describe it.
         """
         if self._described is not None:
             return self._described
@@ -134,9 +134,10 @@ class PolicyPlayer:
         bound: str = "at most",
         before: tuple[int, int] = (0, 0),
     ) -> list[PlayedEpisode]:
-        """Play the episodes of this plan. Returns them in the order of the seeds. Raises `RunError` if that is not possible.
+        """Play this plan's episodes. Returns them in the order of their seeds. Raises `RunError` if they can't be played.
 
-        Against another policy, both policies sample their actions, because two greedy ones would repeat the same few games.
+        Against another policy, both policies sample their actions, because two greedy policies would replay the same few
+        games.
 
         `bound` and `before` are arguments of `EvaluationPlan.how_far`, which makes the line for `watch`.
         """
@@ -204,7 +205,7 @@ def _check_rival(policy: SavedPolicy, against: StoredPolicy) -> None:
 
 
 def _in_words(compared: Any) -> str:
-    """A compared value in words: leaves as path, dtype and shape, action spaces as kind and size, the rest as it is."""
+    """A compared value in words: leaves as path, dtype and shape; action spaces as kind and size; other values unchanged."""
     match compared:
         case tuple((Leaf(), *_)):
             return ", ".join(f"{leaf.path or 'one array'} {leaf.dtype}{list(leaf.shape)}" for leaf in compared)
@@ -216,5 +217,5 @@ def _in_words(compared: Any) -> str:
 
 
 def useful_workers(workers: int, episodes: int, copies: int) -> int:
-    """The number of workers that can be used: `workers`, but at most one for each ticket."""
+    """The number of workers that have something to do: `workers`, but at most one for each ticket."""
     return min(workers, math.ceil(episodes / copies))

@@ -1,10 +1,10 @@
 """Checks the calls in a checkpoint's pickle before torch's loader makes them. Pure.
 
 Rule: a pickle may contain only what torch.save writes for tensors and plain data. torch's loader for untrusted files
-(`weights_only`) doesn't run code from them, but it calls `bytearray` with any length, and copies a container or a string as
-many times as the file says, so a few bytes could fill the memory. It also hashes the keys of dicts, which could take forever
-with tuples that contain a tuple twice, or with numbers that all have the same hash; and whoever visits lists that contain a
-list twice could take as long. This file interprets the pickle without making its objects.
+(`weights_only`) doesn't run code from them, but a few bytes could make it fill the memory, because it calls `bytearray` with
+any length, and copies a container or a string as often as the file says. It also hashes the keys of dicts. That could take
+forever if tuples contain the same tuple twice, again and again, or if all numbers have the same hash. Code that visits lists
+which contain the same list twice could take as long. This file interprets the pickle without creating its objects.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from typing import NamedTuple
 VALUES = {"NONE", "NEWTRUE", "NEWFALSE", "BININT", "BININT1", "BININT2", "LONG1", "LONG4", "BINFLOAT", "BINUNICODE"}
 CONTAINERS = {"EMPTY_LIST", "EMPTY_DICT"}
 TUPLES = {"EMPTY_TUPLE": 0, "TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3}
-"""Opcodes that make values, by their names in pickletools. torch.save writes protocol 2."""
+"""Opcodes that create values, by their names in pickletools. torch.save writes protocol 2."""
 
 REBUILD = {f"torch._utils {name}" for name in ("_rebuild_tensor_v2", "_rebuild_tensor_v3", "_rebuild_parameter")}
-"""Functions that make a view of a storage. torch checks the size of the view when it makes it."""
+"""Functions that create a view of a storage. torch then checks the size of the view."""
 HOOKS = "collections OrderedDict"  # the empty dict of a tensor's hooks
-BYTES = "_codecs encode"  # makes a bytes object, whose content the pickle holds as text
+BYTES = "_codecs encode"  # creates a bytes object, whose content the pickle holds as text
 CALLED = REBUILD | {HOOKS, BYTES}
 MOST_KEY = 1 << 60  # limit on the size of a number that is a key; larger numbers may all have the same hash
-MOST_REPEATED = 1 << 20  # limit on how often a visitor finds an object that it has found before,
-REPEATED_PER_BYTE = 16  # plus this number for each byte of the pickle, because dicts have the same keys again and again
+MOST_REPEATED = 1 << 20  # limit on how often a visitor finds an object that it has already found,
+REPEATED_PER_BYTE = 16  # plus this number for each byte of the pickle, because many dicts have the same keys
 TYPES = ("torch ", "torch.storage ")  # prefixes of the names of storage types and dtypes, which aren't called
 
 
@@ -39,14 +39,14 @@ class _Function(NamedTuple):
 
 @dataclass(slots=True)
 class _Made:
-    """An object that the loader would make."""
+    """An object that the loader would create."""
 
     value: object
     """a number, a text, a function, or a tuple of these; None for anything else"""
     values: int = 1
-    """the number of objects that a visitor finds in it. One that occurs several times counts several times"""
+    """the number of objects that a visitor finds in it; an object that occurs several times counts several times"""
     used_again: bool = False
-    """whether it occurs a second time. If so, it must be complete, because `values` would be too small otherwise"""
+    """whether it occurs a second time. If so, it must be complete, because `values` would otherwise be too small"""
 
 
 def rehearse(content: bytes) -> None:
@@ -107,13 +107,13 @@ def rehearse(content: bytes) -> None:
 
 
 def _gather(stack: list[_Made], first: int) -> None:
-    """Replace the items on the stack, from this index on, with a tuple of them."""
+    """Replace the items on the stack, from index `first` on, with a tuple of these items."""
     items = stack[first:]
     stack[first:] = [_Made(tuple(each.value for each in items), 1 + sum(each.values for each in items))]
 
 
 def _add(stack: list[_Made], first: int) -> None:
-    """Move the items on the stack, from this index on, into the list or dict below them."""
+    """Move the items on the stack, from index `first` on, into the list or dict below them."""
     container = stack[first - 1]
     container.values += sum(each.values for each in stack[first:])
     del stack[first:]
@@ -127,7 +127,7 @@ def may_be_key(key: object) -> bool:
 
 
 def _set_items(stack: list[_Made], first: int) -> None:
-    """Move keys and values, from this index on, into the dict below them. Raises `Unfit` for a key that isn't allowed."""
+    """Move keys and values, from index `first` on, into the dict below them. Raises `Unfit` for a key that isn't allowed."""
     for key in stack[first::2]:
         if not may_be_key(key.value):
             raise Unfit("expected a pickle of tensors and plain data, got a key that is neither text nor a small number")
@@ -135,7 +135,7 @@ def _set_items(stack: list[_Made], first: int) -> None:
 
 
 def _check_storage(storage: object) -> None:
-    """Raise `Unfit` unless this names a storage as torch.save does. torch uses the third item as a key."""
+    """Raise `Unfit` unless this names a storage in the way torch.save does. torch uses the third item as a key."""
     match storage:
         case "storage", _Function(), str(), str(), int():
             pass

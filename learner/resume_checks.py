@@ -1,7 +1,7 @@
-"""Checks, before a run is resumed, that the settings and the environment still fit its weights and state.
+"""Checks, before a run is resumed, that the settings and the environment still fit the run's weights and state.
 
 Rule: all checks are made before anything is written into the run folder, so a refused resume changes nothing. A launcher
-needs a `Resumption`, which only `unless_finished` makes, so no launcher can skip the checks.
+needs a `Resumption`, which only `unless_finished` creates, so no launcher can skip the checks.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ class Resumption(NamedTuple):
 
     run: Path
     differences: tuple[str, ...]
-    """Lines for the user about what will be different."""
+    """Lines that tell the user what will be different."""
 
 
 def unless_finished(config: Config, resume: Path | None, train: Callable[[Resumption | None], Path]) -> Path:
-    """If `resume` is given, check that run. Then call `train`. Returns the run folder.
+    """Call `train`, unless the run to resume is already finished. Returns the run folder.
 
-    For a run that is finished, returns at once, so that no worker is started. Raises `UsageError` if there is no such run or
-    it cannot be resumed with these settings, and whatever `train` raises.
+    If `resume` is given, that run is checked first. If it is finished, no worker is started. Raises `UsageError` if there is
+    no such run or it cannot be resumed with these settings, and whatever `train` raises.
     """
     if resume is None:
         if config.start_from:
@@ -54,7 +54,7 @@ def policy_to_start_from(config: Config) -> StoredPolicy:
 
 
 def check_settings(config: Config, run: Path) -> list[str]:
-    """Check that the run in this folder can be resumed with these settings. Returns lines about what will be different.
+    """Check that the run in this folder can be resumed with these settings. Returns lines that say what will be different.
 
     Raises `UsageError` if this isn't a run folder, or if fixed settings differ. The error names these settings.
     """
@@ -75,7 +75,7 @@ def check_settings(config: Config, run: Path) -> list[str]:
 
 
 def check_spaces(run: Path, made_for: EnvSpaces, now: EnvSpaces) -> None:
-    """Raise `UsageError` unless the environment has the spaces and agents for which the policy was made."""
+    """Raise `UsageError` unless the environment has the spaces and agents that the policy was created for."""
     for what, expected, got in (
         ("agents", (made_for.seats,), (now.seats,)),
         ("observations", made_for.observation, now.observation),
@@ -89,7 +89,7 @@ def check_spaces(run: Path, made_for: EnvSpaces, now: EnvSpaces) -> None:
 
 
 def first_difference(expected: Iterable[object], got: Iterable[object]) -> tuple[str, str] | None:
-    """The first two items that differ, or two different counts, as one line of text each; None if all are equal."""
+    """The first pair of items that differ, or of counts, as one line of text each; None if everything is equal."""
     expected = [*expected]
     got = [*got]
     for one, other in zip(expected, got, strict=False):
@@ -99,7 +99,7 @@ def first_difference(expected: Iterable[object], got: Iterable[object]) -> tuple
 
 
 def _with_present_names(before: Config, now: Config) -> Config:
-    """The settings of a run, with the current names of its environment and wrappers if these were moved to a module."""
+    """A run's settings, with the current names of its environment and wrappers if these were moved to a module."""
     wrappers_moved = len(before.wrappers) == len(now.wrappers) and all(map(moved, before.wrappers, now.wrappers))
     return msgspec.structs.replace(
         before,
@@ -111,8 +111,9 @@ def _with_present_names(before: Config, now: Config) -> Config:
 def _is_finished(config: Config, folder: RunFolder) -> bool:
     """Whether the run has nothing left to do, because the reason why it ended still holds with these settings.
 
-    The reason rests on the returns that ended training. The evaluation of the final policy came later, and the summary has a
-    mean training return even if too few episodes had ended for it to count.
+    Only the returns that ended training decide this. The evaluation of the final policy doesn't count, because it came
+    later; nor does the summary's mean training return if training ended because all env steps were done, because it may be
+    the mean of too few episodes.
     """
     summary = folder.summary()
     if summary is None or summary.evaluation is None:
@@ -150,7 +151,7 @@ def _differences(before: Config, config: Config, changed: Sequence[Change]) -> l
 
 @contextmanager
 def naming_run(run: Path | None) -> Iterator[None]:
-    """Let errors name the run that is resumed, because the wrong setting may be in its folder.
+    """Make errors name the run that is resumed, because the wrong setting may be in its folder.
 
     `run` is None for a new run.
     """

@@ -1,4 +1,4 @@
-"""Makes the specification of a run that `Welcome` sends to workers, for millrace's training and for your own loop.
+"""Creates the run specification that `Welcome` sends to workers, for millrace's training and for your own loop.
 
 It imports no torch.
 """
@@ -31,8 +31,8 @@ def rollout_spec(
     """The specification that `Welcome` sends to workers.
 
     `rollout_steps` is T, the number of steps of a rollout. `extras` are additional arrays of a rollout, which the user's own
-    policy returns. `spaces` are those of the environment. `teams` and `scripted` are for a run with opponents. Raises
-    `UsageError` if the specification cannot be sent, or if settings, environment and policy do not fit together.
+    policy returns. `spaces` are the environment's. `teams` and `scripted` are for a run with opponents. Raises `UsageError`
+    if the specification cannot be sent, or if settings, environment and policy do not fit together.
     """
     masked, seats = spaces.masked, spaces.seats
     if masked and not has_masks(config.vector):
@@ -74,7 +74,7 @@ def rollout_spec(
 def _check_weights_can_be_sent(env: str, policy: PolicySpec, config: RolloutConfig) -> None:
     """Raise `UsageError` if the policy's weights don't fit into a message.
 
-    Even a space of few arrays, such as a `Discrete` of 2**53 values, may make a policy too large to allocate.
+    Even a space with few arrays, such as a `Discrete` with 2**53 values, may make the policy too large to allocate.
     """
     size = acting_size(policy) * (4 if config.acting_dtype == "float32" else 2)
     if size > MAX_FRAME_BYTES:

@@ -1,4 +1,4 @@
-"""An open run, whose learner listens to its workers. `open_run.py` opens it; `whole_run.py` trains it to its end."""
+"""An open run, whose learner listens to its workers. `open_run.py` opens a run; `whole_run.py` trains it to its end."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ class OpenRun:
     setup: RunSetup
     parts: RunParts
     files: RunFiles
-    """writes the files of the run"""
+    """writes the run's files"""
     audience: Audience
-    """reports the progress of the run"""
+    """reports the run's progress"""
     evaluations: Evaluations
     """evaluates the policy"""
     prior: PriorData | None = None
-    """the dataset, if there is one, that the run learns from in addition to its own rollouts"""
+    """the dataset that the run learns from in addition to its own rollouts, if there is one"""
 
     def check_time(self) -> None:
-        """Raise `Interrupted` if the grace time of an interrupted run is up."""
+        """Raise `Interrupted` if the run was interrupted and its grace time is up."""
         if self.setup.interrupts.time_is_up(self.files.longest_save_s):
             raise Interrupted(self.setup.folder.shown)

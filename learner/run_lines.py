@@ -1,7 +1,7 @@
-"""The line that sums up a run: its state, its progress and its return. For this, only a few files of a run folder are read.
+"""The line that sums up a run: its state, its progress and its return. Only a few files in the run folder are read for it.
 
-Rule: a folder that can't be read gets a line, too, which says why. Nothing records that a run died. So a run counts as dead
-if no process trains it and it has no results.
+Rule: a folder that can't be read also gets a line, which says why. Because nothing records that a run died, a run counts as
+dead if no process trains it and it has no results.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from millrace.protocol.errors import UsageError
 from millrace.protocol.progress import RunProgress
 
 RunCondition = Literal["training", "finished", "interrupted", "dead", "unreadable"]
-MOST_RUNS = 1_000  # how many runs are listed at most
+MOST_RUNS = 1_000  # the largest number of runs that are listed
 MOST_REASON = 40  # limit on the characters of a reason
 STARTED = re.compile(r"-(\d{8}-\d{6})(?:-\d{1,9})?")
 
@@ -64,12 +64,12 @@ class RunLine(NamedTuple):
 
     @property
     def begins(self) -> bool:
-        """Whether the run trains but its progress isn't known, because there are no numbers before the first update."""
+        """Whether the run trains but its progress isn't known yet, because there are no numbers before the first update."""
         return self.state == "training" and not (self.progress.updates or self.progress.env_steps_made)
 
     @property
     def has_numbers(self) -> bool:
-        """Whether the run's progress is known. A power failure may have destroyed the file that has it."""
+        """Whether the run's progress is known. A power failure may have destroyed the file that records it."""
         return not self.begins and (self.summary is not None or self.progress.at_s > 0.0)
 
     @property
@@ -86,7 +86,7 @@ class RunLine(NamedTuple):
 
     @property
     def left_s(self) -> float | None:
-        """Seconds of training that are left at the speed so far; None if that is not known."""
+        """Seconds of training that are left at the speed so far; None if this is not known."""
         return self.progress.left_s if self.state == "training" else None
 
 
@@ -137,7 +137,7 @@ def read_line(path: Path, now: float) -> RunLine:
 
 
 def headline(line: RunLine) -> str:
-    """A sentence about the run: how far it has got, how it ended, or that it died; and how to continue it."""
+    """A sentence that says how far the run has got, how it ended, or that it died, and how to continue it."""
     resume = f"continue it with: {one_line(resume_command(line.path, elsewhere=False))}"
     match line.state:
         case "training" if line.begins:
@@ -158,7 +158,7 @@ def headline(line: RunLine) -> str:
 
 
 def in_sentences(line: RunLine) -> str:
-    """The last state of a run that nobody trains, as lines for a terminal."""
+    """The last state of a run that no process trains, as lines for a terminal."""
     progress = line.progress
     done = f"{steps_in_words(progress)} env steps in {duration(progress.wall_s)}"
     figures = f": {done}, return {return_in_words(progress.return_mean)}" if line.has_numbers else ""
@@ -169,13 +169,13 @@ def in_sentences(line: RunLine) -> str:
 
 
 def algorithm_label(algo: str) -> str:
-    """The name of an algorithm in a legend: PPO, or the class of a user-defined one."""
+    """The name of an algorithm in a legend, such as PPO, or a user-defined algorithm's class name."""
     _, own, name = algo.rpartition(":")
     return name if own else algo.upper()
 
 
 def _started(path: Path) -> str:
-    """When the run began, according to the time in its folder's name or, if there is none, to the age of its run.json."""
+    """When the run began: the time in its folder's name or, if there is none, the modification time of its run.json."""
     stamp = STARTED.search(path.name)
     try:
         began = time.strptime(stamp[1], "%Y%m%d-%H%M%S") if stamp else time.localtime((path / RUN_FILE).lstat().st_mtime)

@@ -1,9 +1,9 @@
-"""The parts of a run that exist before PyTorch is imported: its folder, the described environment, and its interrupts.
+"""The parts of a run that exist before PyTorch is imported: its folder, its environment's description, and its interrupts.
 
-A run is set up in this order: bind the link; make or open the run folder; start the workers (a launcher does that); let one
-of them describe the environment, while another thread imports PyTorch (`known_environment`); open the run
+A run is set up in this order: bind the link; create or open the run folder; start the workers (a launcher does this); let
+one of them describe the environment, while another thread imports PyTorch (`known_environment`); open the run
 (`learner/open_run.py`), which takes over the workers; train. This file does not know who starts the workers, and the learner
-runs no code of the environment.
+runs no environment code.
 """
 
 from __future__ import annotations
@@ -73,12 +73,12 @@ class RunSetup:
     interrupts: Interrupts
     """Must be entered, so that signals are recorded."""
     elsewhere: bool = False
-    """Whether the workers are started elsewhere, and not by this program."""
+    """Whether the workers are started elsewhere, not by this program."""
     learners: Learners | None = None
     """The learner processes of a run with shards, which share the updates."""
 
     def announce(self, bound: Bound) -> None:
-        """Write to the run's lock the address at which `millrace status` asks the learner, or why it can't be asked."""
+        """Write to the run's lock the address at which `millrace status` reaches the learner, or why it can't reach it."""
         address = bound.link.address
         keyring = bound.keyring
         lock = self.folder.lock
@@ -94,7 +94,7 @@ class RunSetup:
             lock.announce(Listens(others, own_address(address), keys))
 
     def check_interrupt(self) -> None:
-        """Raise `KeyboardInterrupt` if the user has stopped the program. Call this while there is nothing to save."""
+        """Raise `KeyboardInterrupt` if the user has stopped the program. Use this while there is nothing to save."""
         if self.interrupts.received:
             raise stopped(self.folder.shown if self.resumed else None)
 
@@ -108,7 +108,7 @@ class RunSetup:
 
 @contextmanager
 def run_folder(config: Config, resume: Resumption | None) -> Iterator[RunFolder]:
-    """Make a new run folder, or open the folder of the run that `resume` names. Lock it inside the context.
+    """Create a new run folder, or open the folder of the run that `resume` names. Inside the context, it is locked.
 
     If the body raises before the run has begun, a new folder is removed. Inside the context, a page shows the run if
     `config` says so. Raises `UsageError` if the folder can't be used, or if another process trains the run.
@@ -138,7 +138,7 @@ def _spaces(config: Config, env: DescribedEnv) -> EnvSpaces:
 
 
 def check_evaluation_spaces(config: Config, training: DescribedEnv, evaluation: DescribedEnv) -> None:
-    """Raise `UsageError` if the environment has other spaces or agents with `eval_env_kwargs` than without them."""
+    """Raise `UsageError` if `eval_env_kwargs` change the environment's spaces or agents."""
     expected, got = (
         EnvSpaces.of_description(env, config.action_masks, config.critic_keys) for env in (training, evaluation)
     )
@@ -160,9 +160,9 @@ def named_environment(config: Config) -> EnvSpec:
 def known_environment(config: Config, env: EnvSpec, resume: Resumption | None, lobby: Lobby) -> KnownEnvironment:
     """Let a worker in the lobby describe the environment. Meanwhile, another thread imports PyTorch.
 
-    If `resume` is given, only an environment with the spaces of that run's policy is accepted. Raises `UsageError` if there
-    is no such environment, or if no policy can use it; `RunError` if no worker describes it in time; and
-    `KeyboardInterrupt` if the user stops the program.
+    If `resume` is given, only an environment with the spaces of that run's policy is accepted. Raises `UsageError` if the
+    environment doesn't exist or no policy can use it, `RunError` if no worker describes it in time, and `KeyboardInterrupt`
+    if the user stops the program.
     """
     imports = ImportsAhead(config.algo)
     with Interrupts() as interrupts:
@@ -182,7 +182,7 @@ def known_environment(config: Config, env: EnvSpec, resume: Resumption | None, l
             lobby.listen()
 
         evaluation = lobby.describe(Unknown(env.for_evaluation()), check_interrupt) if env.eval_kwargs else None
-        # The training environment is described last, because its copy is then kept for the first lane.
+        # The training environment is described last, so that its copy is kept for the first lane.
         described = lobby.describe(Unknown(env, config.vector, accept=accept), check_interrupt)
         if evaluation is None:
             evaluation = described

@@ -1,4 +1,4 @@
-"""Makes the specification of a training run for its workers. Its policy is the one that the algorithm trains."""
+"""Creates the specification of a training run for its workers. Its policy is the one that the algorithm trains."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from millrace.protocol.specs import SCORE, PolicySpec, RunSpec
 
 
 def run_spec(config: Config, env: EnvSpec, spaces: EnvSpaces) -> RunSpec:
-    """The specification that `Welcome` sends to workers. `spaces` are those of `env`.
+    """The specification that `Welcome` sends to workers. `spaces` are the spaces of `env`.
 
     Raises `UsageError` if algorithm, settings and spaces do not fit together.
     """
@@ -69,7 +69,7 @@ def _policy_spec(config: Config, spaces: EnvSpaces) -> PolicySpec:
 
 
 def _check_room_for_whole_episodes(config: Config, max_episode_steps: int | None) -> None:
-    """Raise `UsageError` unless a rollout holds the longest episode and the row before it, which resets the env copy."""
+    """Raise `UsageError` unless a rollout has room for the longest episode and the preceding row, which resets the copy."""
     steps = config.algorithm.rollout_steps
     if max_episode_steps is not None and steps <= max_episode_steps:
         raise UsageError(

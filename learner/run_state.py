@@ -1,7 +1,7 @@
 """The state of a run: the content of a checkpoint apart from the algorithm's own state, and how it is restored.
 
-A resumed run restores all of it (`restore`). A new run may take over a part of another run's state (`start_from`), but only
-numbers, for a policy that its own settings describe. Modules that the other run folder names are not imported.
+A resumed run restores all of it (`restore`). A new run may load a part of another run's state (`start_from`), but only
+numbers, for a policy that the new run's own settings describe. Modules that the other run folder names are not imported.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ from millrace.protocol.specs import PolicySpec
 log = logging.getLogger("millrace.learner")
 
 MISFITS = (LookupError, ValueError, TypeError, AttributeError, ArithmeticError, RuntimeError, MemoryError, BadMessage)
-"""The exceptions that loading a state of another form may raise."""
+"""The exceptions that loading a state with an unexpected form may raise."""
 POLICIES = ("best_policy", "pending_policy", "opponent_policies")  # fields of `RunState` that checkpoints store as tensors
 RECORDS: dict[str, type[msgspec.Struct]] = {"lanes": LanePast, "acting": Weights}
-"""The fields of `RunState` that checkpoints store as bytes, and the type of their records."""
+"""The fields of `RunState` that checkpoints store as bytes, and the type of each field's records."""
 BESIDES = {"policy": "", "critic": ", critic", "all": ", critic, optimizers"}
 
 
@@ -55,7 +55,7 @@ class RunState(msgspec.Struct, kw_only=True):
     """The next incarnation of each lane."""
     rounds: RoundsState = RoundsState()
     lanes: Any = ()
-    """The past of each lane, as a sequence of `LanePast`."""
+    """The history of each lane, as a sequence of `LanePast`."""
     acting: Any = ()
     """The weights that act in open rounds, except the newest, as a sequence of `Weights`."""
     episodes: list[Episode] = []
@@ -72,20 +72,20 @@ class RunState(msgspec.Struct, kw_only=True):
     evaluated: EvaluatedPolicy = EvaluatedPolicy()
     """The policy that `newest_evaluation` evaluated."""
     ended_with: DecidingReturns | None = None
-    """The returns with which training ended; None while it continues. The evaluations after training don't change them."""
+    """The returns with which training ended; None while training continues. Later evaluations don't change them."""
     pending: EvaluatedPolicy | None = None
     """The policy that is being evaluated alongside training, if there is one."""
     pending_policy: Any = None
     """Parameters [P] and buffers of that policy, both float32."""
     opponents: PoolState = msgspec.field(default_factory=PoolState)
-    """The opponents of self-play, and the ratings."""
+    """The opponents in self-play, and their ratings."""
     opponent_policies: Any = None
     """Parameters [n, P] and buffers [n, B] of the n snapshots among the opponents, both float32."""
     next_evaluation: Natural = 0
-    """The env steps at which the next evaluation is due; 0 if that is not known."""
+    """The env steps at which the next evaluation is due; 0 if this is not known."""
 
     def checkpoint_content(self, algorithm: Algorithm) -> dict[str, Any]:
-        """The content of a checkpoint of this state and of the algorithm, as plain data and tensors."""
+        """The content of a checkpoint with this state and the algorithm's state, as plain data and tensors."""
         import torch
 
         policies = {name: getattr(self, name) for name in POLICIES}
@@ -100,9 +100,9 @@ class RunState(msgspec.Struct, kw_only=True):
 
 
 def restore(folder: RunFolder, algorithm: Algorithm) -> RunState:
-    """Load the newest undamaged checkpoint into the algorithm. Returns the state of the run.
+    """Load the newest undamaged checkpoint into the algorithm. Returns the run's state.
 
-    Raises `CheckpointError` if there is no such checkpoint, or if the newest does not fit this run.
+    Raises `CheckpointError` if there is no undamaged checkpoint, or if the newest one does not fit this run.
     """
     newest = _newest(folder.path)
     try:
@@ -125,7 +125,7 @@ def restore(folder: RunFolder, algorithm: Algorithm) -> RunState:
 
 
 def _check_policies(state: RunState, own: tuple[Floats, Floats]) -> None:
-    """Raise `ValueError` unless each policy that the state mentions exists and has the size of the run's `own` weights."""
+    """Raise `ValueError` unless each policy that the state mentions exists and is as large as the run's `own` weights."""
     snapshots = len(state.opponents.snapshots)
     for name, is_there, rows in (
         ("best_policy", state.best is not None, ()),
@@ -141,7 +141,7 @@ def _check_policies(state: RunState, own: tuple[Floats, Floats]) -> None:
 def start_from(config: Config, policy: PolicySpec, algorithm: Algorithm) -> str:
     """Let a new algorithm start from the run or the policy that `config.start_from` names. Returns a line that says so.
 
-    `policy` is the policy to train. Raises `UserFacingError` if the other run's policy doesn't fit it or cannot be read.
+    `policy` is the policy to train. Raises `UserFacingError` if the other policy doesn't fit it or cannot be read.
     """
     card, parameters, buffers = policy_to_start_from(config)
     parts = config.from_parts
@@ -175,7 +175,7 @@ def start_from(config: Config, policy: PolicySpec, algorithm: Algorithm) -> str:
 
 
 def _of_policy_alone(config: Config, policy: PolicySpec, parameters: Floats, buffers: Floats) -> dict[str, Any]:
-    """The `Start.state` if only a policy is known. Its statistics count as much as all observations of the new run."""
+    """The `Start.state` if only a policy is known. The policy's statistics count as much as the new run's observations."""
     import torch
 
     state: dict[str, Any] = {"parameters": torch.from_numpy(parameters)}

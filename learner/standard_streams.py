@@ -1,10 +1,10 @@
 """Standard output and standard error whose failed writes never end the program.
 
-Rule: before it opens any file, a program opens standard streams that were closed at its start (`prepare_streams`).
-Otherwise, a file that it opens could get number 1 or 2, and the output of libraries would go into that file. Once they are
-open, `never_fails` can replace a stream. Output that cannot be written, because of a full disk, a closed pipe or a closed
-terminal, is dropped and counted; a character that the encoding lacks is escaped. Each write is attempted, so once a disk has
-space again, it gets the next line.
+Rule: before it opens any file, a program opens the standard streams that were closed at its start (`prepare_streams`).
+Otherwise, a file that it opens could get number 1 or 2, and the output of libraries would go into that file. Once the
+streams are open, `never_fails` can replace one. Output that cannot be written, because of a full disk, a closed pipe or a
+closed terminal, is dropped and counted; a character that the encoding lacks is escaped. Every write is attempted, so when
+a full disk has space again, it gets the next line.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from typing import Literal, TextIO
 def prepare_streams() -> None:
     """Open the null device in place of each standard stream (input, output or error) that is closed.
 
-    From now on, characters that the encoding of standard output or error lacks are escaped.
+    From then on, characters that the encoding of standard output or error lacks are escaped.
     """
     for number in (0, 1, 2):
         try:
@@ -83,7 +83,7 @@ class DroppingFile(io.RawIOBase):
         return os.isatty(self._number)
 
     def write(self, content: bytes) -> int:  # type: ignore[override]  # a buffer, as io.BufferedWriter passes it
-        """Write as much of `content` as possible, and drop the rest. Always returns its whole length."""
+        """Write as much of `content` as possible, and drop the rest. Always returns the length of `content`."""
         done = 0
         try:
             while done < len(content):

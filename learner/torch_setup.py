@@ -1,11 +1,10 @@
-"""The device and the defaults of PyTorch, and the number of threads that PyTorch and numpy use while this process learns or
-acts.
+"""PyTorch's device and defaults, and the number of threads that PyTorch and numpy use while this process learns or acts.
 
-Rules: a run has PyTorch's initial defaults: float32, the CPU, gradients on. So the calling program's own choices don't
-change the run's results. Nor do the numbers of threads depend on who imported PyTorch and numpy first: a script, a notebook
-or the command line. numpy's matrices are so small that more BLAS threads gain nothing. If other processes were busy,
-these threads would wait for one another, and an update could take thirty times as long. Afterwards, the calling program gets
-its threads and defaults back.
+Rules: a run has PyTorch's initial defaults (float32, the CPU, gradients on), so the calling program's own choices don't
+change the run's results. Nor do the numbers of threads depend on what imported PyTorch and numpy first: a script, a notebook
+or the command line. numpy gets one BLAS thread. Its matrices are so small that more threads gain nothing; and if other
+processes are busy, several threads would wait for one another, and an update could take thirty times as long. After the run,
+the calling program gets its threads and defaults back.
 """
 
 from __future__ import annotations
@@ -27,12 +26,12 @@ from millrace.protocol.specs import PolicySpec
 
 MANY_WEIGHTS = 1 << 18  # 512 x 512
 WORTH_A_THREAD = 1 << 25
-"""How many multiply-adds of a forward pass make a thread worthwhile. With the backward pass, a core takes 2 to 5 ms."""
+"""How many multiply-adds in a forward pass make a thread worthwhile. A core takes 2 to 5 ms for both passes."""
 
 
 _lock = Lock()
 _inside: list[list[ExitStack]] = []
-"""Each `one_thread` context that was entered and not left, in order, as a stack that restores the earlier thread numbers."""
+"""Each open `one_thread` context, in order of entry, as a stack that restores the previous numbers of threads."""
 
 
 @contextmanager
@@ -40,7 +39,7 @@ def one_thread(*, uses_torch: bool = True) -> Iterator[None]:
     """Inside this context, numpy's BLAS has one thread, and so has PyTorch until you call `torch.set_num_threads`.
 
     PyTorch also has its initial defaults; it is imported only if `uses_torch`. On exit, the numbers of threads and the
-    defaults are restored. Threads of the program may leave the context in another order than they entered it.
+    defaults are restored. Several threads of the program may enter this context, and leave it in any order.
     """
     own = [ExitStack()]
     with _lock:
@@ -64,7 +63,7 @@ def one_thread(*, uses_torch: bool = True) -> Iterator[None]:
         with _lock:
             later = _inside[_inside.index(own) + 1 :]
             _inside.remove(own)
-            if later:  # the context that was entered next then restores the numbers from before this one
+            if later:  # the next context to be entered restores the numbers from before this one
                 own[0].callback(later[0][0].close)
                 later[0][0] = own[0]
             else:
@@ -72,7 +71,7 @@ def one_thread(*, uses_torch: bool = True) -> Iterator[None]:
 
 
 def torch_device(config: Config) -> str:
-    """The device that the settings name or imply: cpu or cuda. Raises `UsageError` if there is no such device."""
+    """The device that the settings name or imply: cpu or cuda. Raises `UsageError` if this device doesn't exist."""
     import torch
 
     if config.device == "cuda" and not torch.cuda.is_available():
@@ -85,18 +84,19 @@ class ThreadChoice(NamedTuple):
 
     number: int
     line: str
-    """a line for the user that says what was chosen and why; empty if nobody would expect another number"""
+    """a line that tells the user what was chosen and why; empty if nobody would expect another number"""
 
 
 def threads(policy: PolicySpec, rows: int, max_lag: int, workers: int) -> ThreadChoice:
-    """The number of threads for the passes of minibatches of `rows` rows. `workers` is the number of local worker processes.
+    """The number of threads for minibatches with `rows` rows. `workers` is the number of local worker processes.
 
-    Threads wait for one another at the end of each operation. So a thread that has little to do gains nothing, and costs
-    much time if another process keeps its core busy; therefore each thread gets at least `WORTH_A_THREAD`. Networks of small
-    layers get one thread, because numpy computes most of their passes.
+    Threads wait for one another at the end of each operation, so a thread that has little to do gains nothing, and costs
+    much time if another process keeps its core busy. Therefore each thread gets at least `WORTH_A_THREAD` multiply-adds.
+    Networks with only small layers get one thread, because numpy computes most of their passes.
 
-    If workers collect during updates, one core for each of them is left out, but only if this leaves more than half of the
-    cores. Otherwise, updates would take longer than collecting, and the workers and their cores would mostly sit idle.
+    If workers collect during updates, one core is left free for each of them, but only if the threads still get more than
+    half of the cores. Otherwise, updates would take longer than collecting, and the workers and their cores would mostly sit
+    idle.
     """
     largest = max(math.prod(field.shape) for fields in parameter_layout(policy) for field in fields)
     if not policy.needs_torch and largest < MANY_WEIGHTS:
@@ -115,8 +115,8 @@ def threads(policy: PolicySpec, rows: int, max_lag: int, workers: int) -> Thread
 def updates_use_all_cores(config: Config) -> bool:
     """Whether updates use all cores while workers collect, so that local workers should have a lower priority.
 
-    Each operation of an update ends when its slowest thread has finished, so if a worker occupies the core of one thread,
-    all threads wait. Updates with one thread leave cores to the workers. Then the workers limit the speed of the run, so
-    giving them a lower priority would slow the run down. Updates on a GPU leave all cores to the workers.
+    Each operation of an update ends when its slowest thread has finished, so if a worker occupies one thread's core, all
+    threads wait. Updates with one thread leave the other cores to the workers. The workers then limit the speed of the run,
+    so a lower priority would slow the run down. Updates on a GPU leave all cores to the workers.
     """
     return config.max_lag > 0 and 1 < usable_cores() <= (config.torch_threads or 1) and torch_device(config) == "cpu"

@@ -1,14 +1,14 @@
 """The training loop. Everything else is called from here; `hub.gather` is the only place that waits for rollouts.
 
-An evaluation belongs to one version of the weights. It is played after that version's checkpoint was written, and before the
-next rollouts are collected. With `eval_workers` it runs alongside training: see `evaluations.py`.
+An evaluation belongs to one version of the weights. It is played after that version's checkpoint is written, and before the
+next rollouts are collected. With `eval_workers`, it runs alongside training: see `evaluations.py`.
 
-With `max_lag` 0 the learner publishes weights, gathers rollouts and learns, one after the other. With `max_lag` 1 the
+With `max_lag` 0, the learner publishes weights, gathers rollouts and learns, one after the other. With `max_lag` 1, the
 workers already collect the next rollouts while the learner learns. The loop is the same; only the number of tickets differs.
 
-Rule: whatever ends the run, the state after the last whole update is saved first, and the run fails if it can't be saved. An
-update is undone if it raises, if it makes weights that are not finite or with which no worker could act, if it returns
-metrics that aren't numbers, or if a callback doesn't accept its rollouts.
+Rule: whatever ends the run, the state after the last complete update is saved first; if it can't be saved, the run fails. An
+update is undone if it raises, if the new weights are not finite or no worker could act with them, if it returns metrics that
+aren't numbers, or if a callback doesn't accept its rollouts.
 """
 
 from __future__ import annotations
@@ -36,8 +36,9 @@ def train(run: OpenRun, workers: int, cores: CrowdedCores) -> str:
 
     `workers` is the number of workers to wait for before the first rollout. `cores` watches the updates.
 
-    If the run cannot continue (no worker is left, the environment raised too often, the user interrupted the run, a loss is
-    not finite, the user's code raised), the state after the last whole update is saved, and then the error is raised.
+    The run cannot continue if no worker is left, if the environment raised too often, if the user interrupted the run, if a
+    loss is not finite, or if the user's code raised. Then the state after the last complete update is saved, and the error
+    is raised.
     """
     algorithm = run.parts.algorithm
     policy = run.parts.spec.policy
@@ -65,7 +66,7 @@ def train(run: OpenRun, workers: int, cores: CrowdedCores) -> str:
             files.save()
 
     def evaluate() -> None:
-        """Make the evaluation that is due, or begin it. The result of the previous one comes first: it may end the run."""
+        """Make or begin the evaluation that is due. The previous one's result comes first, because it may end the run."""
         tell(evaluations.end_pending(audience.show_now))
         tell(evaluations.evaluate_when_due(audience.show_now))
 
@@ -75,7 +76,7 @@ def train(run: OpenRun, workers: int, cores: CrowdedCores) -> str:
         audience.start()
         tell(evaluations.begin_again(audience.env_attributes(), audience.show_now))
         publish(acting_weights(algorithm, policy))
-        if tally.evaluation_is_due():  # true if the run was interrupted before this evaluation
+        if tally.evaluation_is_due():  # because the run was interrupted before this evaluation
             evaluate()
         while (reason := tally.stop_reason()) is None:
             arrived = hub.gather(audience.show_now)
@@ -96,7 +97,7 @@ def train(run: OpenRun, workers: int, cores: CrowdedCores) -> str:
             tally.updated(time.monotonic() - began_s)
             audience.updated(metrics | tally.ratings())
             if tally.evaluation_is_due():
-                files.save()  # before the evaluation, which may take long
+                files.save()  # before the evaluation, which may take a long time
                 evaluate()
             else:
                 files.save_if_due()
@@ -117,7 +118,7 @@ def train(run: OpenRun, workers: int, cores: CrowdedCores) -> str:
 
 @contextmanager
 def _whole_update(algorithm: Algorithm, hub: Hub, arrived: list[AcceptedRollout]) -> Iterator[None]:
-    """A context for an update with the rollouts that have arrived. If the body raises, the update is undone."""
+    """A context for an update that uses the rollouts in `arrived`. If the body raises, the update is undone."""
     algorithm.remember()
     try:
         yield

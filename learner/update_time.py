@@ -1,7 +1,7 @@
 """Measures how long an algorithm's update takes on this machine, with its settings, on batches that the caller collects.
 
-Rule: the algorithm is made and used just as in a run, with as many threads and on the same device. An algorithm with a
-replay buffer takes its gradient steps from the first update on, and has a small buffer.
+Rule: the algorithm is created and used exactly as in a run, with the same number of threads and on the same device. Only an
+algorithm with a replay buffer differs: it takes gradient steps from the first update on, and has a small buffer.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from millrace.protocol.specs import PolicySpec
 
 SMALL_REPLAY = 20_000  # the largest capacity of the replay buffer, in transitions
 LEAST_UPDATES = 2
-AT_MOST = 4.0  # no update begins later than this multiple of the given seconds
+AT_MOST = 4.0  # no update begins after more than this multiple of the given seconds
 
 
 class UpdateTime(NamedTuple):
     """The time that updates take."""
 
     per_step_s: float
-    """the median time of an update, without delays by other processes, divided by the env steps of its batch"""
+    """the median of an update's time, without delays caused by other processes, divided by the env steps in its batch"""
     cores: float
     """the median, over the updates, of an update's CPU time divided by its duration"""
 
@@ -41,11 +41,11 @@ class UpdateTime(NamedTuple):
 def update_time(
     config: Config, policy: PolicySpec, collect: Callable[[Floats, Floats], Batch], seconds: float, workers: int
 ) -> UpdateTime:
-    """Learn from batches for about this many seconds, and measure the updates.
+    """Learn from batches for about `seconds`, and measure the updates.
 
     `collect` is called with parameters and buffers, and returns a batch. `workers` is the number of workers on this machine.
     The first update, which allocates memory and has an almost empty replay buffer, is not counted if there are others.
-    Raises `MillraceError`.
+    Raises `MillraceError` if the device is missing, or if collecting or learning fails.
     """
     algorithm_config = _from_the_first_step_on(config.algorithm)
     with one_thread():

@@ -24,7 +24,7 @@ log = logging.getLogger("millrace.learner")
 
 
 def train_to_the_end(run: OpenRun, workers: int) -> None:
-    """Wait for this number of `workers`, then train to the end.
+    """Wait for this many workers, then train to the end.
 
     `run.setup.interrupts` must be entered. Raises `Interrupted` if the user interrupts the run, and `MillraceError`, with a
     one-line message, if the run fails.
@@ -52,13 +52,13 @@ def train_to_the_end(run: OpenRun, workers: int) -> None:
 
 
 def _watched_cores(run: OpenRun) -> CrowdedCores:
-    """The `CrowdedCores` of the run. It watches PyTorch's threads, unless a GPU computes the updates."""
+    """The run's `CrowdedCores`, which watches PyTorch's threads unless a GPU computes the updates."""
     config = run.setup.config
     return CrowdedCores((config.torch_threads or 1) if torch_device(config) == "cpu" else 0)
 
 
 def _learn_from_prior(run: OpenRun, prior: PriorData) -> None:
-    """Take the gradient steps that precede the first rollouts. Writes checkpoints when they are due, and at an interrupt."""
+    """Take the gradient steps that precede the first rollouts. Writes checkpoints when due, and when interrupted."""
     algorithm = run.parts.algorithm
 
     def pulse() -> None:
@@ -81,7 +81,7 @@ def _learn_from_prior(run: OpenRun, prior: PriorData) -> None:
 
 
 def _tell_of_error(end: Callable[[], None]) -> None:
-    """Call `end`, which tells the callbacks. If it raises, only log its error: the error that ended the run matters."""
+    """Call `end`, which tells the callbacks. If it raises, only log this, because the error that ended the run matters."""
     try:
         end()
     except Exception as later:

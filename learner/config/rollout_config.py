@@ -193,7 +193,7 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
         return self.replay_limit if self.lost_lanes == "continue" else -1
 
     def stall_timeout_s(self) -> float:
-        """The run ends if no env step, reset or construction finishes for this many seconds. Each of them takes less time."""
+        """The run ends if no env step, reset or construction finishes for this many seconds. Each one takes less time."""
         return max(STALL_TIMEOUT_S, self.call_timeouts().longest_s())
 
     def heartbeat_s(self) -> float:
