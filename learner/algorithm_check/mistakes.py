@@ -1,7 +1,7 @@
 """Finds mistakes in an algorithm. Each rule of `Algorithm` is one function here, which yields the mistakes that it finds.
 
-A mistake is one line of text. Every rule gets its own objects, made with the same seed, and copies of the same batches, so
-one broken rule does not hide another. The rules run in this process, on toy batches, with one PyTorch thread.
+A mistake is one line of text. Every rule gets its own objects, created with the same seed, and copies of the same batches,
+so one broken rule does not hide another. The rules run in this process, on toy batches, with one PyTorch thread.
 """
 
 from __future__ import annotations
@@ -45,11 +45,11 @@ from millrace.protocol.rollout import Batch
 from millrace.protocol.specs import PolicySpec
 
 MOST_STEPS = 64  # rollouts in this check have at most this many steps
-MOST_WARM_UP = 24  # limit on updates before the first gradient step; an algorithm may have to fill a replay buffer first
+MOST_WARM_UP = 24  # limit on updates before the first gradient step, because a replay buffer may have to be filled first
 MORE_UPDATES = 3  # number of updates that follow the first gradient step
 TOTAL_STEPS = 20_000  # env steps of the toy run, for schedules
 LEARNING_STEPS = 40_000  # env steps within which the identity environment must be learned
-LEARNED = 0.5  # the mean reward to reach, as a fraction of the way from random actions to perfect ones
+LEARNED = 0.5  # the mean reward to reach: 0 is that of random actions, 1 that of perfect ones
 MEASURED_BATCHES = 5  # number of batches over which the mean reward is measured
 SEED = 3
 
@@ -57,7 +57,7 @@ Pulse = Callable[[], None]
 
 
 class StoppedByPulse(Exception):
-    """Raised by the pulses that `_stopping` makes."""
+    """Raised by the pulses that `_stopping` creates."""
 
 
 class Subject(NamedTuple):
@@ -71,7 +71,7 @@ class Subject(NamedTuple):
     """The algorithm takes gradient steps on the last `MORE_UPDATES` of them."""
 
     def new(self, total_steps: int = TOTAL_STEPS) -> Algorithm:
-        """Make a new object. The global random generators are in the same state each time."""
+        """Create a new object. The global random generators are in the same state each time."""
         _seed_everything(0)
         return self.algorithm(self.config, self.policy, total_steps=total_steps, seed=SEED)
 
@@ -89,7 +89,7 @@ def mistakes(algorithm: type, settings: dict[str, Any], *, learns: bool) -> Iter
         except Exception as error:
             yield _raised("it cannot be made", error)
             return
-        if made:  # with such weights no policy can act, so no batches can be made for the other rules
+        if made:  # no policy can act with such weights, so there can be no batches for the other rules
             yield from made
             return
         try:
@@ -170,7 +170,7 @@ def weights_have_the_policy_s_shape(subject: Subject) -> Iterator[str]:
 
 
 def weights_are_copies(subject: Subject) -> Iterator[str]:
-    """Check that `weights` returns copies, because they may still be on the way to workers during the next update."""
+    """Check that `weights` returns copies, because weights may still be on the way to workers during the next update."""
     algorithm = subject.new()
     given = algorithm.weights()
     kept = _weights(algorithm)
@@ -216,7 +216,7 @@ def an_update_changes_no_batch(subject: Subject) -> Iterator[str]:
 
 
 def rows_that_are_not_valid_change_nothing(subject: Subject) -> Iterator[str]:
-    """Check that invalid rows, the steps in which a finished copy is reset, change neither weights nor metrics."""
+    """Check that invalid rows, which are steps that only reset a copy, change neither weights nor metrics."""
     one = subject.new()
     other = subject.new()
     generator = np.random.default_rng(2)
@@ -235,7 +235,7 @@ def rows_that_are_not_valid_change_nothing(subject: Subject) -> Iterator[str]:
 def what_is_carried_passes_through_rows_that_are_not_valid(subject: Subject) -> Iterator[str]:
     """Check that an actor-critic's metrics don't change if seats wait for some rows between two of their actions.
 
-    Algorithms with a replay buffer are not checked, because with more rows they may sample other ones.
+    Algorithms with a replay buffer are not checked, because additional rows may change which rows they sample.
     """
     if not issubclass(subject.algorithm, ActorCritic):
         return
@@ -251,7 +251,7 @@ def what_is_carried_passes_through_rows_that_are_not_valid(subject: Subject) -> 
 
 
 def the_same_seed_and_batches_give_the_same_bits(subject: Subject) -> Iterator[str]:
-    """Check that results are reproducible, whatever the state of the global random generators of torch, numpy and Python."""
+    """Check that results are reproducible, whatever state the global generators of torch, numpy and Python are in."""
     results = [_learned(subject, global_seed) for global_seed in (0, 0, 1)]
     if first_difference(results[0], results[1]) is not None:
         yield "update: the same seed and batches give other weights or metrics each time; all random numbers must be seeded"
@@ -260,7 +260,7 @@ def the_same_seed_and_batches_give_the_same_bits(subject: Subject) -> Iterator[s
 
 
 def a_saved_state_goes_on_as_if_nothing_had_happened(subject: Subject) -> Iterator[str]:
-    """Check that a new object that loads a saved state learns on exactly as the saved object does, bit for bit."""
+    """Check that a new object that loads a saved state continues to learn exactly as the saved object does, bit for bit."""
     *first, second, third = subject.copies()
     saved = subject.new()
     restored = subject.new()
@@ -300,7 +300,7 @@ def a_saved_state_goes_on_as_if_nothing_had_happened(subject: Subject) -> Iterat
 
 
 def an_update_can_be_taken_back(subject: Subject) -> Iterator[str]:
-    """Check `roll_back`, after a whole update and after one that stopped in the middle. Also check the next update."""
+    """Check `roll_back` after a complete update and after one that stopped in the middle. Also check the next update."""
     *first, second, third = subject.copies()
     disturbed = subject.new()
     undisturbed = subject.new()
@@ -336,8 +336,8 @@ def an_update_can_be_taken_back(subject: Subject) -> Iterator[str]:
 def numbers_that_are_not_finite_are_raised(subject: Subject) -> Iterator[str]:
     """Check that an update raises if its loss isn't finite.
 
-    Rewards of NaN make any loss NaN, so the update must raise. Rewards that are too large may do the same; the update must
-    raise or give finite numbers.
+    If rewards are NaN, any loss is NaN, so the update must raise. If rewards are too large, the loss may be infinite or NaN;
+    the update must then raise or give finite numbers.
     """
     for reward in (math.nan, 3e38):
         algorithm = subject.new()
@@ -362,7 +362,7 @@ def numbers_that_are_not_finite_are_raised(subject: Subject) -> Iterator[str]:
 def learns_the_identity_environment(subject: Subject) -> Iterator[str]:
     """Check that the algorithm learns the identity environment, in which the right action equals the observation.
 
-    Random choices get a quarter of the reward of right ones.
+    Random choices get a quarter of the reward that right choices get.
     """
     algorithm = subject.new(LEARNING_STEPS)
     generator = np.random.default_rng(4)
@@ -467,7 +467,7 @@ def _not_plain(state: object, where: str = "") -> str:
 
 
 def _raised(what: str, error: Exception) -> str:
-    """One line about an exception of user code, with the place where it was raised."""
+    """One line about an exception from user code, with the place where it was raised."""
     if isinstance(error, UsageError):
         return str(error)
     frame = traceback.extract_tb(error.__traceback__)[-1]

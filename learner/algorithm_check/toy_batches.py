@@ -1,6 +1,6 @@
-"""Batches for the check of an algorithm, made in this process: random ones, and those of the identity environment.
+"""Batches for the check of an algorithm, created in this process: random ones, and batches from the identity environment.
 
-Both follow the row format (`millrace.protocol.rollout`). The random ones contain terminated and truncated episodes. Rows
+Both follow the row format (`millrace.protocol.rollout`). The random batches contain terminated and truncated episodes. Rows
 that are not valid hold rewards that an algorithm must not use. Pure: weights and a generator in, a batch out.
 """
 
@@ -40,7 +40,7 @@ class ToyActor(NamedTuple):
 def noise_batch(acting: ToyActor, steps: int, generator: np.random.Generator, fresh: bool) -> Batch:
     """A batch of random observations and rewards, in which an episode ends on one row in seven.
 
-    `fresh` says that the lanes begin with this batch.
+    `fresh` says whether the lanes begin with this batch.
     """
     columns = LANES * COPIES
     obs = generator.normal(1, 2, (steps + 1, columns, CHOICES)).astype(np.float32)
@@ -55,11 +55,11 @@ def noise_batch(acting: ToyActor, steps: int, generator: np.random.Generator, fr
 
 
 def identity_batch(acting: ToyActor, steps: int, generator: np.random.Generator) -> tuple[Batch, float]:
-    """A batch of the identity environment, and its mean reward.
+    """A batch from the identity environment, and its mean reward.
 
-    In this environment, the right action equals the observation. Each episode has one step. The reward of a discrete action
-    is 1 if it is right. The reward of a Box action is minus its squared distance from the observation. For a Dict or Tuple,
-    the two rewards are added.
+    In this environment, the right action equals the observation. Each episode has one step. The reward for a discrete action
+    is 1 if the action is right, otherwise 0. The reward for a Box action is minus its squared distance from the observation.
+    For a Dict or Tuple action, the two rewards are added.
     """
     columns = LANES * COPIES
     choice = generator.integers(0, CHOICES, (steps + 1, columns))
@@ -84,8 +84,8 @@ def identity_batch(acting: ToyActor, steps: int, generator: np.random.Generator)
 def with_other_invalid_rows(batch: Batch, generator: np.random.Generator) -> Batch:
     """The same batch with other finite values on rows that are not valid.
 
-    Their observations stay, because they also belong to the previous row, which bootstraps from them. After a termination,
-    where nothing bootstraps, the observations are changed, too.
+    The observations on these rows stay, because they also belong to the previous row, which bootstraps from them. After a
+    termination, where nothing bootstraps, the observations are changed too.
     """
     other = generator.permutation(batch.action.reshape(-1, *batch.action.shape[2:])).reshape(batch.action.shape)
     if batch.action.dtype == np.int64:
@@ -104,8 +104,7 @@ def with_other_invalid_rows(batch: Batch, generator: np.random.Generator) -> Bat
 def with_waiting_seats(batch: Batch) -> Batch:
     """The same rows, as if seats had to wait for one step before the outcome of each action is known.
 
-    Each row becomes two rows. In the first of these, the seat waits. If the row only resets a copy, the first of its two
-    rows is the reset.
+    Each row becomes two rows. In the first of the two, the seat waits; or, if the row only resets a copy, the copy is reset.
     """
     T, columns = batch.valid.shape
     waits = np.zeros_like(batch.valid)

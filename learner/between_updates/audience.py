@@ -1,8 +1,8 @@
-"""Reports the progress of a run to its callbacks (the terminal is one of them), to `millrace status` and to Prometheus.
+"""Reports a run's progress to its callbacks (the terminal is one of them), to `millrace status` and to Prometheus.
 
-Rule: numbers are counted, and written to a row of the metrics, before they are reported. Numbers that callbacks log are
-added to the row of the newest update, even if one of the callbacks raises. `on_checkpoint` is called after a checkpoint was
-written, so callbacks can't set attributes of env copies there: the checkpoint would lack them.
+Rule: values are counted, and written to a metrics row, before they are reported. Values that callbacks log are added to the
+newest update's row, even if one of the callbacks raises. `on_checkpoint` is called after a checkpoint is written. Callbacks
+can't set attributes of env copies in it, because the checkpoint would lack them.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from millrace.protocol.logs.notices import log_notice
 
 log = logging.getLogger("millrace.learner")
 
-SHOW_EVERY_S = 0.2  # least interval at which progress between two updates is shown
+SHOW_EVERY_S = 0.2  # shortest interval at which progress between two updates is shown
 
 
 class Audience:
@@ -63,7 +63,7 @@ class Audience:
         self._files.write_row(self.progress(), metrics)
 
     def show_now(self) -> None:
-        """Show, now and then, how far an evaluation has got, or what a long wait is for."""
+        """Show how far an evaluation has got, or what a long wait is for, unless this was shown a moment ago."""
         now = time.monotonic()
         if now - self._shown_s >= SHOW_EVERY_S:
             self._shown_s = now
@@ -74,7 +74,7 @@ class Audience:
             self._callbacks.meanwhile(progress)
 
     def gathered(self, rollouts: Sequence[AcceptedRollout]) -> bool:
-        """Report that these rollouts have arrived. Returns False if a callback ended the run; then no update uses them."""
+        """Report that these rollouts have arrived. Returns False if a callback ended the run, so no update may use them."""
         began_s = time.monotonic()
         if self._callbacks.wants("on_rollouts"):
             progress = msgspec.structs.replace(
@@ -102,7 +102,7 @@ class Audience:
             self._write_logged()
 
     def evaluated(self, metrics: Row | None = None) -> None:
-        """Report an evaluation. Without `metrics`, only the numbers that callbacks log are added to the update's row."""
+        """Report an evaluation. Without `metrics`, only what callbacks log is added to the update's row."""
         progress = self.progress()
         if metrics is not None:
             self._write_row(progress, metrics)
@@ -123,15 +123,15 @@ class Audience:
     def finish(self, reason: str, *, cut_short: bool = False) -> None:
         """Report the end of the run, and write its summary. Does nothing when called again.
 
-        `cut_short` says that an error or an interrupt ended the run. If it is False, this raises `RunError` if the summary
-        cannot be written.
+        `cut_short` is True if an error or an interrupt ended the run. If it is False and the summary cannot be written,
+        raises `RunError`.
         """
         if not self._finished:
             self._files.write_summary(reason, cut_short=cut_short)
             self.leave(reason, cut_short=cut_short)
 
     def leave(self, reason: str, *, cut_short: bool = True) -> None:
-        """Report the end of the run in this process, without a summary, because another process may continue it."""
+        """Report the end of the run in this process. Write no summary, because another process may continue the run."""
         self._finished = True
         self._requests.closed = "the run has ended"
         self._callbacks.on_end(msgspec.structs.replace(self.progress(), stop_reason=reason, cut_short=cut_short))
@@ -141,13 +141,13 @@ class Audience:
         return self._requests.attributes.table(self._state.version)
 
     def progress(self) -> Progress:
-        """The progress of the run."""
+        """The run's progress."""
         return self._progress(self._hub.snapshot())
 
     # ---------------------------------------------------------------- inside
 
     def _progress(self, snapshot: HubSnapshot, collected: int = 0) -> Progress:
-        """The progress at this snapshot. `collected` is the number of env steps already made for the next update."""
+        """The progress at this snapshot. `collected` is the number of env steps already collected for the next update."""
         state = self._state
         tally = self._tally
         wall_s = self._tally.wall_s(snapshot)
@@ -187,7 +187,7 @@ class Audience:
         self._hub.report_progress(progress)
 
     def _write_logged(self) -> None:
-        """Add the numbers that callbacks logged to this update's row. Before the first update, there is no row."""
+        """Add what callbacks logged to this update's row. Before the first update, there is no row."""
         if (logged := self._requests.take_logged()) and self._state.version:
             self._files.write_row(self.progress(), logged)
 

@@ -1,7 +1,7 @@
 """Warns, once, if updates spend their time waiting for CPU cores.
 
-The threads of PyTorch wait for one another at the end of each operation. If other processes keep the cores busy, an update
-with several threads may take many times as long as with one, and nothing else shows why.
+PyTorch's threads wait for one another at the end of each operation. If other processes keep the cores busy, an update with
+several threads may take many times as long as with one thread, and nothing else shows why.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class CrowdedCores:
             log.warning("%s", line)
 
     def updated(self, took_s: float, computed_s: float) -> str:
-        """Check an update that took `took_s` seconds, and for which all threads together used `computed_s` of CPU time.
+        """Check an update that took `took_s` seconds, in which all threads together used `computed_s` seconds of CPU time.
 
         Returns a line for the log; empty if there is nothing to warn about.
         """

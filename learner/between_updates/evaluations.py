@@ -1,13 +1,13 @@
-"""The evaluations of one run. Each version is evaluated at most once, and the best policy again at the end.
+"""The evaluations of one run. Each version is evaluated at most once. At the end, the best policy is evaluated again.
 
-A return that was used to select a policy is a biased estimate of that policy's return. The highest of several evaluations
-is biased upwards. So is an evaluation that ended the run, by reaching the target or through a callback. Therefore, for the
-best policy, and for the final policy if its evaluation ended the run, the summary reports a second evaluation, on other
-episodes.
+A return that was used to select a policy is a biased estimate of that policy's return: the highest of several evaluations
+is biased upwards. So is an evaluation that ended the run, because the target was reached or a callback stopped the run.
+Therefore, for the best policy, and for the final policy if its evaluation ended the run, the summary reports a second
+evaluation, on other episodes.
 
 Rule: without `eval_workers`, training waits for each evaluation. With them, evaluations run alongside training. The result
 of an evaluation is used when the next one is due, or at the end of the run; if it isn't ready by then, the run waits for it.
-So the course of a run doesn't depend on speed. The evaluated policy is kept until its result is used.
+The course of a run therefore doesn't depend on speed. The evaluated policy is kept until its result is used.
 """
 
 from __future__ import annotations
@@ -50,8 +50,8 @@ class Evaluations:
         """Restart the evaluation that was running alongside training when the run was interrupted. Publishes its weights.
 
         If the run was resumed without `eval_workers`, this also waits for the evaluation and returns its metrics.
-        `env_attributes` are those of the newest weights. They are sent along if these weights are the ones to evaluate.
-        If older weights to evaluate still act in an open round, the hub has their attributes.
+        `env_attributes` belong to the newest weights. They are sent along if the newest weights are to be evaluated. If
+        older weights are to be evaluated, and these still act in an open round, the hub has their attributes.
         """
         if (pending := self._state.pending) is None:
             return None
@@ -61,10 +61,11 @@ class Evaluations:
         return None if self._config.eval_workers else self.end_pending(watch)
 
     def evaluate_when_due(self, watch: Callable[[], None]) -> Row | None:
-        """Evaluate the newest policy, because an evaluation is due. Returns the metrics of the evaluation.
+        """Evaluate the newest policy, because an evaluation is due. Returns the evaluation's metrics.
 
-        With `eval_workers`, only begins the evaluation, and returns None. The previous one must have ended (`end_pending`),
-        and if its result ended the run, no other begins. `watch` is called several times a second while this waits.
+        With `eval_workers`, only begins the evaluation, and returns None. The previous evaluation must have ended
+        (`end_pending`); if its result ended the run, no other begins. `watch` is called several times a second during the
+        wait.
         """
         if not self._config.eval_workers:
             evaluation = self._evaluate_newest(evaluation_size(self._config), watch)
@@ -81,7 +82,7 @@ class Evaluations:
     def end_pending(self, watch: Callable[[], None]) -> Row | None:
         """Wait for the evaluation that runs alongside training, if there is one.
 
-        Returns its metrics, which include the env steps of the policy that was evaluated.
+        Returns its metrics, which include the evaluated policy's env steps.
         """
         state = self._state
         pending = state.pending
@@ -95,7 +96,7 @@ class Evaluations:
         return evaluation.metrics() | {EVALUATED_AT_KEY: pending.env_steps}
 
     def conclude(self, watch: Callable[[], None]) -> bool:
-        """Evaluate the final policy and, if the run kept a best policy, evaluate that again on other episodes.
+        """Evaluate the final policy. If the run kept a best policy, evaluate it again on other episodes.
 
         Sets `final`, `confirmed` and `ended_by`. Returns True if the final policy had not yet been evaluated with as many
         episodes.
@@ -130,7 +131,7 @@ class Evaluations:
         folder.writes.write("best policy", lambda: folder.write_policy(spec, policy[0], policy[1], "best"))
 
     def to_report(self) -> Evaluation | None:
-        """The evaluation to report, even for a run that was cut short; None if the newest one may have ended the run."""
+        """The evaluation to report, even if the run was cut short; None if the newest one may have ended the run."""
         if self.final is not None:
             return self.final
         return None if self._newest_is_biased() else self.of_newest()
@@ -140,12 +141,12 @@ class Evaluations:
         return self._state.newest_evaluation if self._state.evaluated.version == self._state.version else None
 
     def _newest_is_biased(self) -> bool:
-        """Whether the evaluation of the newest policy ended the run."""
+        """Whether the newest policy's evaluation ended the run."""
         decided = self._tally.decided_by_evaluation()
         return decided is not None and decided.evaluated_before is None
 
     def _confirm(self, found_again: Evaluation | None, size: EvaluationSize, watch: Callable[[], None]) -> Best | None:
-        """Evaluate the best policy again, if the run kept one. `found_again`: the second evaluation of the final policy."""
+        """Evaluate the best policy again, if the run kept one. `found_again` is the final policy's second evaluation."""
         state = self._state
         if state.best is None:
             return None
@@ -157,7 +158,7 @@ class Evaluations:
         return Best(env_steps=env_steps, chosen_by=chosen_by, evaluation=confirmed)
 
     def _evaluate_newest(self, size: EvaluationSize, watch: Callable[[], None]) -> Evaluation:
-        """Evaluate the newest policy, unless that was already done with the same number of episodes."""
+        """Evaluate the newest policy, unless it was already evaluated with the same number of episodes."""
         state = self._state
         evaluation = self.of_newest()
         if evaluation is None or evaluation.episodes != size.episodes:
@@ -166,7 +167,7 @@ class Evaluations:
         return evaluation
 
     def _record(self, evaluation: Evaluation, of: EvaluatedPolicy) -> None:
-        """Record this evaluation, of the policy `of`, as the newest."""
+        """Record this evaluation of the policy `of` as the newest."""
         self._state.newest_evaluation = evaluation
         self._state.evaluated = of
         self._say(evaluation, of.env_steps)
@@ -194,10 +195,10 @@ class Evaluations:
         return evaluation_of(played, self._run.spec.facts)
 
     def _keep_if_best(self, evaluation: Evaluation, env_steps: int, policy: Callable[[], tuple[Floats, Floats]]) -> None:
-        """Keep the evaluated policy, which was reached after `env_steps`, as the best, unless an earlier policy was better.
+        """Keep the evaluated policy, reached after `env_steps`, as the best, unless an earlier policy was better.
 
-        In a tie, the newer policy is kept, because it has learned for longer. If all returns are equal, as in a zero-sum
-        game that the policy plays against itself, there is no other criterion.
+        In a tie, the newer policy is kept, because it has learned for longer. This matters if all returns are equal, as in a
+        zero-sum game that the policy plays against itself, because there is no other criterion.
         """
         state = self._state
         if state.best is None or evaluation.return_mean >= state.best[0]:

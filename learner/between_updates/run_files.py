@@ -1,7 +1,7 @@
-"""Writes the files of a run: rows of metrics, checkpoints, policies and the summary. Rewrites deleted files.
+"""Writes a run's files: rows of metrics, checkpoints, policies and the summary. Rewrites deleted files.
 
 Rule: a checkpoint is written between two updates, never during one, and holds everything that the next update depends on.
-If the disk is full, the run logs a warning and continues; at its end, it fails if its last state can't be written.
+If the disk is full, the run logs a warning and continues. At the end, the run fails if its last state can't be written.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class RunFiles:
     """Writes the files of one run."""
 
     def __init__(self, run: RunParts, evaluations: Evaluations, attributes: EnvAttributes) -> None:
-        """For a resumed run, removes metrics of updates after its checkpoint. Raises `RunError` if that is impossible."""
+        """In a resumed run, remove the metrics of updates after its checkpoint. Raises `RunError` if this is impossible."""
         self._config, self._spec, self._folder, self._algorithm, self._hub, self._tally = run
         self._state = run.tally.state
         self._evaluations = evaluations
@@ -46,9 +46,9 @@ class RunFiles:
         self.checkpoint = ""
         """Path of the newest checkpoint that this process has written; empty if there is none."""
         self.longest_save_s = 0.0
-        """The longest time, in seconds, that this process took to write a checkpoint."""
+        """The longest time, in seconds, that this process has taken to write a checkpoint."""
         self.on_saved: Callable[[], None] = lambda: None
-        """Called after a checkpoint was written."""
+        """Called after a checkpoint is written."""
         self._metrics = MetricsLog(run.folder.path, self._state.env_steps, self._state.version)
         self._schedule = checkpoint.CheckpointSchedule(run.config.checkpoint_every_s, time.monotonic())
         self._saved: tuple[object, ...] | None = None  # `_position` at the newest checkpoint
@@ -67,7 +67,7 @@ class RunFiles:
         writes.write("metrics", self._metrics.flush)
 
     def write_images(self, batch: Batch) -> None:
-        """After the first update, write observations from its batch as pictures."""
+        """After the first update, write some of its batch's observations as pictures."""
         if self._state.version == 1:
             images = image_samples(batch.obs, self._spec.policy.seen)
             self._folder.writes.write("images", lambda: self._folder.write_images(images))
@@ -97,9 +97,9 @@ class RunFiles:
             self.save()
 
     def save_after_error(self, error: BaseException) -> None:
-        """Like `save_unless_saved` and `confirm_saved`, but logs errors of callbacks, because `error` has ended the run.
+        """Like `save_unless_saved` and `confirm_saved`, but only logs callbacks' errors, because `error` has ended the run.
 
-        If the state can't be written, raises `RunError` only if `error` isn't a failure but, for example, Ctrl-C.
+        If the state can't be written, raises `RunError` only if `error` isn't a failure (but, for example, Ctrl-C).
         """
         try:
             self.save_unless_saved()
@@ -126,7 +126,7 @@ class RunFiles:
             self.on_saved()
 
     def write_summary(self, reason: str, *, cut_short: bool) -> None:
-        """Write the results of the run, and why it ended. Unless `cut_short`, raises `RunError` if that is impossible."""
+        """Write the run's results, and why it ended. Unless `cut_short`, raises `RunError` if this is impossible."""
         self._folder.writes.write("summary", lambda: self._folder.write_summary(self._summary(reason, cut_short)))
         if not cut_short:
             self._folder.writes.confirm()
@@ -165,10 +165,10 @@ class RunFiles:
     # ---------------------------------------------------------------- inside
 
     def _make_folder_again(self) -> None:
-        """Recreate the run folder if it was deleted or renamed. Raises `RunError` if that is not possible."""
+        """Recreate the run folder if it was deleted or renamed. Raises `RunError` if this is impossible."""
         if self._folder.is_gone():
             self._saved = self._saved_env_steps = self._policy_env_steps = None
-            self._schedule.saved(-math.inf)  # so that a checkpoint is due now
+            self._schedule.saved(-math.inf)  # makes a checkpoint due now
             log.warning("%s", self._folder.make_again(self._config))
             self._evaluations.write_best()
 
@@ -204,7 +204,7 @@ class RunFiles:
             self._saved_env_steps = env_steps
 
     def _position(self) -> tuple[object, ...]:
-        """A value that changes whenever there is something new to save: an update, an evaluation or a set attribute."""
+        """A value that changes when there is something new to save: an update, an evaluation or a new attribute value."""
         state = self._state
         return state.version, state.next_evaluation, state.evaluated, state.best, self._attributes.changes
 

@@ -1,4 +1,4 @@
-"""The parts of a run on which every object in this package works. `open_run` makes them."""
+"""The parts of a run that every object in this package works on. `open_run` creates them."""
 
 from __future__ import annotations
 

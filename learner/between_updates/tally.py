@@ -1,8 +1,8 @@
 """Counts the env steps, updates and episodes of one run. The counts decide when it ends, and when an evaluation is due.
 
-Rule: decisions depend on counts alone, so every run with these settings makes the same decisions. The time of evaluations
-is a stage of its own and does not count as training. `run_folder/checkpoint.py` says when a checkpoint is due. This file
-uses no files and no sockets.
+Rule: decisions depend only on counts, so every run with the same settings makes the same decisions. The time that
+evaluations take is a stage of its own and does not count as training. `run_folder/checkpoint.py` says when a checkpoint is
+due. This module uses no files and no sockets.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ class Tally:
         ended_by: Callable[[], str | None] = lambda: None,
         pool: OpponentPool | None = None,
     ) -> None:
-        """`state` is the state of the run. `ended_by` returns why a callback has ended the run, or None.
+        """`state` is the run's state. `ended_by` returns why a callback has ended the run, or None if none has.
 
-        `pool` are the opponents of self-play, if there are any.
+        `pool` holds the opponents in self-play, if there are any.
         """
         self.pool = pool
         self.state = state
-        """The state of the run. Evaluations change it, too, and a checkpoint adds the state of other objects."""
+        """The run's state. Evaluations change it too, and a checkpoint adds the state of other objects."""
         self.window = EpisodeWindow.from_state(state.episodes, state.facts, spec.facts)
         self.new_episodes: tuple[Episode, ...] = ()
         """The episodes that ended in the rollouts of the last update."""
@@ -47,7 +47,7 @@ class Tally:
         self.note = ""
         """A line for the user about the newest evaluation."""
         self.gathered_s = 0.0
-        """Seconds that `on_rollouts` callbacks and the dataset took for the rollouts of the next update."""
+        """Seconds that `on_rollouts` callbacks and the dataset took for the next update's rollouts."""
         self._ended_by = ended_by
         self._config = config
         self._steps_per_update = spec.rollout_steps * config.envs
@@ -74,14 +74,14 @@ class Tally:
     def stop_reason(self) -> str | None:
         """Why the run should end now; None if it should continue.
 
-        If training has ended, the reason rests on the returns with which it ended, unless the run was resumed with settings
-        for which they give no reason.
+        If training has ended, the reason depends on the returns with which it ended. If the run was resumed with settings
+        for which these returns give no reason, it depends on the current returns.
         """
         ended_with = self.state.ended_with
         return self._ended_by() or (ended_with and self._reason(ended_with)) or self._reason(self._returns())
 
     def training_ended(self) -> None:
-        """Record the returns with which training ended. The evaluations that follow then don't change why it ended."""
+        """Record the returns with which training ended, so that later evaluations don't change why it ended."""
         ended_with = self.state.ended_with
         if ended_with is None or self._reason(ended_with) is None:
             self.state.ended_with = self._returns()
@@ -89,8 +89,8 @@ class Tally:
     def decided_by_evaluation(self) -> DecidingReturns | None:
         """The returns with which the run ends, if it ends because of an evaluation; otherwise None.
 
-        If a callback ended the run after the newest policy was evaluated, this evaluation may have been the callback's
-        reason.
+        This includes a run that a callback ended after the newest policy was evaluated, because the evaluation may have been
+        the callback's reason.
         """
         returns = self.state.ended_with or self._returns()
         of_newest = returns.evaluation is not None and returns.evaluated_before is None
@@ -98,7 +98,7 @@ class Tally:
         return returns if decided else None
 
     def training_goes_on(self) -> bool:
-        """Whether the next rollouts may be collected now, because no evaluation is due and the run does not end yet."""
+        """Whether the next rollouts may be collected now, because no evaluation is due and the run doesn't end now."""
         return not self.evaluation_is_due() and self.stop_reason() is None
 
     # ---------------------------------------------------------------- evaluations
@@ -119,14 +119,14 @@ class Tally:
     def updated(self, seconds: float) -> None:
         """Count the time of an update: the `seconds` from the arrival of its rollouts until its weights were published.
 
-        They include the time that callbacks and the dataset took for the rollouts. That time is subtracted here.
+        `seconds` includes the time that callbacks and the dataset took for the rollouts. This time is subtracted here.
         """
         self._update_s += seconds - self.gathered_s
 
     def stages(self, snapshot: HubSnapshot) -> dict[str, float]:
         """Seconds in each stage of the learner, and in each stage of all workers together, as of their last heartbeats.
 
-        They include the time before a resume.
+        These seconds include the time before the run was resumed.
         """
         other_s = snapshot.learn_s - self._update_s
         since = {"learner_wait": snapshot.wait_s, "learner_update": self._update_s, "learner_other": other_s}
@@ -136,7 +136,7 @@ class Tally:
         return {name: before.get(name, 0.0) + since.get(name, 0.0) for name in since | before}
 
     def wall_s(self, snapshot: HubSnapshot) -> float:
-        """Seconds of training so far, without evaluations but including the time before a resume."""
+        """Seconds of training so far, without evaluations but including the time before the run was resumed."""
         return self.wall_before_s + snapshot.taken_s - self._started_s - snapshot.evaluate_s
 
     # ---------------------------------------------------------------- inside
@@ -146,7 +146,7 @@ class Tally:
         return reason_to_stop(self._config, returns, env_steps_after_next_update=after_next)
 
     def _returns(self) -> DecidingReturns:
-        """The returns that decide now whether the run stops."""
+        """The current returns that decide whether the run stops."""
         state = self.state
         newest = state.newest_evaluation
         return DecidingReturns(

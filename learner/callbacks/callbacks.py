@@ -1,7 +1,7 @@
-"""All callbacks of a run as one object. It calls them in order, and remembers whether one of them ended the run.
+"""All of a run's callbacks as one object. It calls them in order, and remembers whether one of them ended the run.
 
-Rule: exceptions of callbacks propagate, with a note that names the callback. `on_end` is called for every callback that was
-started, even if an earlier one raised. A function among the callbacks is called to show the progress of the run: after each
+Rule: callbacks' exceptions propagate, with a note that names the callback. `on_end` is called on every callback that was
+started, even if an earlier callback raised. A callback that is a function is called to show the run's progress: after each
 update and evaluation, several times a second during an evaluation or a long wait, and at the end.
 """
 
@@ -36,16 +36,16 @@ class Callbacks:
 
     @staticmethod
     def of(watch: Watch) -> Callbacks:
-        """The callbacks of a run, from a `Callbacks` object or a single function."""
+        """A run's callbacks, from a `Callbacks` object or a single function."""
         return watch if isinstance(watch, Callbacks) else Callbacks([watch])
 
     def with_named(self, names: Sequence[str]) -> Self:
-        """Add the callbacks with these names, `module:factory`. Raises `UsageError` if one cannot be made."""
+        """Add the callbacks with these names, `module:factory`. Raises `UsageError` if one of them cannot be created."""
         self._callbacks += [_checked(named_callback(name), name) for name in dict.fromkeys(names)]
         return self
 
     def add(self, callback: object) -> None:
-        """Add a callback, which is called after the others. Raises `UsageError` if it isn't a valid callback."""
+        """Add a callback that is called after the others. Raises `UsageError` if it isn't a valid callback."""
         self._callbacks.append(_checked(callback))
 
     def wants(self, moment: str) -> bool:
@@ -59,7 +59,7 @@ class Callbacks:
             self._call_one(callback, "on_start", progress)
 
     def on_rollouts(self, progress: Progress) -> bool:
-        """Call `on_rollouts` of the callbacks until one ends the run. Returns whether an update should use the rollouts."""
+        """Call `on_rollouts` of the callbacks, until one ends the run. Returns whether an update should use the rollouts."""
         for callback in self._callbacks:
             if self.stop_reason is None:
                 self._call_one(callback, "on_rollouts", progress)
@@ -76,7 +76,7 @@ class Callbacks:
         self._call("on_evaluation", progress)
 
     def meanwhile(self, progress: Progress) -> None:
-        """Show the progress of an evaluation or a long wait. `progress.waiting` says how far it is, or what is awaited."""
+        """Show the progress during an evaluation or a long wait. `progress.waiting` says what is awaited, or how far."""
         self._show(progress)
 
     def on_checkpoint(self, progress: Progress) -> None:
@@ -85,7 +85,7 @@ class Callbacks:
             self._call("on_checkpoint", progress)
 
     def on_end(self, progress: Progress) -> None:
-        """Call `on_end` of all started callbacks. Raises the first exception of these calls; further ones are logged."""
+        """Call `on_end` of all started callbacks. Raises the first exception from these calls; logs further ones."""
         raised: BaseException | None = None
         calls = [self._show]
         calls += [lambda progress, each=each: _call(each, "on_end", progress) for each in self._started]  # type: ignore[misc]

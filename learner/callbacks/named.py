@@ -1,6 +1,7 @@
-"""Makes a callback from its name, `module:factory`: imports the module, and calls the factory (or class) without arguments.
+"""Creates a callback from its name, `module:factory`: imports the module, and calls the factory or class without arguments.
 
-Rule: an error in the name is one line that quotes the name. If the user's code raised, the traceback is the error's detail.
+Rule: for an error in the name, the message is one line that quotes the name. If the user's code raised, the traceback is the
+error's detail.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ from millrace.protocol.own_module import own_callable, own_code_failed
 
 
 def named_callback(name: str) -> object:
-    """Make the callback with this name. Raises `UsageError` if it isn't found, or if the factory raises."""
+    """Create the callback with this name. Raises `UsageError` if it isn't found, or if the factory raises."""
     what = f"callback {name}"
     found = own_callable(name, what, "mine:EarlyStop")
     try:
