@@ -17,10 +17,10 @@ __all__ = ["ALGORITHMS", "Algorithm", "algorithm_class"]
 
 
 def algorithm_class(name: str) -> type[Algorithm]:
-    """Import and return the class of this algorithm: one in `ALGORITHMS`, or your own.
+    """Import and return the class of this algorithm: a built-in one from `ALGORITHMS`, or your own.
 
-    Your own class has the methods of `Algorithm` and need not derive from it. Raises KeyError for any other name, and
-    `UsageError` if your class cannot be found or lacks a method.
+    Your own class must have the methods of `Algorithm` but need not derive from it. Raises `UsageError` if your class cannot
+    be found or lacks a method, and KeyError if there is no built-in algorithm with this name.
     """
     if is_own(name):
         own: type[Algorithm] = own_class(name)

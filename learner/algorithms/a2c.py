@@ -1,7 +1,7 @@
 """A2C, the synchronous variant of A3C (Mnih et al. 2016). Its settings are in `learner/config/hyperparameters.py`.
 
 An update is one gradient step on all valid rows of a batch. The batch must have been collected with the newest weights. This
-file uses no sockets, no files and no clock.
+module uses no sockets, no files and no clock.
 """
 
 from __future__ import annotations

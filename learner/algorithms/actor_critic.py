@@ -1,9 +1,9 @@
-"""The base of PPO, A2C, IMPALA, REINFORCE and your own actor-critics: everything about an update except the loss.
+"""The base class of PPO, A2C, IMPALA, REINFORCE and your own actor-critics: everything about an update except the loss.
 
 Before each gradient step, an update checks the loss, the logged numbers and the gradient, and raises if one of them is not
 finite. The training loop checks the weights after the update, and undoes the whole update if they are not finite. With one
-torch thread on a CPU, the same batches give the same bits, even after `load_state_dict`. This file uses no sockets, no files
-and no clock.
+torch thread on a CPU, the same batches give the same bits, even after `load_state_dict`. This module uses no sockets, no
+files and no clock.
 """
 
 from __future__ import annotations
@@ -53,15 +53,16 @@ class Estimates(NamedTuple):
     target: Floats  # the critic is trained to predict these
     values: Floats  # [T+1, ΣN] the values from which advantages and targets were computed
     used: Bools  # True for the rows to learn from, which must all be valid
-    metrics: UpdateMetrics  # metrics of the estimate, named without the prefix "train/"
+    metrics: UpdateMetrics  # metrics about the estimate, named without the prefix "train/"
 
 
 class ActorCritic(GradientDescent):
     """An actor and a critic, and the update that trains them: epochs of gradient steps on minibatches of a batch.
 
     A subclass defines `loss`, with ordinary torch operations, unless its loss is the policy gradient with a squared value
-    loss. Advantages are generalized advantage estimates (GAE); a subclass that needs others defines `estimate`. If an update
-    of your subclass changes state of its own, save this state in `other_state` and load it in `load_other_state`.
+    loss. Advantages are generalized advantage estimates (GAE); a subclass that needs other advantages defines `estimate`. If
+    your subclass has state of its own that an update changes, save this state in `other_state` and load it in
+    `load_other_state`.
 
     `Config` is the class of the settings, and `self.config` holds their values. The class must have the settings of
     `ActorCriticConfig`, unless the subclass overrides the methods that use them (`n_epochs`, `minibatch_count`,
@@ -136,8 +137,8 @@ class ActorCritic(GradientDescent):
         """Whether to scale the advantages of each minibatch to mean 0 and standard deviation 1. Never True after cloning.
 
         A cloned policy acts well from the start, so its advantages are little more than the critic's small errors. Scaled to
-        a standard deviation of 1, these errors would change the policy as much as advantages that tell good actions from bad
-        ones.
+        a standard deviation of 1, these errors would change the policy as much as advantages that distinguish good actions
+        from bad ones.
         """
         normalize: bool = self.config.normalize_advantage
         return normalize and not self.pretraining_steps
@@ -154,7 +155,7 @@ class ActorCritic(GradientDescent):
         Raises `RunError` before a step whose loss, logged numbers or gradient norm are not finite, and after the last step
         if the new weights could give actions that are not finite.
         """
-        if not batch.valid.any():  # with several agents, all seats may be waiting; then there is nothing to learn
+        if not batch.valid.any():  # with several agents, all seats may be waiting, so there is nothing to learn
             self.env_steps += batch.env_steps
             return {}
         self.set_schedules()
@@ -181,7 +182,7 @@ class ActorCritic(GradientDescent):
         return self.metrics(epochs, estimates)
 
     def step(self, *minibatch: Minibatch) -> tuple[UpdateMetrics, bool]:
-        """Take one gradient step on a minibatch, unless its metrics end the update. Returns them, and whether they do.
+        """Take one gradient step on a minibatch, unless its metrics end the update. Returns them and whether they do.
 
         `minibatch` holds the parts that this process learns from: all rows in one part, unless the run has shards.
 
@@ -208,8 +209,8 @@ class ActorCritic(GradientDescent):
     def evaluate(self, minibatch: Minibatch) -> LossInput:
         """Run the network on a minibatch. Returns the minibatch's rows together with the network's outputs for them.
 
-        The logits of actions that are not allowed become -1e30. Actions of a Box have a normal distribution that is not
-        clipped. For a small network on the CPU, numpy computes the same (`kernels/trained_networks.py`).
+        The logits of actions that are not allowed become -1e30. Box actions have a normal distribution that is not clipped.
+        For a small network on the CPU, numpy computes the same outputs (`kernels/trained_networks.py`).
         """
         action = minibatch.action
         outputs = self.net.evaluate(minibatch.features, minibatch.images, minibatch.recurrent, action, minibatch.mask)
@@ -222,13 +223,13 @@ class ActorCritic(GradientDescent):
         """Count an update of `epochs` epochs and its env steps. The new observation statistics take effect now."""
         self.env_steps += batch.env_steps
         self.version += 1
-        # Workers acted under the statistics that were published before this batch. The losses must normalize observations
-        # with the same statistics: otherwise the probability ratio would not be 1 for an unchanged policy. So the
-        # new statistics take effect only after the update. They are published together with the weights.
+        # Workers acted with the statistics that were published before this batch. The losses must normalize observations
+        # with the same statistics, because otherwise the probability ratio would not be 1 for an unchanged policy. The new
+        # statistics therefore take effect only after the update. They are published together with the weights.
         self.statistics = self.normalizer.buffers()
 
     def metrics(self, epochs: Sequence[Sequence[UpdateMetrics]], estimates: Sequence[Estimates]) -> UpdateMetrics:
-        """The metrics of an update: means over its gradient steps and over its estimates, and the values of schedules."""
+        """The metrics of an update: means over its gradient steps and over its estimates, and scheduled values."""
         metrics = self.means(step for epoch in epochs for step in epoch)
         metrics["train/learning_rate"] = self.learning_rate
         metrics["train/n_updates"] = float(self.version)
@@ -244,7 +245,7 @@ class ActorCritic(GradientDescent):
         return WholeBatch(batch, self.observations(batch))
 
     def observations(self, batch: Batch) -> ColumnObservations:
-        """The observations of a batch, normalized just as they were on the workers."""
+        """The observations of a batch, normalized exactly as they were on the workers."""
         x, images = self.normalizer.inputs(batch.obs, self.statistics)
         recurrent = None
         if self.policy.core is not None:
@@ -273,7 +274,7 @@ class ActorCritic(GradientDescent):
 
 
 def _recurrent_input(batch: Batch, tensor: Callable[[Array], Tensor]) -> RecurrentInput:
-    """The recurrent states with which the rollouts began, and the steps at which these are reset or left unchanged.
+    """The recurrent states with which the rollouts began, and the steps at which a state is reset or left unchanged.
 
     The state is reset after a step that resets the env copy. A row in which a seat waits leaves that seat's state unchanged.
     """

@@ -1,7 +1,7 @@
-"""The base of every algorithm: the methods that the training loop (`millrace.learner.train`) calls, and checks of results.
+"""The base class of every algorithm: the methods that the training loop (`millrace.learner.train`) calls.
 
-The checks are needed because your own algorithm may return anything. If its result cannot be used, a one-line error says why
-and names the class. This file doesn't need torch.
+This module also checks the results of these methods, because your own algorithm may return anything. If a result cannot be
+used, a one-line error says why and names the class. This module doesn't need torch.
 """
 
 from __future__ import annotations
@@ -23,25 +23,25 @@ from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
 
 
 class Start(NamedTuple):
-    """The parts of an earlier run that a new run takes over. Both runs' policies have the same `PolicySpec`."""
+    """The parts of an earlier run that a new run loads. Both runs' policies have the same `PolicySpec`."""
 
     state: dict[str, Any]
-    """The `state_dict` of the earlier run's algorithm. If only the policy of that run is known, the dict holds just
-    `parameters`, and perhaps the observation statistics, `observations`.
+    """The `state_dict` of the earlier run's algorithm. If only that run's policy is known, the dict holds only `parameters`
+    and perhaps the observation statistics, `observations`.
     """
     acting: int
     """The number P of acting parameters: the first P of the `parameters` compute actions."""
     critic: bool = False
-    """Whether to take over all weights, not only those that compute actions."""
+    """Whether to load all weights, not only those that compute actions."""
     optimizer: bool = False
-    """Whether to take over the moments of the optimizers, too."""
+    """Whether to load the optimizers' moments, too."""
 
     def into(self, fresh: dict[str, Any], weights: Iterable[str], optimizers: Iterable[str]) -> dict[str, Any]:
-        """The state `fresh` of a new algorithm, with some parts replaced by those taken over from the earlier run.
+        """The state `fresh` of a new algorithm, with some parts replaced by parts of the earlier run's state.
 
-        `weights` and `optimizers` are the names of the tensors and the optimizers in the state. The first P of `parameters`
-        and `target` compute actions; if the new algorithm has no other parameters, the earlier one must have none either.
-        Raises `ValueError` if a tensor's shape or dtype differs from that in the new algorithm.
+        `weights` and `optimizers` are the names of the tensors and the optimizers in the state. The first P numbers of
+        `parameters` and `target` compute actions; if the new algorithm has no other parameters, the earlier one must have
+        none either. Raises `ValueError` if a tensor's shape or dtype isn't the same in both algorithms.
         """
         state = self.state
         taken = dict[str, Any]()
@@ -64,13 +64,13 @@ class Start(NamedTuple):
 
 
 class Algorithm(ABC):
-    """The base of every algorithm. An algorithm learns from batches, and provides the weights with which workers act.
+    """The base class of every algorithm. An algorithm learns from batches, and provides the weights that workers act with.
 
     A subclass defines `__init__`, `update`, `weights`, `state_dict` and `load_state_dict`, and has its settings in `Config`.
     """
 
     Config: ClassVar[type[AlgorithmConfig]] = AlgorithmConfig
-    """The record of the settings. Its fields become flags, TOML keys and keyword arguments of a run."""
+    """The record of the algorithm's settings. Its fields become flags, TOML keys and keyword arguments of a run."""
 
     whole_episodes: ClassVar[bool] = False
     """True if the algorithm learns only from whole episodes. Runs whose rollouts are shorter than an episode are refused."""
@@ -91,9 +91,9 @@ class Algorithm(ABC):
 
     @abstractmethod
     def __init__(self, config: Any, policy: PolicySpec, *, total_steps: int, seed: int, device: str = "cpu") -> None:
-        """Make the weights of version 0.
+        """Create the weights of version 0.
 
-        `config` is an instance of `Config`. `total_steps`, the number of env steps of the run, is needed for schedules. All
+        `config` is an instance of `Config`. `total_steps` is the number of env steps of the run, which schedules need. All
         random numbers must derive from `seed`. `device` is "cpu" or "cuda". Raises `UsageError` if this machine cannot do
         what the settings ask for.
         """
@@ -102,9 +102,10 @@ class Algorithm(ABC):
     def update(self, batch: Batch, pulse: Callable[[], None]) -> dict[str, float]:
         """Learn from a batch and return metrics by name, such as "train/loss".
 
-        Calls `pulse` between gradient steps, so that the learner can answer its workers meanwhile; let any exception that
-        `pulse` raises propagate. Uses only rows where `batch.valid` is True, and changes no array of the batch. If a loss or
-        a gradient is not finite, raises `RunError` before it changes the weights (see `check_finite`).
+        Must call `pulse` between gradient steps, so that the learner can answer its workers meanwhile, and must let any
+        exception that `pulse` raises propagate. Must use only rows where `batch.valid` is True, and change no array of the
+        batch. If a loss or a gradient is not finite, must raise `RunError` before it changes the weights (see
+        `check_finite`).
         """
 
     @abstractmethod
@@ -124,26 +125,26 @@ class Algorithm(ABC):
 
     @abstractmethod
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from a `state_dict`: the next update equals, bit for bit, the one that would have followed it."""
+        """Continue from a `state_dict`: the next update gives the same bits as if the saved algorithm had continued."""
 
     def start_from(self, start: Start) -> None:
-        """Take over the policy of an earlier run (`--from`), its statistics, and whatever else `start` names.
+        """Load an earlier run's policy (`--from`), its statistics, and whatever else `start` names.
 
-        Called once, on a new algorithm, before `add_prior`; a resumed run does not call it. By default raises `UsageError`.
+        Called once, on a new algorithm, before `add_prior`; a resumed run does not call it. By default, raises `UsageError`.
         """
         raise UsageError(f"{type(self).__name__} does not start from another run: it has no method start_from")
 
     def add_prior(self, prior: PriorData) -> None:
         """Accept the rows of a dataset (`--prior`) to learn from.
 
-        Called once, before the first update and before `load_state_dict`. By default raises `UsageError`.
+        Called once, before the first update and before `load_state_dict`. By default, raises `UsageError`.
         """
         raise UsageError(f"prior: {type(self).__name__} does not learn from prior data: it has no method add_prior")
 
     def learn_from_prior(self, pulse: Callable[[], None]) -> None:
         """Take the gradient steps on prior data that precede the first rollouts, except those already taken.
 
-        By default there are none. Like `update`, it calls `pulse` between gradient steps and may raise `RunError`.
+        By default, there are none. Like `update`, it calls `pulse` between gradient steps and may raise `RunError`.
         """
         return
 
@@ -152,12 +153,12 @@ class Algorithm(ABC):
         self._remembered = copy.deepcopy(self.state_dict())
 
     def roll_back(self) -> None:
-        """Return to the state that was remembered last. Must work even if the update stopped halfway."""
+        """Return to the state of the last `remember`. Must work even if the update stopped halfway."""
         self.load_state_dict(copy.deepcopy(self._remembered))
 
 
 def numbers(metrics: Any, who: str) -> dict[str, float]:
-    """The metrics of an update as floats, by name. Scalars of numpy and torch become floats, too.
+    """The metrics of an update as floats, by name. Scalars from numpy and torch become floats, too.
 
     `who` is the name of the algorithm's class. Raises `UsageError` for anything but a dict of numbers by name.
     """
@@ -174,7 +175,7 @@ def numbers(metrics: Any, who: str) -> dict[str, float]:
 
 
 def wrong_weights(weights: Any, policy: PolicySpec) -> Iterator[str]:
-    """Yield what is wrong with an algorithm's weights: one line for each array whose form doesn't fit the policy."""
+    """Yield what is wrong with an algorithm's weights: one line for each array that doesn't fit the policy."""
     if not isinstance(weights, tuple) or len(weights) != 2:
         yield f"weights: expected a pair of arrays, got {type(weights).__name__}"
         return
@@ -187,7 +188,7 @@ def wrong_weights(weights: Any, policy: PolicySpec) -> Iterator[str]:
 
 
 def acting_weights(algorithm: Algorithm, policy: PolicySpec) -> tuple[Floats, Floats]:
-    """The parameters and buffers with which workers act. Raises `UsageError` if they don't fit the policy."""
+    """The parameters and buffers that workers act with. Raises `UsageError` if they don't fit the policy."""
     weights = algorithm.weights()
     if why := next(wrong_weights(weights, policy), None):
         who = type(algorithm).__name__

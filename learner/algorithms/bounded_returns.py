@@ -1,10 +1,10 @@
 """Scales rewards so that values stay within the categories of a distributional critic (XQC).
 
-Rule: rewards are divided by the standard deviation of the discounted return, or by more, so that neither a discounted return
-so far nor the value of going on after a truncated episode exceeds the bound. A truncated episode would have gone on: if its
-rewards continued as they were on average, its value would be their discounted mean divided by 1 − γ. With a short time limit
-that is several times the discounted return, and without this rule all actions would seem to be worth the bound. The last
-reward doesn't count, because some environments pay a penalty with the truncation.
+Rule: rewards are divided by the standard deviation of the discounted return, or by more if necessary, so that neither the
+discounted return so far nor the value of continuing after a truncated episode exceeds the bound. A truncated episode would
+have continued. If its rewards stayed at their discounted mean, its value would be this mean divided by 1 − γ. With a short
+time limit, this value is several times the discounted return, and without this rule all actions would seem to be worth the
+bound. The last reward doesn't count, because in some environments it includes a penalty for the truncation.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class BoundedReturns(RewardScaler):
         return divided
 
     def may_last(self, reward: Floats) -> None:
-        """Record that the largest of these rewards may be earned in every step, for ever. Without a discount, do nothing."""
+        """Record that the largest of these rewards may be earned at every step, forever. Without a discount, do nothing."""
         if self._gamma < 1:
             self._largest = max(self._largest, float(abs(reward).max(initial=0)) / (1 - self._gamma))
 

@@ -1,7 +1,7 @@
 """CrossQ (Bhatt et al. 2024): SAC with batch normalization in actor and critics, and without target networks.
 
-The newest critics also evaluate the next observations. That is stable because observations and next observations pass
-through the critics together, and are normalized alike. `NormalizedSAC` has the parts that CrossQ and XQC share.
+The newest critics also evaluate the next observations. This is stable because observations and next observations pass
+through the critics together, and are normalized in the same way. `NormalizedSAC` has the parts that CrossQ and XQC share.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ class CrossQ(NormalizedSAC):
     def critic_loss(self, rows: Transitions) -> CriticLoss:
         """½ Σ E[w (Q(s, a) − y)²] over both critics, where y = Σ γⁱ r + γᵏ (min Q(s′, a′) − α log π(a′|s′)).
 
-        One pass computes both Q(s, a) and Q(s′, a′). The gradient treats y as a constant. It does flow through the
-        statistics of the minibatch, to which s′ contributes.
+        One pass computes both Q(s, a) and Q(s′, a′). The gradient treats y as a constant, but it flows through the
+        minibatch's statistics, to which s′ contributes.
         """
         self.net.renormalizes = self.gradient_steps >= self.config.renormalize_after
         joint = self.joint(rows)

@@ -1,7 +1,7 @@
 """DQN (Mnih et al. 2015), with double, dueling, n-step and prioritized variants.
 
-An update adds a batch to the replay buffer and takes a fixed number of gradient steps. So how often a transition is used
-depends on the settings, not on speed. ε falls with the number of env steps in all batches so far, and is published with the
+An update adds a batch to the replay buffer and takes a fixed number of gradient steps, so the settings, not speed, determine
+how often a transition is used. ε falls with the number of env steps in all batches so far, and is published with the
 weights. The settings are in `learner/config/hyperparameters.py`.
 """
 
@@ -67,11 +67,11 @@ class DQN(OffPolicy):
         self.optimizers = {"optimizer": optimizer}
 
     def network(self, device: str, seed: int) -> ActionValueNetwork:
-        """Make a network of action values. Called twice, for the network and its target, which begin with equal weights."""
+        """Create a network of action values. Called for the network and for its target, which begin with equal weights."""
         return q_network(self.policy, device, seed)
 
     def steps_due(self) -> int:
-        """The number of gradient steps of this update, which is constant once learning has started."""
+        """The number of gradient steps in this update, which is constant once learning has started."""
         return self.config.gradient_steps if self.env_steps >= self.config.learning_starts else 0
 
     def transitions(self, sample: Sample | SequenceSample) -> Transitions:
@@ -104,7 +104,7 @@ class DQN(OffPolicy):
         return CriticLoss(LOSSES[self.config.loss](error, rows.weight), error, {"q_mean": values.mean()})
 
     def step(self, rows: Transitions) -> tuple[UpdateMetrics, Tensor]:
-        """Take one gradient step on a minibatch, then update the target network if that is due."""
+        """Take one gradient step on a minibatch, then update the target network if an update of it is due."""
         critic = self.loss(rows)
         optimizer = self.optimizers["optimizer"]
         metrics = self.differentiate(critic.loss, optimizer, {**critic.numbers, "loss": critic.loss})
@@ -129,7 +129,7 @@ class DQN(OffPolicy):
             self.target.flat.lerp_(self.net.flat, self.config.tau)
 
     def weights(self) -> tuple[Floats, Floats]:
-        """Copies of the Q-network's parameters [P] and of the buffers: the observation statistics, then ε."""
+        """Copies of the Q-network's parameters [P], and of the buffers: the observation statistics, then ε."""
         epsilon = np.float32(exploration_rate(self.config, self.env_steps))
         return self.net.acting_parameters(), np.append(self.statistics, epsilon)
 

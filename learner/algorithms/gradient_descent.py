@@ -1,7 +1,7 @@
-"""The base of the algorithms that train flat tensors by gradient descent: the tools of an update, and the saved state.
+"""The base class of algorithms that train flat tensors by gradient descent: what updates need, and the saved state.
 
 Rule: torch differentiates exactly the loss that an algorithm defines. A step is taken only if its loss and its gradient are
-finite; if an update raises, `roll_back` undoes the changes that it made before.
+finite. If an update raises, `roll_back` undoes the changes that it has made so far.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Network(Protocol):
 
 
 class GradientDescent(Algorithm):
-    """Flat tensors, an optimizer for each trained one, schedules, and statistics of observations and returns.
+    """Flat tensors, an optimizer for each trained tensor, schedules, and statistics of observations and returns.
 
     A subclass puts everything that a step changes into `tensors` and `optimizers`, and everything else that the next update
     depends on into `other_state`.
@@ -57,7 +57,7 @@ class GradientDescent(Algorithm):
         self.version = 0  # updates made so far
         self._total_steps = total_steps
         # With some heads, the policy's buffers also hold exploration settings. The normalizer must not count these, so it
-        # gets the policy with a head that has none.
+        # gets the policy with a head that has no exploration settings.
         self.normalizer = ObservationNormalizer(replace(policy, head="actor_critic"))
         self.statistics: Floats = self.normalizer.buffers()  # float32 means and standard deviations, as published
         self.rewards = RewardScaler(config.gamma)
@@ -67,7 +67,7 @@ class GradientDescent(Algorithm):
     # ---------------------------------------------------------------- an update
 
     def remaining(self) -> float:
-        """The fraction of the run that remained before this batch, 1 − env_steps / total_steps, and never below 0."""
+        """The fraction of the run that remained before this batch: 1 − env_steps / total_steps, but at least 0."""
         return max(0.0, 1 - self.env_steps / self._total_steps)
 
     def set_schedules(self) -> None:
@@ -83,7 +83,7 @@ class GradientDescent(Algorithm):
         return rate
 
     def inputs(self, leaves: Sequence[Array]) -> tuple[Tensor, tuple[Tensor, ...]]:
-        """The networks' input for leaves [B, *leaf]: normalized features [B, D], and images [B, *leaf] uint8."""
+        """The networks' input for leaves [B, *leaf]: features [B, D], normalized, and images [B, *leaf] uint8."""
         x, images = self.normalizer.inputs(leaves, self.statistics)
         return self.tensor(x).to(self.net.flat.dtype), tuple(map(self.tensor, images))
 
@@ -111,7 +111,7 @@ class GradientDescent(Algorithm):
     def differentiate(self, loss: Tensor, optimizer: Optimizer, numbers: Mapping[str, Tensor | float]) -> UpdateMetrics:
         """Compute the gradient of a loss, and store it in `grad` of the optimizer's flat tensor.
 
-        Sets `grad` to zero, and calls `loss.backward()`. Returns `numbers` as floats, and the norm of the gradient as
+        Sets `grad` to zero, and then calls `loss.backward()`. Returns `numbers` as floats, and the norm of the gradient as
         `grad_norm`. Raises `RunError` if one of these is not finite, and `UsageError` if one isn't a number.
         """
         (flat,) = optimizer.param_groups[0]["params"]
@@ -155,7 +155,7 @@ class GradientDescent(Algorithm):
         return bool(all(tensor.isfinite().all() for tensor in self.tensors.values()) and np.isfinite(self.statistics).all())
 
     def other_state(self) -> dict[str, Any]:
-        """A copy, as plain data, of the state that updates depend on, apart from tensors, optimizers and statistics."""
+        """A copy, as plain data, of all other state that updates depend on: all but tensors, optimizers and statistics."""
         return {"env_steps": self.env_steps, "version": self.version, "pretraining_steps": self.pretraining_steps}
 
     def load_other_state(self, state: dict[str, Any]) -> None:
@@ -174,7 +174,7 @@ class GradientDescent(Algorithm):
         )
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from a `state_dict`: the next update equals, bit for bit, the one that would have followed it."""
+        """Continue from a `state_dict`: the next update gives the same bits as if the saved algorithm had continued."""
         for name, tensor in self.tensors.items():
             tensor.copy_(state[name])
         for name, optimizer in self.optimizers.items():
@@ -187,7 +187,7 @@ class GradientDescent(Algorithm):
     def start_from(self, start: Start) -> None:
         """See `Algorithm.start_from`. A replay buffer starts empty.
 
-        Target networks start as copies of the networks; if the critic is taken over, so are the target networks.
+        Target networks start as copies of the networks. If the earlier run's critic is loaded, so are its target networks.
         """
         own = GradientDescent.state_dict(self)
         GradientDescent.load_state_dict(self, start.into(own, self.tensors, self.optimizers))
@@ -197,7 +197,7 @@ class GradientDescent(Algorithm):
         self._remembered = self.state_dict()
 
     def roll_back(self) -> None:
-        """Return to the state that was remembered last."""
+        """Return to the state of the last `remember`."""
         self.load_state_dict(self._remembered)
 
 
@@ -211,12 +211,12 @@ def check_finite(metrics: Mapping[str, float], update: int, advice: str) -> None
 
 
 def scheduled(first: float, schedule: str, remaining: float) -> float:
-    """A setting's value when this fraction of the run remains: first · remaining for `linear`, first for `constant`."""
+    """A setting's value if this fraction of the run remains: first · remaining for `linear`, first for `constant`."""
     return first * (remaining if schedule == "linear" else 1)
 
 
 def clip_norm(flat: Tensor, norm: float, largest: float) -> None:
-    """Scale the gradient of a flat tensor, whose norm is `norm`, down to a norm of at most `largest`."""
+    """Scale down the gradient of a flat tensor to a norm of at most `largest`. Its current norm is `norm`."""
     if norm > largest:
         assert flat.grad is not None
         flat.grad.mul_(largest / norm)

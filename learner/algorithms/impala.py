@@ -1,8 +1,8 @@
 """IMPALA's learner (Espeholt et al. 2018). Its settings are in `learner/config/hyperparameters.py`.
 
-A batch may have been collected under older weights (`max_lag` above 0). V-trace weights each row by the ratio of its
-action's probability under the newest policy to that under the policy that acted. V-trace is computed in time order, before
-rows are shuffled. This file uses no sockets, no files and no clock.
+A batch may have been collected with older weights (`max_lag` above 0). V-trace weights each row by the ratio of its action's
+probability under the newest policy to its probability under the policy that acted. V-trace is computed in time order, before
+rows are shuffled. This module uses no sockets, no files and no clock.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class IMPALA(ActorCritic):
     def estimate(self, batch: Batch, observations: Observations, reward: Floats, pulse: Pulse) -> Estimates:
         """V-trace advantages and targets under the newest weights.
 
-        The metric `rho` is the mean of the ratios, clipped at 1; it is 1 if the newest weights collected all rows.
+        The metric `rho` is the mean of the ratios, clipped at 1. It is 1 if all rows were collected with the newest weights.
         """
         config, values = self.config, self.values(observations, pulse)
         log_ratio = log_probs(self.net, observations, batch, pulse) - batch.log_prob

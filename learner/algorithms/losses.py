@@ -1,6 +1,6 @@
 """The losses, in plain torch, and their metrics. Each is a pure function that takes tensors [B] and returns one number.
 
-B is the number of rows of a minibatch. All of them are valid: invalid rows are left out when minibatches are selected.
+B is the number of rows in a minibatch. All rows are valid, because invalid ones are left out when minibatches are selected.
 """
 
 from __future__ import annotations
@@ -36,15 +36,15 @@ def policy_gradient(log_prob: Tensor, advantage: Tensor) -> Tensor:
 
 
 def value_loss(value: Tensor, target: Tensor) -> Tensor:
-    """The mean squared error. As in Stable-Baselines3, it lacks the factor ½ that other libraries use."""
+    """The mean squared error. As in Stable-Baselines3, it lacks the factor ½ that some other libraries use."""
     return (value - target).square().mean()
 
 
 def clipped_value_loss(value: Tensor, target: Tensor, old_value: Tensor, clip_range: float) -> Tensor:
     """The value loss of OpenAI's PPO. Moving a value further than `clip_range` from `old_value` doesn't lower the loss.
 
-    L = E[max((V − G)², (clip(V, V_old−ε, V_old+ε) − G)²)].  Stable-Baselines3 uses only the second square, which gives no
-    gradient even to a value that moved too far in the wrong direction.
+    L = E[max((V − G)², (clip(V, V_old−ε, V_old+ε) − G)²)].  Stable-Baselines3 uses only the second square, whose gradient is
+    zero even if a value has moved too far in the wrong direction.
     """
     clipped = old_value + (value - old_value).clamp(-clip_range, clip_range)
     return torch.maximum((value - target).square(), (clipped - target).square()).mean()
@@ -70,9 +70,9 @@ def squared_loss(error: Tensor, weight: Tensor) -> Tensor:
 
 
 def approx_kl(log_ratio: Tensor) -> Tensor:
-    """KL(π_old ‖ π), estimated as E[(ρ − 1) − log ρ], which is unbiased and never negative (Schulman 2020).
+    """KL(π_old ‖ π), estimated as E[(ρ − 1) − log ρ], which is unbiased and never negative.
 
-    The reference is his article "Approximating KL Divergence".
+    See Schulman's article "Approximating KL Divergence" (2020).
     """
     log_ratio = log_ratio.detach()
     return (log_ratio.expm1() - log_ratio).mean()

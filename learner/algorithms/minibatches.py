@@ -4,7 +4,7 @@ Rule: rows that are not valid never enter a loss, and each valid row enters exac
 still runs over the rows that are not valid, because it processes whole columns.
 
 A batch has T rows for each of ΣN env copies (columns). Row indices refer to all T · ΣN rows as one flat sequence in time
-order. B is the number of rows of a minibatch, and C the number of its columns if the policy has a recurrent core.
+order. B is the number of rows in a minibatch, and C the number of its columns if the policy has a recurrent core.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from millrace.protocol.rollout import Batch
 
 Index = Tensor | slice
 
-CHUNK_ROWS = 1024  # number of observations evaluated together if no gradient is needed; it limits the memory
+CHUNK_ROWS = 1024  # number of observations evaluated together if no gradient is needed; limits the memory used
 
 
 class NetworkInput(NamedTuple):
@@ -45,8 +45,8 @@ class Observations(Protocol):
     def evaluate(self, steps: int, function: Callable[[NetworkInput, Index], Tensor], pulse: Callable[[], None]) -> Floats:
         """Apply `function` to the observations of the first `steps` steps, in chunks and without gradients.
 
-        `function` gets the network input of a chunk and the indices of the chunk's rows in the batch, and returns one number
-        for each row. All results are returned as one array [steps, ΣN]. Calls `pulse` after each chunk.
+        `function` gets a chunk's network input and the indices of its rows in the batch, and returns one number for each
+        row. All results are returned as one array [steps, ΣN]. Calls `pulse` after each chunk.
         """
         ...
 
@@ -146,7 +146,7 @@ class Minibatch(NamedTuple):
         """Yield `count` minibatches of nearly equal size. Each row where `used` [T, ΣN] is True is in exactly one of them.
 
         Rows are shuffled; without a generator, they stay in order. With a core, whole columns stay together, because the
-        core learns from consecutive rows; then there are at most as many minibatches as columns.
+        core learns from consecutive rows, so there are at most as many minibatches as columns.
         """
         index = units_in_order(used, generator, whole_columns=self.recurrent is not None)
         if not len(index):
@@ -158,7 +158,7 @@ class Minibatch(NamedTuple):
             yield self.chosen(chosen, of_rows)
 
     def chosen(self, units: Tensor, used: Tensor) -> Minibatch:
-        """A copy of some of the rows or columns that `units_in_order` gave. `used` [T, ΣN] is True for the rows to use."""
+        """A copy of some of the rows or columns from `units_in_order`. `used` [T, ΣN] is True for the rows to use."""
         return self.select(units) if self.recurrent is None else self.select_columns(units, used)
 
 
@@ -173,10 +173,10 @@ class UpdateRows(Protocol):
     def epochs(
         self, advantage: Floats, target: Floats, used: Bools, count: int, generator: torch.Generator
     ) -> Iterator[Iterable[Sequence[Minibatch]]]:
-        """Yield epochs without end. A minibatch of an epoch is a sequence of the parts that this process learns from.
+        """Yield epochs without end. Each minibatch in an epoch is a sequence of the parts that this process learns from.
 
-        If an epoch is a single minibatch, it is made once, with its rows in order, and yielded every time. The arrays are
-        [T, ΣN].
+        If an epoch has a single minibatch, the minibatch is created once, with its rows in order, and yielded every time.
+        The arrays are [T, ΣN].
         """
         ...
 
@@ -198,9 +198,9 @@ class WholeBatch(NamedTuple):
 def endless_epochs(
     minibatches: Callable[[torch.Generator | None], Iterable[Sequence[Minibatch]]], count: int, generator: torch.Generator
 ) -> Iterator[Iterable[Sequence[Minibatch]]]:
-    """Yield epochs without end. `minibatches` makes one epoch's minibatches, in order if its argument is None.
+    """Yield epochs without end. `minibatches` creates one epoch's minibatches, with rows in order if its argument is None.
 
-    If an epoch is a single minibatch, it is made once, with its rows in order, and yielded every time.
+    If an epoch has a single minibatch, the minibatch is created once, with its rows in order, and yielded every time.
     """
     single = tuple(minibatches(None)) if count == 1 else ()
     while True:
@@ -208,13 +208,13 @@ def endless_epochs(
 
 
 class LossInput(NamedTuple):
-    """The input of a loss: B rows of a minibatch, and the network's current outputs for them. Every row is valid.
+    """The input of a loss: the B rows of a minibatch, and the network's current outputs for them. Every row is valid.
 
     All tensors are float32, except discrete actions. Gradients flow through the last three.
     """
 
     action: Tensor
-    """[B, *action] the actions taken: int64 counted from 0, or for a Box float32 that is not clipped to its bounds"""
+    """[B, *action] the actions taken: int64 counted from 0, or for a Box, float32 that is not clipped to its bounds"""
     log_prob: Tensor
     """[B] log-probability of the action under the policy that acted"""
     advantage: Tensor
@@ -252,7 +252,7 @@ def rows_of_columns(steps: int, columns: int, chosen: Tensor) -> Tensor:
 
 
 def log_probs(net: ActorCriticNetwork, observations: Observations, batch: Batch, pulse: Callable[[], None]) -> Floats:
-    """Log-probabilities [T, ΣN] of the actions of a batch, with the current weights of `net`."""
+    """Log-probabilities [T, ΣN] of a batch's actions, with the current weights of `net`."""
     device = net.flat.device
     action = flat_tensor(batch.action, device)
     mask = None if batch.mask is None else flat_tensor(batch.mask[:-1], device)

@@ -1,7 +1,7 @@
 """`RolloutService.normalizer`: the running mean and standard deviation of observations and of the discounted return.
 
-The built-in trainer uses the same classes, and updates them from the same rows. `RolloutService` imports this file, and with
-it torch, when the normalizer is first used.
+The built-in trainer uses the same classes, and updates them from the same rows. `RolloutService` imports this module, and
+therefore torch, when the normalizer is first used.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from millrace.protocol.specs import PolicySpec
 class Normalizer:
     """Running mean and standard deviation of each feature of the observations, and of the discounted return.
 
-    They cover all batches counted so far, except rows that only reset. D is the number of features: the entries of all
-    arrays of the observation side by side, with a one-hot vector for each discrete value. Images aren't features and aren't
-    normalized. The statistics are kept in float64 and returned as float32.
+    These statistics cover all batches counted so far, except rows that only reset. D is the number of features: the
+    observation's arrays are flattened and concatenated, with a one-hot vector for each discrete value. Images aren't
+    features and aren't normalized. The statistics are kept in float64 and returned as float32.
 
     >>> import millrace
     >>> policy = millrace.MLP(normalize_observations=True)
@@ -46,7 +46,7 @@ class Normalizer:
     """
 
     def __init__(self, policy: PolicySpec) -> None:
-        """Make a normalizer for the observations of this policy, even if the policy doesn't normalize them itself."""
+        """Create a normalizer for this policy's observations, even if the policy doesn't normalize them itself."""
         self._policy = msgspec.structs.replace(
             policy, normalize_observations=True, own=None, encoder=None, head="actor_critic"
         )
@@ -75,17 +75,17 @@ class Normalizer:
     def normalized(self, batch: Batch) -> Floats:
         """The features [T+1, N, D] float32 of a batch: (x − mean) / std, clipped to ±10.
 
-        If you call this before `update`, these are the features that the policy saw, provided that it normalizes and that
-        `max_lag` is 0. The observation's arrays are flattened and concatenated; discrete values become one-hot vectors, and
-        the bytes of a Box from 0 to 255 are first divided by 255.
+        If you call this before `update`, these are the features that the policy saw, provided that the policy normalizes and
+        that `max_lag` is 0. The observation's arrays are flattened and concatenated; discrete values become one-hot vectors,
+        and the bytes of a Box from 0 to 255 are first divided by 255.
         """
         return normalize(self._features(batch), self.mean, self.std)
 
     def scaled_rewards(self, batch: Batch, gamma: float) -> Floats:
         """Add the rewards of a batch to the statistics, and return them scaled, as an array [T, N].
 
-        They are divided by the standard deviation of the discounted return, and clipped to ±10. Call this once for each
-        batch. `gamma` is the discount factor. Raises `UsageError` if it isn't the same each time.
+        Rewards are divided by the standard deviation of the discounted return, and clipped to ±10. Call this once for each
+        batch. `gamma` is the discount factor. Raises `UsageError` if `gamma` isn't the same each time.
         """
         if self._rewards is None:
             self._rewards = gamma, RewardScaler(gamma)
@@ -99,7 +99,7 @@ class Normalizer:
         return features(self._policy, [obs[path] for path in paths] if paths[0] else [obs])
 
     def state(self) -> dict[str, Any]:
-        """The state for `restore`, as plain data. It omits running returns because a restored service has new env copies."""
+        """The state for `restore`, as plain data. Running returns are omitted, because a restored service has new copies."""
         kept: dict[str, Any] = {"observations": _plain(self._observations.state_dict())}
         if self._rewards is not None:
             gamma, scaler = self._rewards

@@ -1,8 +1,8 @@
 """PPO (Schulman et al. 2017). Its settings are in `learner/config/hyperparameters.py`.
 
 An update uses each valid row of a batch once in each of `n_epochs` epochs, in minibatches of at most `batch_size` rows. With
-a recurrent core a minibatch consists of whole columns of the batch, and may have more rows. The update itself is
-`ActorCritic.update`; this file adds the loss, the schedule of the clip range and the early stop. It uses no sockets, no
+a recurrent core, a minibatch consists of whole columns of the batch, and may have more rows. The update itself is
+`ActorCritic.update`; this module adds the loss, the schedule of the clip range, and early stopping. It uses no sockets, no
 files and no clock, and all randomness comes from the seed.
 """
 
@@ -56,8 +56,8 @@ class PPO(ActorCritic):
     def loss(self, rows: LossInput) -> tuple[Tensor, Mapping[str, Tensor | float]]:
         """L = −E[min(ρ A, clip(ρ, 1−ε, 1+ε) A)] + vf_coef · E[(V − G)²] − ent_coef · E[H(π)],  ρ = π(a) / π_old(a).
 
-        See Schulman et al. 2017, equations 7 and 9. If `clip_range_vf` is set, the value loss is clipped, with V_old
-        computed as G − A; so if you override `estimate`, keep G = A + V.
+        See Schulman et al. 2017, equations 7 and 9. If `clip_range_vf` is set, the value loss is clipped, and V_old is
+        computed as G − A. If you override `estimate`, therefore keep G = A + V.
         """
         config = self.config
         log_ratio = rows.log_prob_now - rows.log_prob
@@ -77,9 +77,9 @@ class PPO(ActorCritic):
         }
 
     def metrics(self, epochs: Sequence[Sequence[UpdateMetrics]], estimates: Sequence[Estimates]) -> UpdateMetrics:
-        """Add to the metrics the last loss, the last epoch's KL divergence, the clip range, and the number of epochs so far.
+        """The metrics, with the last loss, the last epoch's KL divergence, the clip range, and the number of epochs so far.
 
-        If a subclass has its own loss, the KL divergence is included only if that loss logs it.
+        If a subclass has its own loss, the KL divergence is included only if this loss logs it.
         """
         metrics = super().metrics(epochs, estimates)
         metrics |= {"train/n_updates": float(self.epochs), "train/clip_range": self.clip_range}

@@ -1,4 +1,4 @@
-"""The interface of prior data: a dataset (`--prior`) that an algorithm learns from in addition to its run's rollouts."""
+"""The interface for prior data: a dataset (`--prior`) that an algorithm learns from in addition to its run's rollouts."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from millrace.protocol.rollout import Batch
 
 
 class PriorData(Protocol):
-    """A dataset of whole episodes, in a fixed order.
+    """A dataset of complete episodes, in a fixed order.
 
     >>> import numpy as np
     >>> from millrace.algorithms import PriorData

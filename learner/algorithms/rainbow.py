@@ -1,10 +1,10 @@
 """Rainbow (Hessel et al. 2018): DQN that learns the quantiles of the return (QR-DQN, Dabney et al. 2018).
 
-Its other parts are settings of DQN: double, dueling, n-step returns and prioritized replay. Noisy networks are left out,
-because workers would have to draw noise for each weight; workers explore with ε instead.
+Rainbow's other parts are settings of DQN: double, dueling, n-step returns and prioritized replay. Noisy networks are left
+out, because workers would have to draw noise for each weight; workers explore with ε instead.
 
 Rule: with batch normalization, observations and next observations pass through the network in one minibatch. They come from
-different distributions; in separate minibatches they would be normalized by different means (Bhatt et al. 2024).
+different distributions, so in separate minibatches they would be normalized by different means (Bhatt et al. 2024).
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from millrace.protocol.specs import PolicySpec
 
 
 class Rainbow(DQN):
-    """A network of quantiles with its target network and its optimizer, and the replay buffer with the prior data."""
+    """A quantile network with its target network and its optimizer, and the replay buffer with the prior data."""
 
     Config = RainbowConfig
     net: QuantileQNetwork
@@ -58,7 +58,7 @@ class Rainbow(DQN):
         return rows.reward[:, None] + rows.discount[:, None] * z
 
     def loss(self, rows: Transitions) -> CriticLoss:
-        """E[w · quantile Huber loss] of the quantiles of Q(s, a)."""
+        """E[w · quantile Huber loss] for the quantiles of Q(s, a)."""
         quantiles = of_actions(self.net.trained(*joint(rows))[: len(rows.x)], rows.action)
         targets = self.targets(rows)
         loss = (rows.weight * quantile_huber(quantiles, targets)).mean()

@@ -1,9 +1,9 @@
 """REINFORCE (Williams 1992). Its settings are in `learner/config/hyperparameters.py`.
 
-An update is one gradient step on the rows whose episode ends within the rollout, because all the rewards that follow these
-rows are known. Other rows are dropped, and their number is logged. The return of a truncated episode includes the baseline's
-value of its final observation; without a baseline, the return ends with the last reward. This file uses no sockets, no files
-and no clock.
+An update is one gradient step on the rows whose episode ends within the rollout, because all rewards that follow these rows
+are known. Other rows are dropped, and their number is logged. The return of a truncated episode includes the baseline's
+value for its final observation; without a baseline, the return ends with the last reward. This module uses no sockets, no
+files and no clock.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from millrace.protocol.rollout import Batch
 
 
 class REINFORCE(ActorCritic):
-    """The policy gradient with Monte-Carlo returns of whole episodes."""
+    """The policy gradient with the Monte Carlo returns of complete episodes."""
 
     Config = REINFORCEConfig
     config: REINFORCEConfig
@@ -44,7 +44,7 @@ class REINFORCE(ActorCritic):
         return self.config.normalize_returns
 
     def estimate(self, batch: Batch, observations: Observations, reward: Floats, pulse: Pulse) -> Estimates:
-        """The targets are Monte-Carlo returns. The advantages are these returns minus the baseline's values."""
+        """The targets are Monte Carlo returns. The advantages are these returns minus the baseline's values."""
         T, N = reward.shape
         values = self.values(observations, pulse) if self.config.baseline else np.zeros((T + 1, N), np.float32)
         ends = EpisodeEnds.of(batch)

@@ -1,12 +1,12 @@
 """Returns and advantages, as pure functions of arrays [T, N]: T steps of N env copies.
 
-The replay buffer of single rows has its own n-step returns, because it follows rows from slot to slot
+The replay buffer that draws single rows computes n-step returns itself, because it follows rows from slot to slot
 (`replay/replay_buffer.py`).
 
 Every function follows the row format (`millrace.protocol.rollout`): row t bootstraps from `values[t+1]`, the value of
 `obs[t+1]`. Where an episode was truncated, `obs[t+1]` is its true final observation. No function adds rewards or values
-across the end of an episode. A row that is not valid gives zero and does not affect other rows, whatever it contains: a
-value that a computation carries from row to row, in either direction, passes through it unchanged.
+across the end of an episode. A row that is not valid gives zero and does not affect other rows, whatever it contains. A
+value that a computation carries from row to row, in either direction, passes through such a row unchanged.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class EpisodeEnds(NamedTuple):
     truncated: Bools
     valid: Bools
     with_seats: bool = False
-    """Whether an invalid row may stand between two rows of an episode. If not, it always follows the end of an episode."""
+    """Whether an invalid row may lie between two rows of an episode. If not, it always follows the end of an episode."""
 
     @classmethod
     def of(cls, batch: Batch) -> EpisodeEnds:
@@ -93,7 +93,7 @@ def vtrace(
     delta = np.where(ends.valid, rho * (reward + discount * bootstrap - values[:-1]), zero)
     goes_on = ends.valid & ~ends.ended
     goes_on[-1] = False
-    ahead = np.zeros_like(delta)  # vs − V of the next row, where the episode goes on in this rollout
+    ahead = np.zeros_like(delta)  # vs − V of the next row, where the episode continues in this rollout
     vs_minus_v = delta.copy()
     following = vs_minus_v[-1]  # vs − V of the next valid row
     for t in range(T - 2, -1, -1):
@@ -116,7 +116,7 @@ class NStepReturns(NamedTuple):
     """γᵏ; 0 where the episode terminated"""
     last: Ints
     """The step of the observation that follows the k steps, at most T. Where the episode terminated, the step of the last
-    row instead, because nothing is learned from the observation after it."""
+    row, because nothing is learned from the observation after it."""
 
 
 def n_step_returns(reward: Floats, ends: EpisodeEnds, gamma: float, n_step: int) -> NStepReturns:
@@ -149,12 +149,12 @@ def complete(ends: EpisodeEnds) -> Bools:
 
 
 def discounted_return(reward: Floats, ends: EpisodeEnds, gamma: float, start: Doubles) -> tuple[Doubles, Doubles]:
-    """The discounted sum of the *past* rewards of each row's episode. The spread of these sums sets the scale of rewards.
+    """The discounted sum of the *past* rewards in each row's episode. The spread of these sums sets the scale of rewards.
 
         Gₜ = rₜ + γ Gₜ₋₁ [the same episode]
 
     `start` [N] is G of the row before the first one, or 0 where an episode begins. Returns G [T, N] float64 (0 where the row
-    is not valid), and the `start` [N] for the next rollout of these copies.
+    is not valid), and the `start` [N] for these copies' next rollout.
     """
     returns = np.zeros(reward.shape)
     last, ended = start, ends.ended

@@ -1,13 +1,13 @@
 """Running mean and variance of observation features and of the discounted return.
 
-They are computed in float64 with numpy, and saved as tensors. Only valid rows count. Only the learner updates the
-statistics; workers act with the float32 buffers that it publishes.
+These statistics are computed in float64 with numpy, and saved as tensors. Only valid rows count. Only the learner updates
+the statistics; workers act with the float32 buffers that the learner publishes.
 
 Rule: no single observation may spoil the scale of the others. A value more than `FAR` standard deviations from the mean (a
-far value) counts as if it were `CLIP` standard deviations away, which is what the policy sees. So if a sensor fails in less
-than one row in a hundred, the standard deviation changes little. If the scale of a feature grows permanently, its many far
-values quickly set a new scale. Values that are not far are counted unchanged. Which of the first values are far is not known
-until there are `FEW` rows, so all rows are kept until then.
+far value) counts as if it were `CLIP` standard deviations away, which is what the policy sees. If a sensor fails in less
+than one row in a hundred, the standard deviation therefore changes little. If the scale of a feature grows permanently, its
+many far values quickly set a new scale. Values that are not far count unchanged. Until there are `FEW` rows, it is not known
+which values are far, so all rows are kept until then.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class RunningMoments:
     def std(self) -> Doubles:
         """Standard deviation [*shape] of the population; 1 where the values varied by no more than rounding errors.
 
-        Where the mean is so large that its rounding error may exceed 1, this error takes the place of the 1.
+        Where the mean is so large that its rounding error may exceed 1, it is this error instead of 1.
         """
         variance = self._squares / max(self.count, 1)
         rounding = self._rounding * abs(self.mean)
@@ -97,7 +97,7 @@ class ObservationNormalizer:
     def inputs(self, leaves: Sequence[Array], published: Floats) -> tuple[Array, list[Array]]:
         """The network's input for leaves [..., *leaf]: features [..., D], and the images among the leaves.
 
-        `published` are the `buffers` with which workers act. They may be older than the newest statistics.
+        `published` are the `buffers` that workers act with. They may be older than the newest statistics.
         """
         raw = self.raw(leaves)
         x = normalize(raw, *np.split(published, 2)) if self._enabled else raw
@@ -108,11 +108,11 @@ class ObservationNormalizer:
         return features(self._spec, leaves)
 
     def published(self, buffers: Floats) -> Floats:
-        """The part of `buffers` that workers need to act. It leaves out the features that only the critic sees."""
+        """The part of `buffers` that workers need to act. It omits the features that only the critic sees."""
         return np.concatenate([half[: self._acting] for half in np.split(buffers, 2)]) if self._enabled else buffers
 
     def update(self, raw: Floats | Doubles, valid: npt.NDArray[np.bool_]) -> None:
-        """Add the features [T, N, D], not yet normalized, of the valid rows to the statistics. `valid` is [T, N]."""
+        """Add the raw features [T, N, D] of the valid rows to the statistics. `valid` is [T, N]."""
         if not self._enabled:
             return
         rows = raw[valid]
@@ -144,8 +144,8 @@ class ObservationNormalizer:
         """D means, then D standard deviations, float32, as published; empty if the policy does not normalize.
 
         A feature with a large mean, such as a time in seconds, may vary by less than the rounding error of its mean in
-        float32. Its standard deviation is computed about the rounded mean, so that normalized values have a mean square of 1
-        and are not clipped.
+        float32. The standard deviation of such a feature is computed about the rounded mean, so that normalized values have
+        a mean square of 1 and are not clipped.
         """
         if not self._enabled:
             return np.empty(0, np.float32)
@@ -173,7 +173,7 @@ def _bounded(rows: Floats | Doubles, center: Floats | Doubles, spread: Floats | 
     """The rows [B, D], in which values far from the center [D] are replaced. Returns the same array if no value is far."""
     distance = rows - center.astype(rows.dtype)
     if (np.einsum("bd,bd->d", distance, distance) <= (FAR * spread) ** 2).all():
-        return rows  # true for most batches: if a feature's squares sum to no more than the limit squared, none is far
+        return rows  # as for most batches: if a feature's squares sum to no more than the limit squared, none is far
     far = abs(distance) > FAR * spread
     return np.where(far, center + np.copysign(CLIP * spread, distance), rows) if far.any() else rows
 
@@ -214,7 +214,7 @@ class RewardScaler:
     def count(self, batch: Batch) -> None:
         """Add the rewards of a batch to the statistics."""
         ends = EpisodeEnds.of(batch)
-        for at in range(0, len(batch.lane), batch.columns_per_rollout):  # rollouts of a lane are in order of collection
+        for at in range(0, len(batch.lane), batch.columns_per_rollout):  # a lane's rollouts are in order of collection
             columns = slice(at, at + batch.columns_per_rollout)
             lane = int(batch.lane[at])
             reward, fresh, of_lane = batch.reward[:, columns], batch.fresh[columns], ends.columns(columns)
@@ -224,9 +224,9 @@ class RewardScaler:
             self.counted(returns, reward, of_lane, lane, fresh)
 
     def counted(self, returns: Doubles, reward: Floats, ends: EpisodeEnds, lane: int, fresh: Bools) -> None:
-        """Called for each rollout, with its discounted returns and rewards [T, N]. A derived class may count more.
+        """Called for each rollout, with its discounted returns and rewards [T, N]. A subclass may count more.
 
-        `fresh` [N]: which env copies don't continue the lane's last rollout.
+        `fresh` [N] is True for env copies that don't continue the lane's last rollout.
         """
 
     def state_dict(self) -> dict[str, Any]:

@@ -1,7 +1,8 @@
 """SAC (Haarnoja et al. 2018): a squashed Gaussian policy, two critics, and an automatic temperature.
 
-A call of `step` takes a gradient step of the critics, then one of the actor, then one of the temperature; then the target
-critics move. `OffPolicy.update` calls `step` for each step that is due. `Continuous` has the parts that SAC and TD3 share.
+A call to `step` takes one gradient step of the critics, then one of the actor, then one of the temperature; then it moves
+the target critics. `OffPolicy.update` calls `step` for each step that is due. `Continuous` has the parts that SAC and TD3
+share.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
 
 
 class SAC(Continuous):
-    """An actor, two critics with their targets, and the temperature."""
+    """An actor, two critics with their target networks, and the temperature."""
 
     Config = SACConfig
 
@@ -44,7 +45,7 @@ class SAC(Continuous):
 
     @property
     def batch_normalization(self) -> str:
-        """Where the actor has batch normalization. Actors that differ here cannot use each other's parameters."""
+        """Where the actor has batch normalization. If two actors differ in this, neither can use the other's parameters."""
         return "none"
 
     @property

@@ -1,6 +1,6 @@
 """TD3 (Fujimoto et al. 2018): a deterministic actor, two critics, and smoothed targets.
 
-The actor takes one gradient step for every `policy_delay` steps of the critics; the target networks move at the same time.
+The actor takes one gradient step for every `policy_delay` steps of the critics; the target networks move when it does.
 `OffPolicy.update` calls `step` for each step that is due. `Continuous` has the parts that SAC and TD3 share.
 """
 
@@ -19,7 +19,7 @@ from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
 
 
 class TD3(Continuous):
-    """An actor and two critics, with a target for each."""
+    """An actor and two critics, with a target network for each."""
 
     Config = TD3Config
     net: ActorAndCritics

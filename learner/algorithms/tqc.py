@@ -1,7 +1,7 @@
 """TQC (Kuznetsov et al. 2020): SAC whose critics learn quantiles of the return, and whose targets leave out the highest.
 
-SAC takes the lower of two critics' values, so that the actor doesn't exploit their errors. TQC pools the quantiles of all
-critics and drops the highest ones, so you can adjust in finer steps how pessimistic the targets are.
+SAC uses the lower of two critics' values, so that the actor doesn't exploit the critics' errors. TQC pools the quantiles of
+all critics and drops the highest ones, which lets you adjust in finer steps how pessimistic the targets are.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
 
 
 class TQC(SAC):
-    """An actor, quantile critics with their targets, and the temperature."""
+    """An actor, quantile critics with their target networks, and the temperature."""
 
     Config = TQCConfig
     net: ActorWithCritics

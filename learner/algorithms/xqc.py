@@ -1,9 +1,9 @@
-"""XQC (Palenicek et al. 2025): SAC with a better-conditioned loss, so that it learns more from each step.
+"""XQC (Palenicek et al. 2025): SAC with a better-conditioned loss, so it learns more from each step.
 
-It has three parts: batch normalization before each activation; weights that are kept at norm 1, because optimizer steps turn
-large weights by smaller angles; and critics that predict the probabilities of returns and learn by cross-entropy, whose
-gradient is bounded. Rewards are scaled so that values lie within the categories. `NormalizedSAC` has the parts that XQC and
-CrossQ share.
+XQC changes three parts of SAC. Batch normalization precedes each activation. Weights are kept at norm 1, because an
+optimizer step rotates larger weights by smaller angles. Critics predict the probabilities of returns and learn by
+cross-entropy, whose gradient is bounded. Rewards are scaled so that values lie within the categories. `NormalizedSAC` has
+the parts that XQC and CrossQ share.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class XQC(NormalizedSAC):
     def scaled(self, reward: Floats) -> Floats:
         """See `GradientDescent`. Rewards are scaled so that values don't exceed `return_bound`.
 
-        With hindsight, an agent that stays at a goal gets the goal's reward in every step, which no collected return shows.
+        With hindsight, an agent that stays at a goal gets the goal's reward at every step, which no collected return shows.
         """
         if self.config.hindsight and self.config.goal_ends is None:
             self.rewards.may_last(reward)
@@ -82,8 +82,8 @@ class XQC(NormalizedSAC):
         with torch.no_grad():
             values = self.categories.mean(logits)
             error = (values - target @ self.categories.atoms.to(target.dtype)).abs().mean(0)
-        # The loss is finite even if a reward is infinite, because a return beyond the bounds counts as the bound. So the
-        # mean reward is logged: the check of the logged numbers then fails.
+        # The loss is finite even if a reward is infinite, because a return beyond the bounds counts as the bound. The mean
+        # reward is logged so that the check of the logged numbers finds an infinite reward.
         return CriticLoss(loss, error, {"q_mean": values.mean(), "scaled_reward": rows.reward.mean()})
 
     def critic_loss(self, rows: Transitions) -> CriticLoss:
