@@ -1,8 +1,8 @@
-"""An encoder, an actor and K critics as `StackedMLPs`. It stands in for SAC's `ActorAndCritics`, with critics of any form.
+"""An encoder, an actor and K critics as `StackedMLPs`. It replaces SAC's `ActorAndCritics`; its critics may have any form.
 
 Rule: where a gradient is recorded (`torch.is_grad_enabled`), the actor is being trained, so it normalizes by the statistics
-of its minibatch. Under `torch.no_grad`, and wherever critics stay constant, running statistics are used. So SAC's losses can
-use this network unchanged.
+of its minibatch. Under `torch.no_grad`, and wherever critics stay constant, running statistics are used. SAC's losses can
+therefore use this network unchanged.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class ActorWithCritics:
         device: str,
         seed: int,
     ) -> None:
-        """`values_of` maps outputs of the critics [K, B, O] to values [K, B]. The initial parameters depend on `seed`."""
+        """`values_of` maps the critics' outputs [K, B, O] to values [K, B]. The initial parameters depend on `seed`."""
         keep_freed_memory()  # each pass allocates and frees arrays of half a megabyte
         generator = torch.Generator().manual_seed(torch_seed(seed, Purpose.WEIGHTS))
         fields, _ = encoder_layout(policy)
@@ -57,7 +57,7 @@ class ActorWithCritics:
         self.encode = Encoder.of_flat(policy, self._encoder, of_encoder, device, seed=seed)
         statistics = [initial_statistics(shape) for shape in (actor, critics)]
         self.statistics = torch.cat(statistics).to(device)
-        """[S] the running statistics, those of the actor first; empty without normalization"""
+        """[S] the running statistics, the actor's first; empty without normalization"""
         of_actor, of_critics = torch.split(self.statistics, [len(part) for part in statistics])
         self.actor_body = StackedMLPs(actor, trainable(self.actor, self.actor.grad), of_actor)
         self.critic_bodies = StackedMLPs(critics, trainable(constant_critics, of_constant_critics), of_critics)
@@ -71,7 +71,7 @@ class ActorWithCritics:
         return self.actor_params(self.encode(x, images))
 
     def actor_params(self, h: Tensor) -> Tensor:
-        """The actor's means and log standard deviations [B, 2 D′], before tanh, for inputs of the MLPs [B, H]."""
+        """The actor's means and log standard deviations [B, 2 D′], before tanh, for inputs [B, H]."""
         if torch.is_grad_enabled():
             (out,) = self.actor_body.trained(h, renormalizes=self.renormalizes)
         else:
@@ -84,7 +84,7 @@ class ActorWithCritics:
         return squashed_sample(self.actor_params(h), noise)
 
     def outputs(self, h: Tensor, action: Tensor) -> Tensor:
-        """Outputs of the critics [K, B, O] for inputs [B, H] and actions [B, D′], for training the critics."""
+        """The critics' outputs [K, B, O] for inputs [B, H] and actions [B, D′], for training the critics."""
         return self.critic_bodies.trained(torch.cat((h, action), -1), renormalizes=self.renormalizes)
 
     def minibatch_outputs(self, h: Tensor, action: Tensor) -> Tensor:
@@ -102,12 +102,12 @@ class ActorWithCritics:
         self.critic_bodies.project()
 
     def acting_parameters(self) -> Floats:
-        """A copy of the parameters [P] with which workers act: those of a plain MLP, then those of the encoder."""
+        """A copy of the parameters [P] that workers act with: first a plain MLP's, then the encoder's."""
         return torch.cat((self.actor_body.folded(), self._encoder)).cpu().numpy()
 
 
 def layer_sizes(policy: PolicySpec, critic_net: tuple[int, ...], outputs: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """The layer sizes of the policy's actor, and of a critic with these hidden layers and this number of outputs."""
+    """The layer sizes of the policy's actor, and of a critic with the hidden layers `critic_net` and this many outputs."""
     _, features = encoder_layout(policy)
     size = math.prod(policy.action.shape)
     return (features, *policy.net, 2 * size), (features + size, *critic_net, outputs)

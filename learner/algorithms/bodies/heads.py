@@ -1,8 +1,8 @@
 """Critics that predict a distribution of returns, as quantiles (TQC, Rainbow) or as category probabilities (C51, XQC).
 
 All functions are pure. Arrays are [..., B, O]: rows, then outputs. The outputs of a quantile critic are the quantiles at the
-fractions (2 i + 1) / (2 O), for i from 0 to O − 1. Those of a categorical critic are the logits of O returns, the atoms,
-which are equally spaced between two bounds.
+fractions (2 i + 1) / (2 O), for i from 0 to O − 1. The outputs of a categorical critic are the logits of O returns, the
+atoms, which are equally spaced between two bounds.
 """
 
 from __future__ import annotations

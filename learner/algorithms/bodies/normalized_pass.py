@@ -1,9 +1,9 @@
 """A pass of a whole minibatch through MLPs with batch normalization, as one node of autograd's graph.
 
 Rule: a layer's mean and variance are those of the whole minibatch, so all rows pass through one layer before any row enters
-the next. That is why this pass isn't cut into chunks of rows, unlike the pass of `kernels/mlp.py`.
+the next. That is why this pass isn't divided into chunks of rows, unlike the pass in `kernels/mlp.py`.
 
-Arrays are [K, n, B]: K networks, n features, B rows. So a sum over the minibatch reads contiguous memory, and one call
+Arrays are [K, n, B] (K networks, n features, B rows), so a sum over the minibatch reads contiguous memory, and one call
 normalizes the features of all networks. With x̂ = (h − μ) / σ, where σ² = variance + ε, and g = ∂L/∂(γ x̂ + β): ∂L/∂β = Σ g,
 ∂L/∂γ = Σ g x̂, ∂L/∂h = γ / σ · (g − mean(g) − x̂ mean(g x̂)).
 """
@@ -22,7 +22,7 @@ from millrace.protocol.policy.networks import refuse_second_derivatives
 EPS = 1e-3
 """the ε added to each variance, as in CrossQ and XQC"""
 MOMENTUM = 0.01
-"""the fraction by which running means and variances move towards those of a minibatch"""
+"""the fraction by which running means and variances move towards a minibatch's means and variances"""
 
 
 class Layer(NamedTuple):
@@ -48,7 +48,7 @@ class RunningStatistics(NamedTuple):
 
 
 class Plan(NamedTuple):
-    """The structure of the MLPs of a pass."""
+    """The structure of the MLPs in a pass."""
 
     layers_of: Callable[[Tensor], Sequence[Layer]]
     """returns the layers as views of a tensor that is laid out like the flat parameters"""
@@ -65,7 +65,7 @@ class NormalizedPass(torch.autograd.Function):
     def forward(
         ctx: Any, x: Tensor, flat: Tensor, plan: Plan, running: Sequence[RunningStatistics] | None, renormalizes: bool
     ) -> Tensor:
-        """The outputs [K, B, O]. Moves `running`, unless it is None, towards the statistics of the minibatch.
+        """The outputs [K, B, O]. Moves `running`, unless it is None, towards the minibatch's statistics.
 
         For `renormalizes`, see `_normalized`.
         """
@@ -83,7 +83,7 @@ class NormalizedPass(torch.autograd.Function):
             h = torch.bmm(layer.weight, h) if layer.bias is None else torch.baddbmm(layer.bias, layer.weight, h)
         ctx.kept = kept
         ctx.plan = plan
-        ctx.save_for_backward(flat)  # so that torch raises if an optimizer step changes them before the backward pass
+        ctx.save_for_backward(flat)  # makes torch raise if an optimizer step changes it before the backward pass
         return h.mT
 
     @staticmethod
@@ -125,7 +125,7 @@ class _Normalization(NamedTuple):
     d: Tensor | None
 
     def backward(self, g: Tensor, layer: Layer, by_layer: Layer) -> Tensor:
-        """The gradient [K, n, B] with respect to the input, from `g`, that with respect to the result. Overwrites `g`."""
+        """The gradient [K, n, B] with respect to the input, from `g`, the gradient of the result. Overwrites `g`."""
         total = g.sum(-1, keepdim=True)
         product = _row_products(g, self.x_hat.expand_as(g))
         by_layer.shift.copy_(total)
@@ -164,7 +164,7 @@ def _normalized(
 
 R_MAX = 3.0
 D_MAX = 5.0
-"""The bounds of batch renormalization: R_MAX for σ / σ(running) and its inverse, D_MAX for |μ − μ(running)| / σ(running)."""
+"""The bounds of batch renormalization: R_MAX for σ / σ(running) and its inverse, D_MAX for |μ − μ(running)| / σ(running)"""
 
 
 def renormalization(mean: Tensor, inverse: Tensor, running: RunningStatistics) -> tuple[Tensor, Tensor]:
@@ -177,7 +177,7 @@ def renormalization(mean: Tensor, inverse: Tensor, running: RunningStatistics) -
 def _row_products(a: Tensor, b: Tensor) -> Tensor:
     """Σ a b over the last dimension, which is kept with size 1.
 
-    On a CPU this uses numpy, which adds while it multiplies; torch would store all products first.
+    On a CPU, this uses numpy, which adds while it multiplies; torch would store all products first.
     """
     if a.device.type != "cpu":
         return (a * b).sum(-1, keepdim=True)

@@ -1,8 +1,8 @@
-"""The base of CrossQ and XQC: SAC with batch normalization in actor and critics, and fewer steps of the actor.
+"""The base class of CrossQ and XQC: SAC with batch normalization in actor and critics, and fewer steps of the actor.
 
 Rule: observations and next observations, with their actions, pass through the critics in one minibatch. They come from
-different distributions. In separate minibatches they would be normalized by different means, and values and targets would
-not be comparable (Bhatt et al. 2024).
+different distributions, so in separate minibatches they would be normalized by different means, and values and targets
+would not be comparable (Bhatt et al. 2024).
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ class NormalizedSAC(SAC):
         return Joint(torch.cat((rows.x, rows.next_x)), torch.cat((rows.action, action)), log_prob)
 
     def after_step(self, name: str) -> None:
-        """See `Continuous`. Weights that must have norm 1 are scaled back to it."""
+        """See `Continuous`. Weights that must have norm 1 are scaled back to norm 1."""
         match name:
             case "actor":
                 self.net.actor_body.project()
@@ -76,7 +76,7 @@ class NormalizedSAC(SAC):
         """Move the target critics, if there are any. Called after each step of the critics."""
 
     def step(self, rows: Transitions) -> tuple[UpdateMetrics, Tensor]:
-        """Take one gradient step of the critics, and, if it is their turn, of the actor and the temperature."""
+        """Take one gradient step of the critics and, every `policy_delay`-th time, of the actor and the temperature."""
         critic = self.critic_loss(rows)
         measured = {"ent_coef": self.temperature} | self.descend("critic", critic.loss, critic.numbers)
         self.move_target()

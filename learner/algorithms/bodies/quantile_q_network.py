@@ -2,10 +2,10 @@
 
 Rule: workers act with an ordinary Q-network. The value of an action is the mean of its quantiles, so it is linear in the
 last hidden layer, as the quantiles are. The last layer of the acting network is therefore the mean, over the quantiles, of
-the last layer here. Batch normalization is folded into the layers (`stacked_mlps.py`).
+this network's last layer. Batch normalization is folded into the layers (`stacked_mlps.py`).
 
-With dueling, N quantiles and n actions take N (n + 1) outputs: for each quantile the value of the state, then n advantages.
-Without dueling there are N n outputs, the quantiles themselves.
+With dueling, N quantiles and n actions need N (n + 1) outputs: for each quantile, the value of the state, then n advantages.
+Without dueling, there are N n outputs: the quantiles themselves.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ from millrace.protocol.specs import PolicySpec
 
 
 class QuantileQNetwork:
-    """N quantiles of the return of each of n actions."""
+    """A network that computes N quantiles of the return for each of n actions."""
 
     def __init__(self, policy: PolicySpec, quantiles: int, normalized: Normalized, device: str, seed: int) -> None:
-        """`policy` is the policy with which workers act. The initial parameters depend on `seed`."""
+        """`policy` is the policy that workers act with. The initial parameters depend on `seed`."""
         keep_freed_memory()  # each loss allocates and frees arrays of half a megabyte
         actions = policy.action.sizes[0]
         self._quantiles = quantiles
@@ -42,7 +42,7 @@ class QuantileQNetwork:
         parts = [initial_fields(encoder, generator), initial(shape, generator)]
         sizes = [len(part) for part in parts]
         self.flat = torch.cat(parts).to(device)
-        """[P] float32: all parameters, those of the encoder first"""
+        """[P] float32: all parameters, the encoder's first"""
         self.flat_grad = torch.zeros_like(self.flat)
         self.flat.grad = self.flat_grad
         self._encoder, layers = torch.split(self.flat, sizes)
@@ -57,7 +57,7 @@ class QuantileQNetwork:
         return self._by_action(self.body.trained(self.encode(x, images)))
 
     def of_minibatch(self, x: Tensor, images: Sequence[Tensor]) -> Tensor:
-        """Like `trained`, but without a gradient, and without moving the running statistics: for targets."""
+        """Like `trained`, but for targets: without a gradient, and without moving the running statistics."""
         return self._by_action(self.body.of_minibatch(self.encode(x, images)))
 
     def params(self, x: Tensor, images: Sequence[Tensor] = ()) -> Tensor:
@@ -65,7 +65,7 @@ class QuantileQNetwork:
         return self.head(self.encode(x, images))
 
     def head(self, h: Tensor) -> Tensor:
-        """Action values [B, n], the means of quantiles, for outputs h [B, H] of the encoder. Uses the running statistics."""
+        """Action values [B, n], the means of quantiles, for the encoder's outputs h [B, H]. Uses the running statistics."""
         return self._by_action(self.body.evaluated(h)).mean(1)
 
     def _by_action(self, outputs: Tensor) -> Tensor:
@@ -74,7 +74,7 @@ class QuantileQNetwork:
         return QNetwork.action_values(advantage, *value)
 
     def acting_parameters(self) -> Floats:
-        """A copy of the parameters [P′] with which workers act: those of a `QNetwork` with the same action values."""
+        """A copy of the parameters [P′] that workers act with: those of a `QNetwork` with the same action values."""
         layers = self.body.folded()
         *hidden, weight, bias = named_views(layers, self.body.shape.folded().fields()).values()
         last = [of_outputs.reshape(self._quantiles, self._outputs, -1).mean(0) for of_outputs in (weight, bias)]

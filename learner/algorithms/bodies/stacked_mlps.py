@@ -1,9 +1,9 @@
-"""MLPs of one shape, with or without batch normalization (Ioffe and Szegedy 2015), and how they fold into plain MLPs.
+"""MLPs with the same shape, with or without batch normalization (Ioffe and Szegedy 2015), and how they fold into plain MLPs.
 
 Rule: a training pass normalizes by the mean and variance of its own minibatch, and moves the running statistics towards
-them. A pass that doesn't train these MLPs, such as one that acts, uses the running statistics (except for targets, see
-`of_minibatch`). Batch normalization is then linear, so it is folded into the linear layers: workers act with a plain MLP,
-and need neither statistics nor PyTorch.
+these. A pass that doesn't train these MLPs, such as one that computes actions, uses the running statistics. (Targets are an
+exception, see `of_minibatch`.) Batch normalization is then linear, so it is folded into the linear layers. Workers therefore
+act with a plain MLP, and need neither statistics nor PyTorch.
 
 With `Normalized.BEFORE`, an MLP begins with batch normalization (BN), continues with a linear layer, BN and an activation
 for each hidden layer, and ends with a linear layer (XQC, Palenicek et al. 2025). With `Normalized.AFTER`, there is a BN in
@@ -47,7 +47,7 @@ class MLPShape(NamedTuple):
     unit_rows: bool = False
     """whether the weights of each unit are kept at norm 1 (weight normalization)"""
     output_gain: float = 1.0
-    """the gain of the orthogonal initialization of the last layer; the other layers have √2"""
+    """the gain of the orthogonal initialization of the last layer; it is √2 for the other layers"""
 
     def fields(self) -> list[Field]:
         """The fields of the parameters in the flat tensor, [K, …] each."""
@@ -97,10 +97,10 @@ def initial_statistics(shape: MLPShape) -> Tensor:
 
 
 class StackedMLPs:
-    """K MLPs of one shape. The caller owns their flat tensors: parameters [P] and running statistics [S]."""
+    """K MLPs with the same shape. The caller owns their flat tensors: parameters [P] and running statistics [S]."""
 
     def __init__(self, shape: MLPShape, parameters: Tensor, statistics: Tensor) -> None:
-        """`parameters` is a leaf of the graph. `statistics` (see `initial_statistics`) are changed in place."""
+        """`parameters` is a leaf of autograd's graph. `statistics` (see `initial_statistics`) are changed in place."""
         self.shape = shape
         self._fields = shape.fields()
         self._folded_fields = shape.folded().fields()
@@ -133,7 +133,7 @@ class StackedMLPs:
 
     @torch.no_grad()
     def folded(self) -> Tensor:
-        """Parameters [P′] of plain MLPs with the same outputs as `evaluated`: weights and biases by layer, [K, …] each."""
+        """Parameters [P′] of plain MLPs that give the outputs of `evaluated`: weights and biases by layer, [K, …] each."""
         if not self._normalizes:
             return self._constant
         flat = self._constant.new_zeros(total_size(self._folded_fields))
@@ -162,7 +162,7 @@ class StackedMLPs:
 
     @torch.no_grad()
     def project(self) -> None:
-        """With `unit_rows`: scale the weights of each unit to norm 1. Called after each step of an optimizer."""
+        """With `unit_rows`, scale the weights of each unit to norm 1. Called after each optimizer step."""
         if self.shape.unit_rows:
             for name, view in named_views(self._constant, self._fields).items():
                 if name.endswith("weight"):

@@ -1,1 +1,1 @@
-"""Fast updates of small networks. A whole pass is one node of autograd's graph, and an optimizer step is one call."""
+"""Fast updates for small networks. A whole pass is one node of autograd's graph, and an optimizer step is one call."""

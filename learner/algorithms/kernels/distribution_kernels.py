@@ -1,7 +1,7 @@
-"""Action distributions of small networks, in numpy: log-probabilities, entropies and samples from an actor's outputs.
+"""Action distributions for small networks, in numpy: log-probabilities, entropies and samples from an actor's outputs.
 
 Rule: results and gradients equal those of `millrace.protocol.policy.torch_distributions` and autograd, except for rounding.
-The kernels save 0.1 ms per minibatch of 64 rows, for which autograd would need a dozen nodes. The P parameters of a
+The kernels save 0.1 ms per minibatch of 64 rows, because autograd would need a dozen nodes. The P parameters of a
 distribution are arrays [P, B], with a column for each of B rows. `forward` stores the intermediate results that `backward`
 needs.
 """
@@ -32,7 +32,7 @@ class EvaluatedActions:
     def forward(self, outputs: Sequence[Array], action: Array, mask: Bools | None) -> tuple[Array, ...]:
         """See `Top`. `action` is [B, *action]; `mask` [B, choices] is True for the choices that are allowed.
 
-        A forbidden choice has probability p = 0. Its gradient in `backward` has the factor p, so it is 0, too.
+        A forbidden choice has probability p = 0. Its gradient in `backward` has the factor p, so the gradient is 0, too.
         """
         params, value = outputs
         if mask is not None:
@@ -186,7 +186,7 @@ class _KernelFactor(NamedTuple):
 def distribution_kernel(spec: ActionSpec, log_std: Array | None, by_log_std: Array | None) -> DistributionKernel:
     """The kernel for this action space.
 
-    For a Box, `log_std` and `by_log_std` are [numbers]; the kernel writes the gradient of `log_std` into `by_log_std`.
+    For a Box, `log_std` and `by_log_std` have shape [numbers]; the kernel writes the gradient of `log_std` to `by_log_std`.
     """
     factors = [_KernelFactor(_CategoricalKernel(), size, 1) for size in spec.sizes]
     if spec.bits:

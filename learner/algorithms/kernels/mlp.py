@@ -4,8 +4,8 @@ Rule: outputs and gradients are those of the formulas below, except for rounding
 only on the number of rows, so the same minibatch gives the same bits.
 
 With a small network, torch spends most of a minibatch's time on its graph, its dispatcher and its allocator, not on
-arithmetic. Here a pass is a few dozen calls on arrays that are reused. A call of `SmallMLP` owns its arrays until its
-backward pass, so one loss may call it several times. A second backward pass, and derivatives of the gradient, are not
+arithmetic. In this module, a pass is a few dozen calls on arrays that are reused. A call to `SmallMLP` owns its arrays until
+its backward pass, so one loss may call it several times. A second backward pass, and derivatives of the gradient, are not
 supported.
 
 Arrays are [S, n, B]: S networks, n units, and one column for each of B rows, so that inner loops are long. Each chunk of
@@ -32,11 +32,11 @@ MLPPass = Callable[[], object]
 
 CHUNK_ROWS = 512  # the largest number of rows in a chunk
 THREADED_PRODUCT_SIZE = 64 * 64 * 128  # torch's threads speed up matrix products of at least this many multiplications
-MAX_PLANS = 256  # limit on the minibatch sizes with plans; sizes vary with the number of valid rows
+MAX_PLANS = 256  # largest number of minibatch sizes that have a plan; sizes vary with the number of valid rows
 
 
 class Linear(NamedTuple):
-    """A layer of the same shape in S networks, and its gradients: views of flat arrays."""
+    """A layer with the same shape in S networks, and its gradients: views of flat arrays."""
 
     weight: Array  # [S, out, in]
     bias: Array  # [S, out, 1]
@@ -60,7 +60,7 @@ class Head(NamedTuple):
 
 
 class Trunks(NamedTuple):
-    """The layers, by name, of networks of the same shape that take the same input."""
+    """The layers, by name, of networks that have the same shape and take the same input."""
 
     hidden: Sequence[Sequence[str]]
     """the hidden layers of each network"""
@@ -69,14 +69,14 @@ class Trunks(NamedTuple):
 
 
 class Top(Protocol):
-    """The function that a call applies to the outputs of the networks, and its derivative."""
+    """The function that a call applies to the networks' outputs, and its derivative."""
 
     def forward(self, outputs: Sequence[Array], *given: Any) -> tuple[Array, ...]:
         """The results, from the outputs [out, B] and the call's other arguments. The next call overwrites `outputs`."""
         ...
 
     def backward(self, by_results: Sequence[Array]) -> Sequence[Array]:
-        """The gradients [out, B] with respect to the outputs of the last call, from those with respect to its results."""
+        """The gradients [out, B] with respect to the last call's outputs, from those with respect to its results."""
         ...
 
 
@@ -93,7 +93,7 @@ class Outputs:
 
 
 class Values:
-    """A `Top` for networks with one output each. Returns their outputs as one array [networks, B]."""
+    """A `Top` for networks that have one output each. Returns all their outputs as one array [networks, B]."""
 
     def forward(self, outputs: Sequence[Array]) -> tuple[Array, ...]:
         """See `Top`."""
@@ -106,12 +106,11 @@ class Values:
 
 
 MakeTop = Callable[[Mapping[str, Array], Mapping[str, Array]], Top]
-"""Makes a top from the parameters and their gradients, by name. The top writes the gradients of the parameters it uses.
-"""
+"""Creates a top from the parameters and their gradients, by name. The top writes the gradients of the parameters it uses."""
 
 
 class SmallMLP:
-    """MLPs of the same shape that take the same features, with linear output layers and a top."""
+    """MLPs that have the same shape and take the same features, with linear output layers and a top."""
 
     def __init__(
         self,
@@ -121,7 +120,7 @@ class SmallMLP:
         relu: bool,
         top: MakeTop = lambda values, gradients: Outputs(),
     ) -> None:
-        """`parameters` is a leaf [P] of autograd's graph, laid out in these fields."""
+        """`parameters` is a leaf [P] of autograd's graph, laid out as `fields` says."""
         self._parameters = parameters
         self._constants = parameters.detach()
         self._fields = fields
@@ -156,13 +155,13 @@ class SmallMLP:
 
 
 class _Pass(torch.autograd.Function):
-    """A call of `SmallMLP`."""
+    """One call to `SmallMLP`."""
 
     @staticmethod
     def forward(ctx: Any, mlp: SmallMLP, x: Tensor, parameters: Tensor, *given: Tensor | None) -> tuple[Tensor, ...]:
         ctx.mlp = mlp
         ctx.kept = mlp.take()
-        ctx.save_for_backward(parameters)  # so that torch raises if an optimizer step changes them before the backward pass
+        ctx.save_for_backward(parameters)  # makes torch raise if an optimizer step changes them before the backward pass
         outputs: tuple[Tensor, ...] = ctx.kept.forward(x, given)
         return outputs
 
@@ -197,7 +196,7 @@ def taken_once(ctx: Any) -> Any:
 
 
 class _Workspace:
-    """The arrays, which only one call at a time uses, and the plans for all minibatch sizes so far.
+    """The arrays for one call at a time, and the plans for all minibatch sizes so far.
 
     All plans share these arrays: each plan takes the same arrays in the same order.
     """
@@ -236,7 +235,7 @@ class _Workspace:
     def backward(
         self, by_results: Sequence[Tensor], wants_x: bool, wants_parameters: bool
     ) -> tuple[Tensor | None, Tensor | None]:
-        """The gradients with respect to x and all parameters, from those with respect to the results; None if not wanted."""
+        """The gradients with respect to x and all parameters, from those with respect to the results; None if unwanted."""
         by_heads = self._top.backward([by_result.numpy() for by_result in by_results])
         by_x = self.by_input(by_heads) if wants_x else None
         return by_x, self.by_parameters(by_heads) if wants_parameters else None
@@ -252,7 +251,7 @@ class _Workspace:
         return self._gradient.clone()
 
     def by_input(self, by_heads: Sequence[Array]) -> Tensor:
-        """∂L/∂x [B, D]. There must be a hidden layer. For the argument, see `by_parameters`."""
+        """∂L/∂x [B, D]. There must be a hidden layer. For `by_heads`, see `by_parameters`."""
         self._place(by_heads)
         for chunk in self._plan.chunks:
             for call in chunk.heads_to_input + chunk.hidden_to_input:
@@ -272,9 +271,9 @@ class _Workspace:
         if number == len(self._arrays):
             self._arrays.append(np.empty(0, self._gradient.numpy().dtype))
         if self._arrays[number].size < size:
-            # Let torch allocate the array, because it aligns all arrays in the same way. With another alignment, its matrix
-            # products could give other bits. The size is a power of two, so that a slightly larger minibatch needs no new
-            # array.
+            # Let torch allocate the array, because torch aligns all arrays in the same way. With another alignment, its
+            # matrix products could give different bits. The size is a power of two, so that a slightly larger minibatch
+            # needs no new array.
             room = 1 << (size - 1).bit_length()
             self._arrays[number] = torch.zeros(room, dtype=self._gradient.dtype).numpy()
         return self._arrays[number][:size].reshape(shape)
@@ -298,7 +297,7 @@ class _MinibatchPlan:
         self.gather: list[MLPPass] = []
         trunk = [self._for_each(layer, count) for layer in hidden]
         head_layers = [self._for_each(head.layer, count) for head in heads]
-        # All chunks share these arrays, so the arrays stay in the cache.
+        # All chunks share these arrays, so that the arrays stay in the cache.
         gradients = [workspace.outputs(layer, -(-rows // count)) for layer in hidden]
         self.chunks: list[_Chunk] = []
         for i in range(count):
@@ -311,7 +310,7 @@ class _MinibatchPlan:
             self.chunks.append(chunk)
 
     def _for_each(self, layer: Linear, count: int) -> list[Linear]:
-        """Copies of a layer, one for each chunk, that share its weights but have gradient arrays of their own."""
+        """Copies of a layer, one for each chunk. They share its weights but have gradient arrays of their own."""
         if count == 1:
             return [layer]
         weight, bias = (self._workspace.take(count, *grad.shape) for grad in (layer.weight_grad, layer.bias_grad))
@@ -321,14 +320,14 @@ class _MinibatchPlan:
 
 
 class _Chunk:
-    """A range of rows of a minibatch, and the calls of its forward and backward passes, in order."""
+    """A range of rows in a minibatch, and the calls of its forward and backward passes, in order."""
 
     def __init__(self, rows: slice, first: Linear, workspace: _Workspace) -> None:
         self.rows = rows
         self._workspace = workspace
         self.x = self._h = workspace.take(1, first.weight.shape[2], rows.stop - rows.start)
         self._dh: Array | None = None  # ∂L/∂output of the last hidden layers
-        self._networks_with_gradient: set[int] = set()  # networks whose part of `_dh` a head has written
+        self._networks_with_gradient: set[int] = set()  # networks whose part of `_dh` a head already writes
         self._ones = np.ones(rows.stop - rows.start, first.weight.dtype)
         self.forward: list[MLPPass] = []
         self.back_from_heads: list[MLPPass] = []
@@ -401,7 +400,7 @@ def _activation_gradient(dy: Array, y: Array, relu: bool) -> MLPPass:
 def uses_torch(multiplications: int) -> bool:
     """Whether torch computes matrix products of this size: only if it has several threads and the product is large enough.
 
-    With one thread, numpy is as fast as torch on Intel's processors and a tenth faster on AMD's.
+    With one thread, numpy is as fast as torch on Intel processors, and a tenth faster on AMD processors.
     """
     return torch.get_num_threads() > 1 and multiplications >= THREADED_PRODUCT_SIZE
 

@@ -1,19 +1,19 @@
 """A step of torch's Adam, AdamW or RMSprop on one flat tensor, without the overhead of `Optimizer.step`.
 
-Rule: it uses the same kernels on the same state, so it gives the same bits as `Optimizer.step`, with one exception: denormal
+Rule: this step uses the same kernels on the same state as `Optimizer.step`, so it gives the same bits, except that denormal
 numbers count as zero during the step. The state belongs to the optimizer, which saves and loads it.
 
 For a small network, the overhead of `Optimizer.step` takes longer than the kernel. In addition, torch imports its compiler
-when an optimizer is made and when its first `step` is called, only to exclude the optimizer's methods from compilation. The
-import takes 0.8 s and 70 MB, which a learner that compiles nothing can save.
+when an optimizer is created and when its first `step` is called, only to exclude the optimizer's methods from compilation.
+The import takes 0.8 s and 70 MB, which a learner that compiles nothing can save.
 
-Denormal numbers are set to zero because they are slow: if parameters no longer get a gradient, for example behind a dead
+Denormal numbers are set to zero because they are slow. If parameters no longer get a gradient, for example behind a dead
 ReLU, their moments decay to denormal numbers within 800 steps and stay there. A step on a CPU then takes twelve times as
 long.
 
-This file uses private parts of torch: `torch._fused_adam_`, `torch._fused_adamw_`, `__dynamo_disable`. If the installed
-version of torch lacks such a function, or if the function accepts other arguments or does something else, `Optimizer.step`
-is called instead.
+This module uses private parts of torch: `torch._fused_adam_`, `torch._fused_adamw_`, `__dynamo_disable`. If the installed
+version of torch lacks one of these functions, or if the function accepts other arguments or does something else,
+`Optimizer.step` is called instead.
 """
 
 from __future__ import annotations
@@ -34,10 +34,11 @@ Kernel = Callable[..., Any]
 
 
 def make_optimizer(kind: str, flat: Tensor, **settings: Any) -> Optimizer:
-    """Make an Adam, AdamW or RMSprop optimizer for one flat tensor that has a gradient. Each update sets the learning rate.
+    """Create an Adam, AdamW or RMSprop optimizer for one flat tensor that has a gradient.
 
+    Each update sets the learning rate.
     Adam has β 0.9 and 0.999, and ε 1e-8 outside the square root; AdamW also decays weights by 0.01; RMSprop has α 0.99.
-    `settings` are arguments of torch's optimizer that override these, such as `eps` and `amsgrad`.
+    `settings`, such as `eps` and `amsgrad`, are arguments for torch's optimizer that override these values.
     """
     avoid_compiler_import()
     match kind:
@@ -48,11 +49,11 @@ def make_optimizer(kind: str, flat: Tensor, **settings: Any) -> Optimizer:
 
 
 def avoid_compiler_import() -> None:
-    """Make it possible to make, save and load optimizers without importing torch's compiler.
+    """Make it possible to create, save and load optimizers without importing torch's compiler.
 
     torch wraps some methods of `Optimizer`. The wrapper asks the compiler for a version of the method that is excluded from
-    compilation, and stores this version in an attribute. This function stores the method itself there, so that the wrapper
-    does not ask. If torch does not wrap these methods in this way, nothing changes.
+    compilation, and stores this version in an attribute. This function stores the method itself in the attribute, so that
+    the wrapper does not ask. If torch does not wrap these methods in this way, nothing changes.
     """
     for method in (Optimizer.add_param_group, Optimizer.state_dict, Optimizer.load_state_dict, Optimizer.zero_grad):
         wrapped = getattr(method, "__wrapped__", None)
@@ -61,7 +62,7 @@ def avoid_compiler_import() -> None:
 
 
 def take_step(optimizer: Optimizer) -> None:
-    """Like `optimizer.step()`, for Adam, AdamW (both fused) or plain RMSprop of one flat tensor that has a gradient."""
+    """Like `optimizer.step()`, for a fused Adam or AdamW, or a plain RMSprop, on one flat tensor that has a gradient."""
     (group,) = optimizer.param_groups
     (flat,) = group["params"]
     step = _step_of(optimizer)
@@ -89,7 +90,7 @@ def state_of(optimizer: Optimizer) -> dict[str, Any]:
 
 
 def load_state(optimizer: Optimizer, state: dict[str, Any]) -> None:
-    """Load a copy of a state. Raises ValueError if it belongs to another kind of optimizer or to another network."""
+    """Load a copy of `state`. Raises ValueError if it belongs to another kind of optimizer or to another network."""
     (own_group,) = optimizer.param_groups
     optimizer.load_state_dict(copy.deepcopy(state))
     (group,) = optimizer.param_groups
@@ -119,7 +120,7 @@ def _step_of(optimizer: Optimizer) -> Callable[[Tensor, dict[str, Any], Optimize
 
 
 def _adam_step(name: str, decayed_parameter: float) -> Callable[[Tensor, dict[str, Any], OptimizerState], None] | None:
-    """The Adam step that uses this private function of torch; None if torch lacks it, or if it works in another way."""
+    """The Adam step that uses this private torch function; None if torch lacks it, or if it does something else."""
     kernel = getattr(torch, name, None)
     return partial(_adam, kernel) if kernel is not None and _is_adam(kernel, decayed_parameter) else None
 

@@ -1,4 +1,4 @@
-"""The networks that the learner trains. A small one on the CPU computes in numpy, as one node of autograd's graph.
+"""The networks that the learner trains. On the CPU, a small network computes in numpy, as one node of autograd's graph.
 
 Rule: whether numpy or torch computes a pass depends only on the network's shape and device. Both give the same numbers,
 except for rounding, so a loss need not know which one is used.
@@ -22,7 +22,7 @@ from millrace.protocol.policy.layout import CRITICS, hidden_names
 from millrace.protocol.policy.networks import ActorAndCritics, ActorCriticNetwork, QNetwork
 from millrace.protocol.specs import PolicySpec
 
-MAX_UNITS = 256  # units per layer; with more, matrix products take nearly all the time (`benchmarks.update`)
+MAX_UNITS = 256  # units per layer; with more units, matrix products take nearly all the time (`benchmarks.update`)
 
 
 def is_small(spec: PolicySpec, device: str) -> bool:
@@ -33,7 +33,7 @@ def is_small(spec: PolicySpec, device: str) -> bool:
 
 
 def actor_critic_network(spec: PolicySpec, device: str, seed: int) -> ActorCriticNetwork:
-    """Make the network of an actor and a critic: the small kind if it is small enough."""
+    """Create the network of an actor and a critic: the small kind if it is small enough."""
     return (SmallActorCritic if is_small(spec, device) else ActorCriticNetwork)(spec, device, seed=seed)
 
 
@@ -55,23 +55,23 @@ class ActionValueNetwork(Protocol):
         ...
 
     def acting_parameters(self) -> Floats:
-        """A copy of the parameters [P′] with which workers act."""
+        """A copy of the parameters [P′] that workers act with."""
         ...
 
 
 def q_network(spec: PolicySpec, device: str, seed: int) -> QNetwork:
-    """Make the network of action values: the small kind if it is small enough."""
+    """Create the network of action values: the small kind if it is small enough."""
     return (SmallQNetwork if is_small(spec, device) else QNetwork)(spec, device, seed=seed)
 
 
 def actor_and_critics(spec: PolicySpec, device: str, seed: int) -> ActorAndCritics:
-    """Make the networks of an actor and two critics: the small kind if they are small enough."""
+    """Create the networks of an actor and two critics: the small kind if they are small enough."""
     small = is_small(spec, device) and len(spec.net) > 0  # the derivative with respect to the action needs a hidden layer
     return (SmallActorAndCritics if small else ActorAndCritics)(spec, device, seed=seed)
 
 
 class SmallActorCritic(ActorCriticNetwork):
-    """A small actor and critic. One pass computes both, and the action distribution on top."""
+    """A small actor and critic. One pass computes both, and then the action distribution."""
 
     def __init__(self, spec: PolicySpec, device: str = "cpu", *, seed: int = 0) -> None:
         super().__init__(spec, device, seed=seed)

@@ -1,8 +1,8 @@
-"""The base of SAC and TD3: an actor with critics, uniform actions at first, and an exact replay ratio.
+"""The base class of SAC and TD3: an actor with critics, uniform actions at first, and an exact replay ratio.
 
-Rule: after each update, ⌊updates_per_step × (env steps used − learning_starts)⌋ gradient steps have been taken in all,
+Rule: after each update, a total of ⌊updates_per_step × (env steps used − learning_starts)⌋ gradient steps have been taken,
 whatever the size of the rollouts and the number and speed of the workers. If a resumed run changes `updates_per_step` or
-`learning_starts`, the counts of env steps and gradient steps restart when it resumes.
+`learning_starts`, these counts of env steps and gradient steps start anew when the run resumes.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class Networks(Protocol):
         ...
 
     def acting_parameters(self) -> Floats:
-        """A copy of the parameters [P] with which workers act."""
+        """A copy of the parameters [P] that workers act with."""
         ...
 
 
@@ -111,26 +111,26 @@ class Continuous(OffPolicy):
         self._generator = torch.Generator().manual_seed(torch_seed(seed, Purpose.NOISE))
         self._counted = {"updates_per_step": config.updates_per_step, "env_steps": config.learning_starts, "made": 0}
         self._learning_starts = config.learning_starts
-        self._acts_at_once = False  # True if the policy was trained before; then there is no warm-up of uniform actions
+        self._acts_at_once = False  # True if the policy is already trained, so no warm-up of uniform actions is needed
         self.tensors = {"parameters": self.net.flat, "target": self.target.flat}
         trained = {"actor_optimizer": self.net.actor, "critic_optimizer": self.net.critics}
         self.optimizers = {name: make_optimizer("adam", part, **self.ADAM) for name, part in trained.items()}
 
     def networks(self, device: str) -> Networks:
-        """Make new networks, the same at each call. Called once for the trained networks, and once for their targets."""
+        """Create networks, the same ones at each call. Called once for the trained networks, and once for their targets."""
         return actor_and_critics(self.policy, device, self.seed)
 
     def after_step(self, name: str) -> None:
         """Enforce the algorithm's constraints on weights. Called after each step of NAME_optimizer, including in cloning."""
 
     def begin_with_actor(self) -> None:
-        """Act with the actor from the first env step, because it is already trained. Copies it to its target."""
+        """Act with the actor from the first env step, because it is already trained. Copies the actor to its target."""
         self.target.actor.copy_(self.net.actor)
         self._acts_at_once = True
 
     def steps_due(self) -> int:
         """The number of gradient steps that the replay ratio demands now."""
-        ratio = Fraction(repr(self.config.updates_per_step))  # the decimal number as written, so that 0.29 × 100 is 29
+        ratio = Fraction(repr(self.config.updates_per_step))  # exact, so that 0.29 × 100 is 29
         steps = math.floor(ratio * max(0, self.env_steps - self._counted["env_steps"]))
         return max(0, int(self._counted["made"]) + steps - (self.gradient_steps - self.prior_gradient_steps))
 
@@ -182,8 +182,8 @@ class Continuous(OffPolicy):
     def exploration(self) -> list[float]:
         """The exploration settings, which follow the statistics in the policy's buffers.
 
-        The last number of the buffers is not one of them. It says whether to draw uniform actions: it is 1 during the
-        warm-up.
+        The last number in the buffers is not one of these settings. It says whether to draw uniform actions: it is 1 during
+        the warm-up.
         """
         return []
 

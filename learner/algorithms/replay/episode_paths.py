@@ -1,8 +1,8 @@
 """Paths: which stored observations follow one another in an episode, so that a later one is found in constant time.
 
-Law: the paths are a function of the stored rows, and aren't part of a saved state: `rebuilt` computes them from the rows. A
-path is the list of the slots of an episode's observations, oldest first. The ring overwrites the oldest slot first, so a
-path loses its beginning before its end, and all observations that follow a stored row are stored.
+Law: the paths are a function of the stored rows, so they aren't part of a saved state: `rebuilt` computes them from the
+rows. A path lists the slots of an episode's observations, oldest first. The ring overwrites the oldest slot first, so a path
+loses its beginning before its end, and all observations that follow a stored row are stored.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class EpisodePaths:
 
     @staticmethod
     def memory_bytes(size: int) -> int:
-        """Memory of the paths in a ring of `size` slots, in bytes, without the spare capacity of growing arrays."""
+        """Memory that the paths need in a ring of `size` slots, in bytes, without the spare capacity of growing arrays."""
         return 3 * size * np.dtype(np.int64).itemsize
 
     def overwrite(self, slots: Ints) -> None:

@@ -1,12 +1,12 @@
 """Hindsight experience replay (Andrychowicz et al. 2017): learn from a row as if an outcome reached later were its goal.
 
-Law: a row shows what an action did, whatever the goal was. So when a row is drawn, its goal may be replaced with one that
-was achieved later in its episode, provided that its reward and its end are recomputed for this goal. The learner runs no
-code of the environment: reward and end must be functions of the achieved and the desired goal alone, and the user names
-these functions. Each row that arrives is checked against them.
+Law: a row shows what an action did, whatever the goal was. When a row is drawn, its goal may therefore be replaced with one
+that was achieved later in its episode, provided that the row's reward and end are recomputed for this goal. The learner runs
+no environment code, so reward and end must be functions of only the achieved and the desired goal, and the user names these
+functions. Each row that arrives is checked against them.
 
-As in gymnasium-robotics, reward and end of a row depend on the achieved and the desired goal of its next observation. This
-file is pure.
+As in gymnasium-robotics, a row's reward and end depend on the achieved and the desired goal in its next observation. This
+module is pure.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ EXAMPLE = "sparse:0.05"
 
 
 class GoalReward(Protocol):
-    """A reward function that depends on nothing but two goals."""
+    """A reward function that depends only on two goals."""
 
     def __call__(self, achieved: Doubles, desired: Doubles, /) -> Array:
-        """The rewards [B] of rows that led to the goals `achieved` [B, G] while the goals `desired` [B, G] applied."""
+        """The rewards [B] for rows that achieved the goals `achieved` [B, G] while the goals were `desired` [B, G]."""
         ...
 
 
@@ -51,7 +51,7 @@ class Goals(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """The rewards and ends of steps under some goals."""
+    """The rewards and ends of some steps under other goals."""
 
     reward: Floats
     """[K]"""
@@ -60,13 +60,13 @@ class Outcome(NamedTuple):
 
 
 def distance(achieved: Doubles, desired: Doubles) -> Doubles:
-    """The Euclidean distances [B] of goals [B, G]."""
+    """The Euclidean distances [B] between goals [B, G]."""
     apart: Doubles = np.linalg.norm(achieved - desired, axis=-1)
     return apart
 
 
 def minus_distance(achieved: Doubles, desired: Doubles) -> Doubles:
-    """The reward function for which the name `dense` stands."""
+    """The reward function that the name `dense` stands for."""
     return -distance(achieved, desired)
 
 
@@ -104,7 +104,7 @@ def goal_reward(name: str) -> GoalReward:
 
 
 def goals_of(observation: Sequence[Leaf]) -> tuple[int, int] | None:
-    """The indices of the leaves with the achieved and desired goals; None unless both exist, with equal shape and dtype."""
+    """The indices of the leaves with the achieved and desired goals; None unless both exist and share shape and dtype."""
     paths = [leaf.path for leaf in observation]
     if ACHIEVED not in paths or DESIRED not in paths:
         return None
@@ -126,10 +126,10 @@ def goals_not_used(config: AlgorithmConfig, observation: Sequence[Leaf], env: st
 
 @dataclass(frozen=True)
 class Hindsight:
-    """The settings of hindsight: how many rows of a sample get another goal, and how their outcome under it is computed."""
+    """The settings of hindsight: how many rows in a sample get another goal, and how their outcome is then computed."""
 
     share: float
-    """the fraction of the rows of a sample that get another goal"""
+    """the fraction of the rows in a sample that get another goal"""
     achieved: int
     """the leaf of the observation that holds the achieved goal"""
     desired: int
@@ -138,7 +138,7 @@ class Hindsight:
     """the name of the reward function in the settings"""
     reward_of: GoalReward
     ends_within: float | None
-    """the distance from the goal at which the episode terminates; None if the episode doesn't terminate at its goal"""
+    """the distance from the goal at which the episode terminates; None if reaching the goal doesn't end it"""
     roundoff: float
     """the largest relative rounding error of a goal's numbers in observations"""
 
@@ -181,8 +181,8 @@ class Hindsight:
     def outcome(self, achieved: Array, desired: Array, terminated: Bools, goal: Array) -> Outcome:
         """Rewards and terminations [K] of steps whose goals are replaced by `goal` [K, *goal].
 
-        The steps reached `achieved`; their original goals were `desired`; `terminated` [K] says which of them terminated
-        their episode. Terminations that reaching the original goal caused are dropped; others are kept.
+        The steps reached `achieved`, their original goals were `desired`, and `terminated` [K] says which of them terminated
+        their episode. A termination is dropped if reaching the original goal caused it; otherwise, it is kept.
         """
         led_to = _flat(achieved)
         wanted = _flat(goal)
@@ -211,10 +211,11 @@ class Hindsight:
     def check(self, batch: Batch) -> None:
         """Raise `UsageError`, with a one-line message, unless rewards and ends of all valid rows agree with their goals.
 
-        Goals may have been rounded after the reward was computed, and the reward was rounded to float32. So the reward is
-        computed for three pairs of goals: for the pair as it arrived, and for the two pairs that are as near together and as
-        far apart as the goals may have been before rounding. A row is right if its reward lies between the lowest and the
-        highest of the three. If the reward is a function of the distance between the goals, these bounds are exact.
+        Goals may have been rounded after the reward was computed, and the reward was rounded to float32. The reward is
+        therefore computed for three pairs of goals: for the pair as it arrived, and for the pairs that are as close together
+        and as far apart as the goals may have been before rounding. A row is right if its reward lies between the lowest and
+        the highest of these three rewards. If the reward is a function of the distance between the goals, these bounds are
+        exact.
         """
         valid = batch.valid
         achieved = _flat(batch.obs[self.achieved][1:][valid])
@@ -245,8 +246,8 @@ class Hindsight:
     def _check_ends(self, batch: Batch, terminated: Bools, achieved: Doubles, desired: Doubles, far: Doubles) -> None:
         """Raise `UsageError` unless episodes terminate at their goal if and only if `goal_ends` says so.
 
-        Episodes may terminate elsewhere, too. So they count as terminating at their goal only if this is true of all rows
-        whose rewards say that the goal is reached.
+        Episodes may terminate elsewhere, too. Therefore, they count as terminating at their goal only if all rows whose
+        rewards say that the goal is reached terminate.
         """
         ends_within = -1.0 if self.ends_within is None else self.ends_within
         given = "goal_ends none" if self.ends_within is None else f"goal_ends {ends_within:g}"
@@ -269,9 +270,9 @@ class Hindsight:
                 )
 
     def _moved(self, achieved: Doubles, desired: Doubles) -> tuple[Doubles, Doubles]:
-        """The achieved goals moved as near to the desired ones, and as far from them, as they may have been before rounding.
+        """The achieved goals, moved as near to the desired ones and as far from them as they may have been before rounding.
 
-        Each number of a goal was rounded once, and a norm of G numbers has a relative error of G/2 + 2 roundoffs.
+        Each number in a goal was rounded once, and a norm of G numbers has a relative error of G/2 + 2 roundoffs.
         """
         apart = achieved - desired
         most = (achieved.shape[1] / 2 + 3) * self.roundoff * (abs(achieved) + abs(desired))

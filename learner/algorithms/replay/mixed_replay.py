@@ -22,7 +22,7 @@ PRIOR_SLOT = -1  # stands for every prior transition in `Sample.slots`
 
 
 def check_dataset_fits_memory(content: Content) -> None:
-    """Raise `UsageError` if a dataset of this size does not fit into the free memory. Checkpoints make no copy of it."""
+    """Raise `UsageError` if a dataset of this size does not fit into the free memory. Checkpoints don't copy the dataset."""
     needed = content.bytes
     free = available_bytes()
     if free is not None and needed > free:
@@ -40,7 +40,7 @@ class PriorTransitions(ReplayBuffer):
 
 
 class MixedReplay(ReplayBuffer):
-    """The run's own transitions, and prior ones if there are any. In a sample, the prior transitions come last."""
+    """The run's own transitions, and prior transitions if there are any. In a sample, the prior transitions come last."""
 
     prior: ReplayBuffer | None = None
     _prior_share = 0.0
@@ -50,7 +50,7 @@ class MixedReplay(ReplayBuffer):
         """Store prior transitions.
 
         `slots` is the number of their observations, and `share` the fraction of each sample that is prior. Raises
-        `UsageError` if memory is too small, or, with hindsight, if the rewards don't agree with the goals.
+        `UsageError` if there is too little memory, or, with hindsight, if the rewards don't agree with the goals.
         """
         prior = PriorTransitions(
             self._content.observation,
@@ -70,7 +70,7 @@ class MixedReplay(ReplayBuffer):
         self._prior_share = share
 
     def sample(self, count: int, beta: float = 1.0) -> Sample:
-        """Draw transitions with replacement; all are prior until the run has its own. For `beta`, see `ReplayBuffer`."""
+        """Draw transitions with replacement. Until the run has its own, all are prior. For `beta`, see `ReplayBuffer`."""
         if self.prior is None:
             return super().sample(count, beta)
         prior = round(self._prior_share * count) if len(self) else count
@@ -81,7 +81,7 @@ class MixedReplay(ReplayBuffer):
         return parts[0] if len(parts) == 1 else _joined(*parts)
 
     def samples(self, number: int, count: int, beta: float = 1.0) -> Iterator[Sample]:
-        """Yield `number` samples of `count` transitions each. For one of them, see `sample`."""
+        """Yield `number` samples of `count` transitions each. `sample` describes one of them."""
         if self.prior is None:
             return super().samples(number, count, beta)
         return (self.sample(count, beta) for _ in range(number))
@@ -98,13 +98,13 @@ class MixedReplay(ReplayBuffer):
         self._remembered_prior = _generator_state(self.prior)
 
     def roll_back(self) -> None:
-        """Return to the state that was remembered last."""
+        """Return to the state of the last `remember`."""
         super().roll_back()
         if self.prior is not None and self._remembered_prior is not None:
             self.prior.generator.bit_generator.state = self._remembered_prior
 
     def state_dict(self) -> dict[str, Any]:
-        """A copy of the run's own slots in use, and of the random generator that draws prior transitions."""
+        """A copy of the run's own slots in use, and of the state of the generator that draws prior transitions."""
         state = super().state_dict()
         return (
             state
@@ -113,7 +113,7 @@ class MixedReplay(ReplayBuffer):
         )
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from a `state_dict`, bit for bit. Raises ValueError if its size, or that of the prior data, differs."""
+        """Continue from a `state_dict`, bit for bit. Raises ValueError if its size, or the prior data's, differs."""
         had = state.get("prior", {}).get("rows", 0)
         has = 0 if self.prior is None else len(self.prior)
         if had != has:

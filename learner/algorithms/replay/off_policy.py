@@ -1,12 +1,12 @@
-"""The base of the algorithms with a replay buffer: everything about an update except its gradient steps.
+"""The base class of algorithms with a replay buffer: everything about an update except its gradient steps.
 
 DQN derives from it directly; SAC, TD3 and their variants derive from it through `continuous.py`. These algorithms define
-`steps_due`, the number of gradient steps of an update, and `step`, which takes one gradient step, adds 1 to `gradient_steps`
+`steps_due`, the number of gradient steps in an update, and `step`, which takes one gradient step, adds 1 to `gradient_steps`
 and moves the target networks.
 
 The buffer holds raw observations and rewards. They are normalized when they are drawn, with the current statistics. With one
-torch thread on a CPU, the same batches give the same bits, even after `load_state_dict`. This file uses no sockets, no files
-and no clock, and all randomness comes from the seed.
+torch thread on a CPU, the same batches give the same bits, even after `load_state_dict`. This module uses no sockets, no
+files and no clock, and all randomness comes from the seed.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
 
 
 class CriticLoss(NamedTuple):
-    """The loss of the critics, or of the Q-network, on a minibatch."""
+    """The loss of the critics or the Q-network on a minibatch."""
 
     loss: Tensor
     """the loss, a 0-dimensional tensor"""
@@ -92,7 +92,7 @@ class OffPolicy(GradientDescent):
     def steps_due(self) -> int:
         """The number of gradient steps to take in this update.
 
-        The batch of the update is already in the buffer and counted in `env_steps`.
+        The update's batch is already in the buffer and counted in `env_steps`.
         """
 
     @abstractmethod
@@ -127,7 +127,7 @@ class OffPolicy(GradientDescent):
         return metrics
 
     def steps(self, number: int, pulse: Callable[[], None], beta: float = 1.0) -> Iterator[UpdateMetrics]:
-        """Take gradient steps on minibatches of the replay buffer and of prior data, yielding the metrics of each.
+        """Take gradient steps on minibatches from the replay buffer and the prior data, yielding each step's metrics.
 
         For `beta`, see `ReplayBuffer.sample`.
         """
@@ -139,7 +139,7 @@ class OffPolicy(GradientDescent):
             pulse()
 
     def transitions(self, sample: Sample | SequenceSample) -> Transitions:
-        """A sample as tensors on the device of the weights, normalized if the settings say so."""
+        """A sample as tensors on the weights' device, normalized if the settings say so."""
         if isinstance(sample, SequenceSample):
             return self._of_sequences(sample)
         next_x, next_images = self.inputs(sample.next_leaves)
@@ -183,7 +183,7 @@ class OffPolicy(GradientDescent):
         )
 
     def _number(self, array: Array) -> Tensor:
-        """The array as a tensor with the dtype and on the device of the weights."""
+        """The array as a tensor with the weights' dtype, on their device."""
         return self.tensor(array).to(self.net.flat.dtype)
 
     # ---------------------------------------------------------------- prior data
@@ -191,7 +191,7 @@ class OffPolicy(GradientDescent):
     def add_prior(self, prior: PriorData) -> None:
         """Store the rows of a dataset alongside the replay buffer, and add them to all running statistics.
 
-        Raises `UsageError` if the policy has a recurrent core, because a dataset has no states of a core.
+        Raises `UsageError` if the policy has a recurrent core, because a dataset has no core states.
         """
         if isinstance(self.replay, SequenceReplay):
             raise UsageError(f"prior: expected no recurrent core, got {self.policy.core}; take --core none, or no --prior")
@@ -206,7 +206,7 @@ class OffPolicy(GradientDescent):
 
     def learn_from_prior(self, pulse: Callable[[], None]) -> None:
         """Take `prior_steps` gradient steps on prior data alone, except those already taken."""
-        self.set_schedules()  # a state that was loaded may have changed the learning rate
+        self.set_schedules()  # loading a state may have changed the learning rate
         for _ in self.steps(self.config.prior_steps - self.prior_gradient_steps, pulse):
             self.prior_gradient_steps += 1
 
@@ -233,11 +233,11 @@ class OffPolicy(GradientDescent):
         self.replay.load_state_dict(state["replay"])
 
     def remember(self) -> None:
-        """Remember the current state, for `roll_back`. The replay buffer copies a slot only when it is about to write it."""
+        """Remember the current state, for `roll_back`. The replay buffer copies a slot only before it writes to the slot."""
         self._remembered = super().state_dict()
         self.replay.remember()
 
     def roll_back(self) -> None:
-        """Return to the state that was remembered last."""
+        """Return to the state of the last `remember`."""
         super().load_state_dict(self._remembered)
         self.replay.roll_back()

@@ -1,6 +1,6 @@
 """Random shifts of images (Kostrikov et al. 2021, DrQ), which keep critics from memorizing the images in the buffer.
 
-Rule: each image of a minibatch is moved by a random number of whole pixels in each direction, up to a limit, and its border
+Rule: each image in a minibatch is moved by a random number of whole pixels along each axis, up to a limit, and its border
 pixels are repeated. All channels move together, so the motion between the frames of a stack is preserved.
 """
 
@@ -11,7 +11,7 @@ from torch import Tensor
 
 
 def random_shift(images: Tensor, most: int, *, channels_last: bool, generator: torch.Generator) -> Tensor:
-    """Images [B, H, W, C] or [B, C, H, W] of any dtype, each moved by -most to most pixels along both axes."""
+    """Images [B, H, W, C] or [B, C, H, W] of any dtype, each moved by -most to most pixels along each axis."""
     if not most:
         return images
     pixels = images if channels_last else images.movedim(1, 3)

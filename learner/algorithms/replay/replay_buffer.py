@@ -1,20 +1,21 @@
 """The replay buffer: stores rows, and draws n-step transitions, uniformly or by priority.
 
-It is a ring of preallocated numpy arrays. A slot holds a raw observation. If a valid row begins with this observation, the
-slot also holds the rest of the row: action, reward, whether it terminated, and the slot of the next observation. So each
-observation is stored once (or each frame of a frame stack, see `shared_channels.py`). When a transition is drawn, its n-step
-return is computed by following the rows from slot to slot. A slot without a row holds the final observation of a truncated
-episode, or the newest observation of an env copy: its row arrives with the copy's next rollout.
+The buffer is a ring of preallocated numpy arrays. A slot holds a raw observation. If a valid row begins with this
+observation, the slot also holds the rest of the row: action, reward, whether it terminated, and the slot of the next
+observation. Each observation is therefore stored once (or each frame of a frame stack, see `shared_channels.py`). When a
+transition is drawn, its n-step return is computed by following the rows from slot to slot. A slot without a row holds the
+final observation of a truncated episode, or the newest observation of an env copy, whose row arrives with the copy's next
+rollout.
 
 Rule: rows that are not valid are never stored. A row's next observation is newer than the row, and the ring overwrites the
-oldest slot first. So the rows that follow a stored row are always stored, too. They are rows of the same seat, however long
-the seat waits between them: while it waits, its observation stays the one to which its last row led, and this is stored only
+oldest slot first, so the rows that follow a stored row are always stored, too. They are rows of the same seat, however long
+the seat waits between them. While it waits, its observation stays the one that its last row led to, which is stored only
 once.
 
 With hindsight (`hindsight.py`), a share of the rows get another goal when they are drawn. In that case, the final
 observation of a terminated episode has a slot, too, because it holds the goal that was achieved last.
 
-This file uses no sockets and no files, and all randomness comes from the seed.
+This module uses no sockets and no files, and all randomness comes from the seed.
 """
 
 from __future__ import annotations
@@ -45,13 +46,13 @@ DISCRETE = ActionSpec("discrete", (), "int64")
 
 
 def row_dtype(action: ActionSpec) -> np.dtype[Any]:
-    """The dtype of a row. It is a single record, so that a row is drawn with a single copy."""
+    """The dtype of a row: a single record, so that a row is drawn with a single copy."""
     fields = [("follows", "i8"), ("reward", "f4"), ("terminated", "?"), ("is_row", "?")]
     return np.dtype([("action", action.stored_dtype, action.shape), *fields], align=True)
 
 
 class Sample(NamedTuple):
-    """B transitions of k steps. k is `n_step`, or less if the episode or the stored rows end sooner."""
+    """B transitions of k steps, where k is `n_step`, or less if the episode or the stored rows end sooner."""
 
     slots: Ints  # [B] the slots of their first rows
     leaves: tuple[Array, ...]  # [B, *leaf] each
@@ -100,9 +101,9 @@ class Content(NamedTuple):
 
 
 def check_fits_memory(content: Content) -> None:
-    """Raise `UsageError` if the memory is too small for the buffer and a copy of it. The error names a size that fits.
+    """Raise `UsageError` if there isn't enough memory for the buffer and a copy of it. The error names a size that fits.
 
-    Writing a checkpoint makes such a copy.
+    Writing a checkpoint needs such a copy.
     """
     size = content.size
     needed = 2 * content.bytes
@@ -127,9 +128,9 @@ class Overwritten(NamedTuple):
 
 
 def _goes_on(ends: EpisodeEnds, continues: Bools) -> Bools:
-    """[T+1, N] True where row t begins with an observation that is stored already, because the previous row led to it.
+    """[T+1, N] True where row t begins with an observation that is already stored, because the previous row led to it.
 
-    `continues` [N] says this for row 0. With seats, rows that are not valid may stand between a row and the previous one.
+    `continues` [N] says this for row 0. With seats, rows that are not valid may lie between a row and the previous one.
     """
     goes_on = np.concatenate([continues[None], ends.valid & ~ends.ended])
     if ends.with_seats:
@@ -158,7 +159,7 @@ class ReplayBuffer(Rewinding[Overwritten]):
     ) -> None:
         """`size` is in slots. Transitions are drawn in proportion to |error|^alpha, or uniformly if `alpha` is None.
 
-        Raises `UsageError` if memory is too small.
+        Raises `UsageError` if there is too little memory.
         """
         self._content = Content(observation, size, alpha is not None, action, linked=hindsight is not None)
         self.size = size  # number of slots
@@ -214,7 +215,7 @@ class ReplayBuffer(Rewinding[Overwritten]):
             self._make_mask(batch.mask.shape[-1])
         if not self._written:
             self._share_channels([leaf[:, 0] for leaf in batch.obs])
-        for at in range(0, len(batch.lane), batch.columns_per_rollout):  # rollouts of a lane are in order of collection
+        for at in range(0, len(batch.lane), batch.columns_per_rollout):  # a lane's rollouts are in order of collection
             self._add(batch, slice(at, at + batch.columns_per_rollout), int(batch.lane[at]))
 
     def _add(self, batch: Batch, columns: slice, lane: int) -> None:
@@ -285,15 +286,15 @@ class ReplayBuffer(Rewinding[Overwritten]):
         return SharedChannels(self.size, leaf) if shared else np.zeros((self.size, *leaf.shape), leaf.dtype)
 
     def _per_observation(self) -> tuple[Array | SharedChannels, ...]:
-        """The arrays with one entry for each stored observation: its leaves, and its mask if there are masks."""
+        """The arrays with one entry for each stored observation: the leaves, and the mask if there are masks."""
         return self._obs if self._mask is None else (*self._obs, self._mask)
 
     def _continues(self, first: Sequence[Array], newest: Ints, room: int) -> Bools:
         """[N] True where a copy's rollout begins with the newest observation that is stored for it.
 
         `newest` [N] is the value of `_written` when that observation was stored, or NO_SLOT. The rollout needs `room` slots.
-        The observations are compared, in case a caller that stacks rollouts itself has left one out. The stored observation
-        must also be so new that adding this rollout does not overwrite it.
+        The observations are compared, because a caller that stacks rollouts itself may have left a rollout out. The stored
+        observation must also be so new that adding this rollout does not overwrite it.
         """
         continues: Bools = (newest != NO_SLOT) & (newest + self.size >= self._written + room)
         for kept, leaf in zip(self._obs, first, strict=True):
@@ -323,7 +324,7 @@ class ReplayBuffer(Rewinding[Overwritten]):
         )
 
     def _other_goals(self, share: float, slots: Ints) -> Goals:
-        """Other goals for a random share of the rows in these slots, each achieved at a later step of the row's episode."""
+        """Other goals for a random share of the rows in these slots. Each was achieved later in the row's episode."""
         assert self._paths is not None
         assert self._hindsight is not None
         rows = np.flatnonzero(self.generator.random(len(slots)) < share)
@@ -338,9 +339,9 @@ class ReplayBuffer(Rewinding[Overwritten]):
         return leaves
 
     def samples(self, number: int, count: int, beta: float = 1.0) -> Iterator[Sample]:
-        """Yield `number` samples of `count` transitions each. Between the samples, nothing but priorities may change.
+        """Yield `number` samples of `count` transitions each. Between the samples, only priorities may change.
 
-        Several small uniform samples are drawn at once, because that is faster.
+        Several small uniform samples are drawn at once, because this is faster.
         """
         at_once = 1 if self.prioritized else max(1, DRAWN_AT_ONCE // (count * self._transition_bytes))
         for first in range(0, number, at_once):
@@ -362,7 +363,7 @@ class ReplayBuffer(Rewinding[Overwritten]):
     def _follow(self, row: Array, goals: Goals | None) -> tuple[Doubles, Doubles, Ints]:
         """Follow each row for up to `n_step` steps. Returns the discounted reward, γᵏ (0 if terminated) and the last slot.
 
-        `row` is a copy. The rows in it that have another goal are changed to their outcome under that goal.
+        `row` is a copy. Rows in it that have another goal get the reward and the end that this goal gives.
         """
         self._set_outcome(row, goals)
         reward = row["reward"].astype(np.float64)
@@ -372,7 +373,7 @@ class ReplayBuffer(Rewinding[Overwritten]):
         for _ in range(self._n_step - 1):
             row = self._row[at]
             self._set_outcome(row, goals)
-            going = row["is_row"] & ~ended  # the other rows stay at the last slot that they reached
+            going = row["is_row"] & ~ended  # the others stay at the last slot that they reached
             reward += np.where(going, discount * row["reward"], 0)
             discount = np.where(going, discount * self._gamma * ~row["terminated"], discount)
             ended |= going & row["terminated"]
@@ -407,7 +408,7 @@ class ReplayBuffer(Rewinding[Overwritten]):
     # ---------------------------------------------------------------- rolling back
 
     def roll_back(self) -> None:
-        """Return to the state that was remembered last."""
+        """Return to the state of the last `remember`."""
         super().roll_back()
         self._find_paths()
 
@@ -419,7 +420,7 @@ class ReplayBuffer(Rewinding[Overwritten]):
             self._tree.set(old.slots, old.weights)
 
     def _find_paths(self) -> None:
-        """Recompute the paths of the stored rows. Called after anything but `add` has changed these rows."""
+        """Recompute the paths of the stored rows. Called after anything other than `add` has changed these rows."""
         if self._paths is not None:
             used = min(self._written, self.size)
             by_age = np.arange(self._written - used, self._written) % self.size
@@ -458,7 +459,7 @@ class ReplayBuffer(Rewinding[Overwritten]):
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from a `state_dict`, bit for bit. Raises ValueError if its size differs from that of this buffer."""
+        """Continue from a `state_dict`, bit for bit. Raises ValueError if its size differs from this buffer's."""
         if state["size"] != self.size:
             raise ValueError(f"replay_size: expected {state['size']}, got {self.size}")
         self._written = state["written"]

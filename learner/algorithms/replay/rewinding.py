@@ -1,7 +1,7 @@
-"""Rolls a replay buffer back to the state before an update, if that update fails, without a copy of the whole buffer.
+"""If an update fails, rolls a replay buffer back to the state before the update, without a copy of the whole buffer.
 
-Rule: once a state is remembered, the buffer saves the content of a slot before it writes to the slot. Rolling back writes
-the saved contents in reverse order, so the oldest content of a slot is written last.
+Rule: once a state is remembered, the buffer saves the content of each slot before it writes to the slot. Rolling back writes
+the saved contents back in reverse order, so the oldest content of a slot is written last.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ KeptT = TypeVar("KeptT")
 
 
 class Remembered(NamedTuple):
-    """The state to which `roll_back` returns a replay buffer, without the content of the slots."""
+    """The state that `roll_back` returns a replay buffer to, without the content of the slots."""
 
     written: int
     rows: int
@@ -27,7 +27,7 @@ class Remembered(NamedTuple):
 
 
 class Rewinding(ABC, Generic[KeptT]):
-    """A replay buffer that can roll back. `KeptT` is the type of the saved contents of some slots."""
+    """A replay buffer that can roll back. `KeptT` is the type of the saved slot contents."""
 
     generator: np.random.Generator
     _written: int
@@ -39,14 +39,14 @@ class Rewinding(ABC, Generic[KeptT]):
     """the contents saved since `remember`, oldest first"""
 
     def remember(self) -> None:
-        """Remember the current state, for `roll_back`. From now on, slots are saved before they are written."""
+        """Remember the current state, for `roll_back`. From then on, slots are saved before they are written."""
         self._overwritten.clear()
         self._remembered = Remembered(
             self._written, self._rows, self._highest, dict(self._newest), self.generator.bit_generator.state
         )
 
     def roll_back(self) -> None:
-        """Return to the state that was remembered last."""
+        """Return to the state of the last `remember`."""
         remembered = self._remembered
         assert remembered is not None, "nothing was remembered"
         self._written = remembered.written

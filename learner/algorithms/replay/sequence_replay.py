@@ -1,15 +1,15 @@
-"""The replay buffer of a policy with memory: stores sequences, and draws each together with its predecessor.
+"""The replay buffer for recurrent policies: stores sequences, and draws each one together with its predecessor.
 
 A sequence is the part of a rollout that belongs to one env copy, or to one seat: T rows, and the state that the recurrent
-core had on the worker before them. That state was computed with older weights. So the previous sequence is passed through
-the core first, from its own stored state and without a gradient, to compute a state with the current weights (stored state
-and burn-in, Kapturowski et al. 2019, R2D2).
+core had on the worker before these rows. This state was computed with older weights. The previous sequence is therefore
+passed through the core first, from its own stored state and without a gradient, to compute a state with the current weights
+(stored state and burn-in, Kapturowski et al. 2019, R2D2).
 
 Rule: each row is in exactly one sequence. Unless replay is prioritized, all sequences are equally likely to be drawn, so all
-rows are used equally often, however long their episodes are. Rows follow the row format (`millrace.protocol.rollout`):
-episodes may end inside a sequence, where the state is reset to zeros, and a row that is not valid passes the state on.
+rows are used equally often, however long their episodes are. Rows follow the row format (`millrace.protocol.rollout`). If an
+episode ends inside a sequence, the state is reset to zeros there, and a row that is not valid passes the state on.
 
-This file uses no files, and all randomness comes from the seed.
+This module uses no files, and all randomness comes from the seed.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from millrace.protocol.specs import PolicySpec
 
 NONE = -1  # stands for "no sequence" where a sequence's number is expected
 FEWEST = 16
-"""The least number of sequences in a sample. Rows of a sequence are alike, so few sequences would give a noisy gradient."""
+"""The smallest number of sequences in a sample. Rows of a sequence are similar, so few sequences give a noisy gradient."""
 HIGHEST_SHARE = 0.9  # weight of the highest error in a priority; the mean error has the rest (Kapturowski et al. 2019)
 
 
@@ -42,8 +42,8 @@ class SequenceSample(NamedTuple):
     """B rows in C sequences of T rows, each preceded by T rows of burn-in. Arrays of steps are in time order."""
 
     slots: Ints  # [B] the slot of the sequence that each row is in
-    leaves: tuple[Array, ...]  # [2 T + 1, C, *leaf] each: T observations of burn-in, then those of the sequence
-    state: Floats  # [C, S] state of the core before the burn-in, or before the sequence if that has no predecessor
+    leaves: tuple[Array, ...]  # [2 T + 1, C, *leaf] each: T observations of burn-in, then the sequence's observations
+    state: Floats  # [C, S] the core's state before the burn-in, or before the sequence if it has no predecessor
     keep_state: Bools  # [2 T + 1, C] False where an episode begins
     advances: Bools  # [2 T + 1, C] False where a row leaves the core's state unchanged
     rows: Ints  # [B] indices of the rows in [T, C], flattened
@@ -79,7 +79,7 @@ class SequenceReplay(Rewinding[ReplacedSequences]):
     ) -> None:
         """Allocate memory for `rows` rows, in sequences of T = `steps` rows. For `alpha`, see `ReplayBuffer`.
 
-        Raises `UsageError` if memory is too small.
+        Raises `UsageError` if there is too little memory.
         """
         self.size = max(1, rows // steps)  # number of slots, each of which holds one sequence
         self._steps = steps
@@ -154,7 +154,7 @@ class SequenceReplay(Rewinding[ReplacedSequences]):
         if batch.mask is not None and "mask" not in self.arrays:
             self._make_mask(batch.mask.shape[-1])
         begins = _begins(batch)
-        for at in range(0, len(batch.lane), N):  # rollouts of a lane are in order of collection
+        for at in range(0, len(batch.lane), N):  # a lane's rollouts are in order of collection
             self._add(batch, begins, slice(at, at + N), int(batch.lane[at]))
 
     def _add(self, batch: Batch, begins: Bools, columns: slice, lane: int) -> None:
@@ -178,7 +178,7 @@ class SequenceReplay(Rewinding[ReplacedSequences]):
         if self._tree is not None and self._alpha is not None:
             self._tree.set(slots, self._highest**self._alpha)
         self._written += len(used)
-        # A seat that waited throughout this rollout gets no sequence of its own; it still continues its previous sequence.
+        # A seat that waited throughout this rollout gets no sequence, and its next rollout continues its previous sequence.
         waits = ~arrays["begins"].any(1)
         newest = np.where(waits, arrays["before"], NONE)
         newest[used] = numbers
@@ -187,7 +187,7 @@ class SequenceReplay(Rewinding[ReplacedSequences]):
     def _before(self, lane: int, fresh: Bools, arrays: dict[str, Array]) -> Ints:
         """[N] the number of the sequence that each column continues; NONE if there is none.
 
-        The observations are compared, in case a caller that stacks rollouts itself has left one out.
+        The observations are compared, because a caller that stacks rollouts itself may have left a rollout out.
         """
         known = self._newest.get(lane)
         if known is None or len(known) != len(fresh):
@@ -210,7 +210,7 @@ class SequenceReplay(Rewinding[ReplacedSequences]):
         return (self.sample(count, beta) for _ in range(number))
 
     def sample(self, count: int, beta: float = 1.0) -> SequenceSample:
-        """Draw sequences with replacement: as many as hold `count` rows when all of these are valid, but at least `FEWEST`.
+        """Draw sequences with replacement: as many as hold `count` rows if all rows are valid, but at least `FEWEST`.
 
         For `beta`, see `ReplayBuffer`.
         """
@@ -255,7 +255,7 @@ class SequenceReplay(Rewinding[ReplacedSequences]):
         )
 
     def update_priorities(self, slots: Ints, error: Floats) -> None:
-        """Set the priorities of sequences from the errors [B] of their rows. `slots` [B] are the slots of the rows."""
+        """Set the priorities of sequences from the errors [B] of their rows. `slots` [B] are the rows' slots."""
         if self._tree is None or self._alpha is None:
             return
         sequences, of_row = np.unique(slots, return_inverse=True)

@@ -1,8 +1,8 @@
-"""Images whose distinct channels are stored once each, because successive frame stacks repeat the same frames.
+"""Images whose distinct channels are stored once each, because successive frame stacks contain the same frames.
 
 Law: reading returns exactly the bytes that were written. A replay buffer uses `SharedChannels` like an array of images:
-`images[slots]` copies, and `images[slots] = values` overwrites. A channel is kept as long as a slot refers to it. It is
-identified by its digest, so it is shared wherever it occurs: in any slot, and at any position in the stack.
+`images[slots]` copies, and `images[slots] = values` overwrites. A channel is kept as long as a slot refers to it. Channels
+are identified by their digests, so a channel is shared wherever it occurs, in any slot and at any position in the stack.
 """
 
 from __future__ import annotations
@@ -16,14 +16,15 @@ from millrace.protocol.specs import Leaf
 
 DIGEST_BYTES = 16
 CHUNK_BYTES = 1 << 24
-"""Memory is allocated in chunks of about this size, so that nothing is copied when the number of channels grows."""
+"""Memory is allocated in chunks of about this size, so nothing is copied when the number of channels grows."""
 NONE = -1
 WORTHWHILE = 0.5
 """The largest share of distinct channels at which sharing saves enough memory to be worth its time."""
 INDEX_BYTES = 250
 """The approximate size of the Python objects in the index by digest, per channel."""
 LEAST_BYTES = 1024
-"""The smallest channel to share. With smaller ones, the index would take much of the memory that sharing saves."""
+"""The size of the smallest channels to share. With smaller ones, the index would use much of the memory that sharing saves.
+"""
 
 
 class SharedChannels:
@@ -44,12 +45,12 @@ class SharedChannels:
 
     @property
     def nbytes(self) -> int:
-        """Memory of the channels, their numbers and the index by digest, in bytes. The size of the index is an estimate."""
+        """Memory of the channels, their numbers and the index by digest, in bytes. The index size is an estimate."""
         return self._of_slot.nbytes + sum(chunk.nbytes for chunk in self._chunks) + INDEX_BYTES * len(self._number)
 
     @staticmethod
     def worthwhile(leaf: Leaf, images: Bytes) -> bool:
-        """Whether these images [K, *leaf] share so many channels that storing each once saves memory."""
+        """Whether these images [K, *leaf] share so many channels that storing each channel once saves memory."""
         channels = _by_channel(leaf, images)
         if channels.shape[1] < LEAST_BYTES:
             return False
@@ -110,8 +111,8 @@ class SharedChannels:
     def saved(self, used: int) -> tuple[Bytes, Ints]:
         """The distinct channels [M, H, W] of the first `used` slots, and the indices [used, C] of each slot's channels.
 
-        Channels are in order of first occurrence. So the result depends on nothing but the images, and equal buffers give
-        equal saved states.
+        Channels are in order of first occurrence, so the result depends only on the images, and equal buffers give equal
+        saved states.
         """
         numbers = self._of_slot[:used]
         distinct, first, place = np.unique(numbers, return_index=True, return_inverse=True)
@@ -124,7 +125,7 @@ class SharedChannels:
         return channels, rank[place].reshape(numbers.shape)
 
     def load(self, channels: Bytes, numbers: Ints) -> None:
-        """Restore the result of `saved`. Call this before anything is written."""
+        """Restore the result of `saved`. Call this before anything is written to the array."""
         for at, of_slot in enumerate(numbers):
             images = channels[of_slot]
             self[np.array([at])] = np.moveaxis(images, 0, -1)[None] if self._leaf.has_channels_last else images[None]

@@ -1,7 +1,7 @@
 """A sum tree: draws indices in proportion to their weights, and changes weights, in logarithmic time. Vectorized in numpy.
 
-Rule: every inner node is the sum of its two children and is recomputed when one of them changes. So the tree is a function
-of its leaves, bit for bit, and rounding errors do not accumulate.
+Rule: every inner node is the sum of its two children and is recomputed when one of them changes. The tree is therefore a
+function of its leaves, bit for bit, and rounding errors do not accumulate.
 """
 
 from __future__ import annotations
@@ -15,9 +15,10 @@ from millrace.protocol.arrays import Doubles, Floats, Ints
 
 
 class SumTree:
-    """`size` weights, 0 at first. Node i has the children 2i and 2i + 1; the leaves are the nodes from `size` on.
+    """`size` weights, initially 0. Node i has the children 2i and 2i + 1; the leaves are the nodes from `size` on.
 
-    `size` need not be a power of two. If it isn't, leaves are at two depths; every node but the root still has one parent.
+    `size` need not be a power of two. If it isn't, leaves are at two depths, but every node except the root still has one
+    parent.
     """
 
     def __init__(self, size: int) -> None:
@@ -41,7 +42,7 @@ class SumTree:
         return self._nodes[self._size :]
 
     def set(self, index: Ints, weight: npt.NDArray[Any] | float) -> None:
-        """Set these weights, which must not be negative. If an index occurs twice, its last weight counts."""
+        """Set the weights at these indices. They must not be negative. If an index occurs twice, its last weight counts."""
         nodes = self._nodes
         i = index + self._size
         nodes[i] = weight
@@ -75,7 +76,7 @@ class SumTree:
         """Draw `count` indices as `draw` does. Returns them and their importance-sampling weights [count].
 
         `entries` is the number of indices that have a weight. P(i) = pᵢ^α / Σ p^α;  wᵢ = (entries · P(i))^−β, divided by the
-        greatest of them (Schaul et al. 2016, section 3.4).
+        largest w in the sample (Schaul et al. 2016, section 3.4).
         """
         index = self.draw(generator, count)
         chance = self.weights[index] / self.total

@@ -21,16 +21,16 @@ class Sequences(NamedTuple):
     before: RecurrentInput
     """the recurrent core's input for the T rows of burn-in"""
     keep_state: Tensor
-    """[T + 1, C] of the sequences: 0 where an episode begins, otherwise 1"""
+    """[T + 1, C] for the sequences: 0 where an episode begins, otherwise 1"""
     advances: Tensor
     """[T + 1, C] bool: False where a row leaves the core's state unchanged"""
     rows: Tensor
     """[B] the indices of the rows among the T · C rows of the sequences"""
     next_rows: Tensor
-    """[B] the indices of the observations k steps later among the (T + 1) · C observations of the sequences"""
+    """[B] the indices, among the (T + 1) · C observations of the sequences, of the observations k steps later"""
 
     def outputs(self, encode: Encoder, x: Tensor, images: Sequence[Tensor]) -> Tensor:
-        """The core's outputs [(T + 1) · C, H] for x and images [(2 T + 1) · C, …]. The burn-in has no gradient."""
+        """The core's outputs [(T + 1) · C, H] for x and images [(2 T + 1) · C, …]. The burn-in gets no gradient."""
         warm_up = self.before.keep_state.numel()
         with torch.no_grad():
             _, state = encode.advance(x[:warm_up], [image[:warm_up] for image in images], self.before)
@@ -40,7 +40,7 @@ class Sequences(NamedTuple):
 
 
 class Transitions(NamedTuple):
-    """The input of a loss: B transitions of k steps; k is `n_step`, or less where an episode ends.
+    """The input of a loss: B transitions of k steps, where k is `n_step`, or less where an episode ends.
 
     With a recurrent core, x and images hold all rows of the `sequences` until they are encoded.
     """
@@ -81,7 +81,7 @@ class Transitions(NamedTuple):
 
     @torch.no_grad()
     def encoded_next(self, encode: Encoder) -> Tensor:
-        """The outputs [B, H] of an encoder for the observations k steps later, without a gradient."""
+        """An encoder's outputs [B, H] for the observations k steps later, without a gradient."""
         if self.sequences is not None:
             return self.sequences.outputs(encode, self.x, self.images)[self.sequences.next_rows]
         return encode(self.next_x, self.next_images)
