@@ -37,7 +37,7 @@ POLICY = 1
 
 
 class SavedPolicy(NamedTuple):
-    """A policy from a run folder, and the environment for which it was trained."""
+    """A policy from a run folder, and the environment that it was trained for."""
 
     spec: PolicySpec
     env: EnvSpec

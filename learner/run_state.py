@@ -43,7 +43,7 @@ BESIDES = {"policy": "", "critic": ", critic", "all": ", critic, optimizers"}
 
 
 class RunState(msgspec.Struct, kw_only=True):
-    """All counters of a run. The defaults are those of a new run."""
+    """All counters of a run. The defaults are a new run's values."""
 
     version: Past = 0
     env_steps: Past = 0
@@ -139,7 +139,9 @@ def _check_policies(state: RunState, own: tuple[Floats, Floats]) -> None:
 
 
 def start_from(config: Config, policy: PolicySpec, algorithm: Algorithm) -> str:
-    """Let a new algorithm start from the run or the policy that `config.start_from` names. Returns a line that says so.
+    """Let a new algorithm start from the run or the policy that `config.start_from` names.
+
+    Returns a line for the log that says what was loaded from where.
 
     `policy` is the policy to train. Raises `UserFacingError` if the other policy doesn't fit it or cannot be read.
     """

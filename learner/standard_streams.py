@@ -49,7 +49,7 @@ def unfailing(name: Literal["stdout", "stderr"]) -> Iterator[None]:
 
 
 def never_fails(stream: TextIO) -> TextIO:
-    """A stream that writes where `stream` does but never raises. A stream without a file descriptor is returned as it is."""
+    """A stream that writes where `stream` does but never raises. Returns `stream` itself if it has no file descriptor."""
     try:
         number = stream.fileno()
         stream.flush()

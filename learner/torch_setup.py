@@ -113,7 +113,7 @@ def threads(policy: PolicySpec, rows: int, max_lag: int, workers: int) -> Thread
 
 
 def updates_use_all_cores(config: Config) -> bool:
-    """Whether updates use all cores while workers collect, so that local workers should have a lower priority.
+    """Whether updates use all cores while workers collect, so local workers should have a lower priority.
 
     Each operation of an update ends when its slowest thread has finished, so if a worker occupies one thread's core, all
     threads wait. Updates with one thread leave the other cores to the workers. The workers then limit the speed of the run,

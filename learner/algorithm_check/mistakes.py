@@ -49,7 +49,7 @@ MOST_WARM_UP = 24  # limit on updates before the first gradient step, because a 
 MORE_UPDATES = 3  # number of updates that follow the first gradient step
 TOTAL_STEPS = 20_000  # env steps of the toy run, for schedules
 LEARNING_STEPS = 40_000  # env steps within which the identity environment must be learned
-LEARNED = 0.5  # the mean reward to reach: 0 is that of random actions, 1 that of perfect ones
+LEARNED = 0.5  # the mean reward to reach, on a scale from 0 (random actions) to 1 (perfect actions)
 MEASURED_BATCHES = 5  # number of batches over which the mean reward is measured
 SEED = 3
 

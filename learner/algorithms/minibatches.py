@@ -35,7 +35,7 @@ class NetworkInput(NamedTuple):
 
 
 class Observations(Protocol):
-    """The T+1 observations of a batch, for which an algorithm computes values or log-probabilities."""
+    """The T+1 observations of a batch. An algorithm computes values or log-probabilities for them."""
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -52,7 +52,7 @@ class Observations(Protocol):
 
 
 class ColumnObservations(NamedTuple):
-    """The T+1 observations of ΣN env copies, normalized by the statistics with which the workers acted."""
+    """The T+1 observations of ΣN env copies, normalized by the statistics that the workers acted with."""
 
     shape: tuple[int, ...]  # (T+1, ΣN)
     features: Tensor  # [(T+1) · ΣN, D] float32, normalized
@@ -167,7 +167,7 @@ class UpdateRows(Protocol):
 
     @property
     def observations(self) -> Observations:
-        """The observations for which `estimate` computes values."""
+        """The observations that `estimate` computes values for."""
         ...
 
     def epochs(

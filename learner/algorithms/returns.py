@@ -120,7 +120,7 @@ class NStepReturns(NamedTuple):
 
 
 def n_step_returns(reward: Floats, ends: EpisodeEnds, gamma: float, n_step: int) -> NStepReturns:
-    """For each row, the discounted sum of up to `n_step` rewards: its own, and those of its episode's next valid rows.
+    """For each row, the discounted sum of up to `n_step` rewards: its own and those of the episode's next valid rows.
 
     `reward` is [T, N].
     """
@@ -144,7 +144,7 @@ def n_step_returns(reward: Floats, ends: EpisodeEnds, gamma: float, n_step: int)
 
 
 def complete(ends: EpisodeEnds) -> Bools:
-    """[T, N] True for valid rows whose episode ends within the rollout, so that all its later rewards are known."""
+    """[T, N] True for valid rows whose episode ends within the rollout, so all later rewards of the episode are known."""
     return np.asarray(np.logical_or.accumulate((ends.ended & ends.valid)[::-1])[::-1] & ends.valid)
 
 

@@ -125,7 +125,7 @@ class ObservationNormalizer:
             self._update_with_first(rows)
 
     def _update_with_first(self, rows: Floats | Doubles) -> None:
-        """Add the rows [B, D] with which the total reaches or exceeds `FEW`.
+        """Add the rows [B, D] that bring the total to `FEW` or more.
 
         The scale is set by the 99 % of all values so far that are nearest to the median.
         """
@@ -179,7 +179,7 @@ def _bounded(rows: Floats | Doubles, center: Floats | Doubles, spread: Floats | 
 
 
 def continued(by_lane: Mapping[int, Doubles], lane: int, fresh: Bools) -> Doubles:
-    """The running sums [N] with which a lane's env copies begin a rollout: 0 for copies that are `fresh` [N]."""
+    """The running sums [N] of a lane's env copies at the beginning of a rollout: 0 for copies that are `fresh` [N]."""
     known = 0.0 if fresh.all() else by_lane.get(lane, 0.0)  # a fresh lane may have more or fewer env copies
     return np.where(fresh, 0.0, known)
 

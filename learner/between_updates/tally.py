@@ -74,8 +74,8 @@ class Tally:
     def stop_reason(self) -> str | None:
         """Why the run should end now; None if it should continue.
 
-        If training has ended, the reason depends on the returns with which it ended. If the run was resumed with settings
-        for which these returns give no reason, it depends on the current returns.
+        If training has ended, the reason comes from the returns with which it ended. If the run was resumed with settings
+        for which these returns give no reason to stop, the current returns decide.
         """
         ended_with = self.state.ended_with
         return self._ended_by() or (ended_with and self._reason(ended_with)) or self._reason(self._returns())

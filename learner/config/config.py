@@ -110,10 +110,10 @@ class Config(RolloutConfig, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     """
     torch_threads: Free[Count | None] = None
     """Number of PyTorch threads in the learner. none: chosen when the run starts, and kept in its config.toml. The choice is
-    1, except with images, an encoder or a layer of at least 512 x 512 weights: then it is one thread for every 34 million
-    multiply-adds in a minibatch's forward pass, but at most one for each core. If max_lag is above 0, one of these cores is
-    left to each local worker, unless the learner would get only half of the cores or fewer. With shards, the choice is
-    always 1. Another number changes the last bits of results.
+    1. With images, an encoder or a layer of at least 512 x 512 weights, it is instead one for every 34 million multiply-adds
+    in a minibatch's forward pass, but at most one for each core. If max_lag is above 0, one core is left to each local
+    worker, unless the learner would then get half of the cores or fewer. With shards, the choice is always 1. Another number
+    changes the last bits of results.
     """
 
     shards: Fixed[Count] = 1

@@ -206,7 +206,7 @@ class OffPolicyConfig(AlgorithmConfig, frozen=True):
     prior_share: Free[Fraction] = 0.5
     """Share of each minibatch that is prior data, in a run with --prior (Ball et al. 2023 use 0.5)."""
     prior_steps: Free[Natural] = 0
-    """Number of gradient steps on prior data alone, before the first rollouts are collected. Needs --prior."""
+    """Number of gradient steps on only prior data, before the first rollouts are collected. Needs --prior."""
     hindsight: Fixed[Fraction] = 0.0
     """Hindsight experience replay: the share of a minibatch's transitions whose goal is replaced by a goal that was achieved
     later in the episode. 0: off. Andrychowicz et al. 2017 use 0.8. Needs goal_reward, and observations with achieved_goal

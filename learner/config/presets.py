@@ -35,7 +35,7 @@ def named_presets() -> dict[str, Preset]:
 
 
 def environment_presets(algo: str) -> dict[str, dict[str, Any]]:
-    """The settings of each environment for which this algorithm has a preset."""
+    """The preset's settings, for each environment that this algorithm has a preset for."""
     presets: dict[str, dict[str, Any]] = _tables().get(algo, {})
     return presets
 

@@ -16,7 +16,7 @@ from millrace.learner.run_folder.newest_run import newest_run
 
 
 def settings_with_newest_run(lower: LowerLayers, above: Callable[[LowerLayers], Config]) -> tuple[Config, Path | None]:
-    """The settings, and the run to resume; None if there is no such run, so a new run begins.
+    """The settings, and the run to resume; None instead of a run if a new one must begin.
 
     `lower` are the lower layers of a new run. `above` merges the given lower layers with the flags or keyword arguments.
     Raises `UsageError` if a setting or a file is not valid.

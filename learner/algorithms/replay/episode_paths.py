@@ -38,7 +38,7 @@ class EpisodePaths:
     """The paths of all episodes in a ring of `size` slots."""
 
     def __init__(self, size: int) -> None:
-        self._number: Ints = np.full(size, NO_PATH)  # [size] the number of the path to which each slot belongs
+        self._number: Ints = np.full(size, NO_PATH)  # [size] the number of the path that each slot belongs to
         self._place: Ints = np.zeros(size, np.int64)  # [size] the place of each slot on its path
         self._paths: dict[int, EpisodePath] = {}
         self._next = 0

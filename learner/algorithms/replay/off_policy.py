@@ -205,7 +205,7 @@ class OffPolicy(GradientDescent):
         self.statistics = self.normalizer.buffers()
 
     def learn_from_prior(self, pulse: Callable[[], None]) -> None:
-        """Take `prior_steps` gradient steps on prior data alone, except those already taken."""
+        """Take `prior_steps` gradient steps on only prior data, except those already taken."""
         self.set_schedules()  # loading a state may have changed the learning rate
         for _ in self.steps(self.config.prior_steps - self.prior_gradient_steps, pulse):
             self.prior_gradient_steps += 1

@@ -326,7 +326,7 @@ class SequenceReplay(Rewinding[ReplacedSequences]):
 
 
 def _begins(batch: Batch) -> Bools:
-    """[T, ΣN] True where row t only resets its copy, so that obs[t+1] begins an episode."""
+    """[T, ΣN] True where row t only resets its copy, so obs[t+1] begins an episode."""
     if batch.resets is None:
         return ~batch.valid
     return np.repeat(batch.resets[:-1], batch.valid.shape[1] // batch.resets.shape[1], axis=1)

@@ -98,7 +98,7 @@ class SharedChannels:
         end = first + self._per_chunk
         self._uses[first:] = [0] * self._per_chunk
         self._digest[first:] = [b""] * self._per_chunk
-        self._free += range(end - 1, first - 1, -1)  # done last: if an exception prevents it, the chunk just stays unused
+        self._free += range(end - 1, first - 1, -1)  # done last: if an exception prevents this, the chunk stays unused
 
     def _release(self, number: int) -> None:
         self._uses[number] -= 1
