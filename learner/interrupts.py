@@ -29,9 +29,8 @@ Handler = Callable[[int, FrameType | None], None] | signal.Handlers
 class Stopped(KeyboardInterrupt):
     """A signal has stopped the program.
 
-    It is a separate class because of how Python treats a plain KeyboardInterrupt that has passed through `exec`, for example
-    in the definition of a dataclass: Python then ends as if the signal had killed it, even if the program handles the
-    exception.
+    It is a separate class, because a plain KeyboardInterrupt may pass through `exec`, for example in the definition of a
+    dataclass. Python then ends as if the signal had killed it, even if the program handles the exception.
     """
 
 

@@ -1,10 +1,11 @@
 """Checks the calls in a checkpoint's pickle before torch's loader makes them. Pure.
 
 Rule: a pickle may contain only what torch.save writes for tensors and plain data. torch's loader for untrusted files
-(`weights_only`) doesn't run code from them, but a few bytes could make it fill the memory, because it calls `bytearray` with
-any length, and copies a container or a string as often as the file says. It also hashes the keys of dicts. That could take
-forever if tuples contain the same tuple twice, again and again, or if all numbers have the same hash. Code that visits lists
-which contain the same list twice could take as long. This file interprets the pickle without creating its objects.
+(`weights_only`) doesn't run code from them, but a few bytes could make it fill the memory: it calls `bytearray` with any
+length, and copies a container or a string as often as the file says. It also hashes the keys of dicts. This could take
+forever if each tuple in a deep nest contains the next tuple twice, or if all numbers have the same hash. With lists nested
+in the same way, any code that visits them could take as long. This module interprets the pickle without creating its
+objects.
 """
 
 from __future__ import annotations

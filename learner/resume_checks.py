@@ -112,8 +112,8 @@ def _is_finished(config: Config, folder: RunFolder) -> bool:
     """Whether the run has nothing left to do, because the reason why it ended still holds with these settings.
 
     Only the returns that ended training decide this. The evaluation of the final policy doesn't count, because it came
-    later; nor does the summary's mean training return if training ended because all env steps were done, because it may be
-    the mean of too few episodes.
+    later. If training ended because all env steps were done, the summary's mean training return doesn't count either,
+    because it may be the mean of too few episodes.
     """
     summary = folder.summary()
     if summary is None or summary.evaluation is None:

@@ -2,9 +2,9 @@
 
 Rules: a run has PyTorch's initial defaults (float32, the CPU, gradients on), so the calling program's own choices don't
 change the run's results. Nor do the numbers of threads depend on what imported PyTorch and numpy first: a script, a notebook
-or the command line. numpy gets one BLAS thread. Its matrices are so small that more threads gain nothing; and if other
-processes are busy, several threads would wait for one another, and an update could take thirty times as long. After the run,
-the calling program gets its threads and defaults back.
+or the command line. numpy gets one BLAS thread, because its matrices are so small that more threads gain nothing. If other
+processes were busy, several threads would wait for one another, and an update could take thirty times as long. After the
+run, the calling program gets its threads and defaults back.
 """
 
 from __future__ import annotations
@@ -90,8 +90,8 @@ class ThreadChoice(NamedTuple):
 def threads(policy: PolicySpec, rows: int, max_lag: int, workers: int) -> ThreadChoice:
     """The number of threads for minibatches with `rows` rows. `workers` is the number of local worker processes.
 
-    Threads wait for one another at the end of each operation, so a thread that has little to do gains nothing, and costs
-    much time if another process keeps its core busy. Therefore each thread gets at least `WORTH_A_THREAD` multiply-adds.
+    Threads wait for one another at the end of each operation. A thread that has little to do therefore gains nothing, and
+    costs much time if another process keeps its core busy, so each thread gets at least `WORTH_A_THREAD` multiply-adds.
     Networks with only small layers get one thread, because numpy computes most of their passes.
 
     If workers collect during updates, one core is left free for each of them, but only if the threads still get more than

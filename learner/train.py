@@ -36,9 +36,9 @@ def train(run: OpenRun, workers: int, cores: CrowdedCores) -> str:
 
     `workers` is the number of workers to wait for before the first rollout. `cores` watches the updates.
 
-    The run cannot continue if no worker is left, if the environment raised too often, if the user interrupted the run, if a
-    loss is not finite, or if the user's code raised. Then the state after the last complete update is saved, and the error
-    is raised.
+    If the run cannot continue, the state after the last complete update is saved, and then the error is raised. This happens
+    if no worker is left, the environment raised too often, the user interrupted the run, a loss is not finite, or the user's
+    code raised.
     """
     algorithm = run.parts.algorithm
     policy = run.parts.spec.policy

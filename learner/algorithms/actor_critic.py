@@ -152,8 +152,8 @@ class ActorCritic(GradientDescent):
     def update(self, batch: Batch, pulse: Pulse) -> UpdateMetrics:
         """Learn from a batch, calling `pulse` between minibatches. Returns metrics, named as in Stable-Baselines3.
 
-        Raises `RunError` before a step whose loss, logged numbers or gradient norm are not finite, and after the last step
-        if the new weights could give actions that are not finite.
+        Raises `RunError` before a step whose loss, logged numbers or gradient norm are not finite. Also raises it after the
+        last step if the new weights could give actions that are not finite.
         """
         if not batch.valid.any():  # with several agents, all seats may be waiting, so there is nothing to learn
             self.env_steps += batch.env_steps

@@ -27,7 +27,7 @@ class RunFlags(Config, frozen=True, kw_only=True):
     """
     resume: Annotated[Path | None, Flag("PATH")] = None
     """Continue this run from its newest checkpoint. auto: continue the newest run in --run-dir with the same ENV, --algo and
-    --seed, or start a new run if there is none; --config then overrides the settings of the run that continues. Some
+    --seed, or start a new run if there is none. With auto, --config overrides the settings of the run that continues. Some
     settings can't be changed: see docs/how-to/resume.md.
     """
     log_json: bool = False

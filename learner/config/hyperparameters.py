@@ -225,7 +225,7 @@ class OffPolicyConfig(AlgorithmConfig, frozen=True):
     """τ of the polyak update: the fraction by which each gradient step moves the target network toward the network."""
     normalize_rewards: Fixed[bool] = False
     """When rewards are drawn from the buffer, divide them by the running standard deviation of the discounted return, and
-    clip them to ±10; with n_step, the sum of n rewards is clipped.
+    clip them to ±10. With n_step, the sum of n rewards is clipped.
     """
 
 

@@ -45,7 +45,7 @@ def declared(record: type[msgspec.Struct], *, by_type: bool = False) -> dict[str
     """For each setting of a record, in the order of the fields, what a resumed run does if the setting changes.
 
     With `by_type`, for user-defined records, fields may be undeclared. If such a field overrides a field of a base class, it
-    keeps that field's declaration. Otherwise, a float is free, because it is usually a coefficient, and any other field is
+    keeps that field's declaration. Otherwise, a float is free, because it is usually a coefficient. Any other field is
     fixed, because the shape of the weights or of the saved state may depend on it.
 
     Raises TypeError for a field with no declaration or with several, and NameError for a type that cannot be found.

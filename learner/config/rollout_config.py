@@ -169,11 +169,11 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     """
     max_env_failures: Free[Natural] = 3
     """How many failures the run survives. A failure is an exception or an unusable result from the environment or an
-    `OwnPolicy`, or the unexpected end of a worker process, because the environment may have caused it. Either of two counts
-    ends the run. In a row: more than this number, or more than 10, in one lane without a rollout in between; a failure after
-    env steps counts as a quarter. Within an hour: more failures after env steps than this × (1 + env copies × h + w / 30),
-    where h is the number of hours since the learner began, at most 1, and w is the number of seconds that the failed workers
-    had worked before they failed.
+    `OwnPolicy`. The unexpected end of a worker process counts too, because the environment may have caused it. Either of two
+    counts ends the run. In a row: one lane has more failures than this, or more than 10, without a rollout in between; a
+    failure after env steps counts as a quarter. Within an hour: there are more failures after env steps than
+    this × (1 + env copies × h + w / 30). Here h is the number of hours since the learner began, at most 1, and w is the
+    number of seconds that the failed workers had worked before.
     """
 
     def all_wrappers(self, given: Sequence[WrapperLike] | None = None) -> list[WrapperLike]:

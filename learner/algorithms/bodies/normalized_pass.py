@@ -140,8 +140,8 @@ def _normalized(
 ) -> tuple[Tensor, _Normalization]:
     """γ x̂ + β [K, n, B] for h [K or 1, n, B], and the intermediate results that the backward pass needs.
 
-    With batch renormalization (Ioffe 2017), the result is γ (r x̂ + d) + β, which equals a normalization by the running
-    statistics as long as r and d are within their bounds. The backward pass treats r and d as constants.
+    With batch renormalization (Ioffe 2017), the result is γ (r x̂ + d) + β. As long as r and d are within their bounds, this
+    equals a normalization by the running statistics. The backward pass treats r and d as constants.
     """
     mean = h.mean(-1, keepdim=True)
     x_hat = h.sub_(mean) if in_place else h - mean

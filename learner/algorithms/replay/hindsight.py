@@ -212,10 +212,9 @@ class Hindsight:
         """Raise `UsageError`, with a one-line message, unless rewards and ends of all valid rows agree with their goals.
 
         Goals may have been rounded after the reward was computed, and the reward was rounded to float32. The reward is
-        therefore computed for three pairs of goals: for the pair as it arrived, and for the pairs that are as close together
-        and as far apart as the goals may have been before rounding. A row is right if its reward lies between the lowest and
-        the highest of these three rewards. If the reward is a function of the distance between the goals, these bounds are
-        exact.
+        therefore computed for three pairs of goals: for the pair as it arrived, and for the closest and the most distant
+        pair that may have been rounded to it. A row is right if its reward lies between the lowest and the highest of these
+        three rewards. If the reward is a function of the distance between the goals, these bounds are exact.
         """
         valid = batch.valid
         achieved = _flat(batch.obs[self.achieved][1:][valid])

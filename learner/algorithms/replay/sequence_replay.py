@@ -1,9 +1,9 @@
 """The replay buffer for recurrent policies: stores sequences, and draws each one together with its predecessor.
 
-A sequence is the part of a rollout that belongs to one env copy, or to one seat: T rows, and the state that the recurrent
-core had on the worker before these rows. This state was computed with older weights. The previous sequence is therefore
-passed through the core first, from its own stored state and without a gradient, to compute a state with the current weights
-(stored state and burn-in, Kapturowski et al. 2019, R2D2).
+A sequence is the part of a rollout that belongs to one env copy, or to one seat. It has T rows, and the state that the
+recurrent core had on the worker before these rows. This state was computed with older weights. To compute a state with the
+current weights, the previous sequence is therefore passed through the core first, from its own stored state and without a
+gradient (stored state and burn-in, Kapturowski et al. 2019, R2D2).
 
 Rule: each row is in exactly one sequence. Unless replay is prioritized, all sequences are equally likely to be drawn, so all
 rows are used equally often, however long their episodes are. Rows follow the row format (`millrace.protocol.rollout`). If an
