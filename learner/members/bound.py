@@ -52,8 +52,8 @@ def listen(where: Listening, resources: ExitStack, code: str = "") -> Bound:
 def bind(address: str, keyring: Keyring | None, resources: ExitStack, code: str = "", linger_s: float = LINGER_S) -> Bound:
     """Bind this address for peers whose keys are in `keyring`.
 
-    `code` names the thing that is sent to the workers as code, for an error message; it is empty if nothing is. Raises
-    `UsageError` if code would be sent over tcp without keys, or if the address can't be bound.
+    `code` names, for error messages, what is sent to the workers as code; it is empty if nothing is. Raises `UsageError` if
+    code would be sent over tcp without keys, or if the address can't be bound.
     """
     if code and address.startswith("tcp://") and keyring is None:
         instead = REGISTER_IT if code == FACTORY else ""

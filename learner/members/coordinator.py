@@ -3,11 +3,11 @@
 It is pure: messages and `now` in, messages out.
 
 Rule: a worker that is waiting when the run begins becomes a member of the run, in the same session. If it is describing an
-environment at that time, it gets work only once it says that it has begun the run. The membership (`Membership.hear`)
-answers messages that don't belong to a member's session, and Failures; a subclass handles all other messages. A membership
-ends by Goodbye, by Failure, by the end of the process, by silence, by a refusal, or when the worker's key is revoked. Then
-the member's tickets and lanes are taken back, and `_deal` gives them to others. If a Heartbeat shows that a message was
-lost, the message is sent again before the reply.
+environment at that time, it gets work only after it reports that it has begun the run. `Membership.hear` answers Failures
+and messages that don't belong to a member's session; a subclass handles all other messages. A membership ends with a
+Goodbye, a Failure, the end of the worker's process, silence, a refusal, or the revocation of the worker's key. Then the
+member's tickets and lanes are taken back, and `_deal` gives them to others. If a Heartbeat shows that a message was lost,
+the message is sent again before the reply.
 
 A subclass defines the rest: how to answer messages, which work to deal, what to do when a worker is lost, and what to do
 after a wrong answer.
@@ -37,7 +37,7 @@ from millrace.protocol.messages import (
 
 
 class Coordinator(ABC, Generic[M]):
-    """Answers the messages of the members, removes members, and deals work to them."""
+    """Answers members' messages, removes members, and deals work to them."""
 
     def __init__(self, membership: Membership[M], worker_timeout_s: float) -> None:
         self.membership = membership
@@ -115,7 +115,7 @@ class Coordinator(ABC, Generic[M]):
     def _again(self, member: M, heartbeat: Heartbeat, lost: Sequence[int]) -> list[Outgoing]:
         """The messages to send again because this heartbeat shows that they were lost.
 
-        `lost` are the member's tickets that were lost.
+        `lost` has the member's tickets that were lost.
         """
         return []
 

@@ -1,12 +1,12 @@
 """The conversation before a run: workers wait, and describe environments. Pure: messages and `now` in, messages out.
 
 Rule: the worker that joined first describes the environment; the others wait. A worker that has not answered an order is the
-last to be asked about the next environment, because it may hang. Each time a worker is lost after it was asked, or no answer
-arrives for a long time, twice as many workers are asked at once. So one bad machine delays the start by one attempt, and an
-environment that fails everywhere is discovered after a few attempts.
+last to be asked about the next environment, because it may be hanging. Each time a worker is lost after it was asked, or no
+answer arrives for a long time, the number of workers asked at once doubles. One bad machine therefore delays the start by
+only one attempt, and an environment that fails everywhere is discovered after a few attempts.
 
 Rule: the run uses the first description that can be read and is accepted; other workers compare their env copies with it
-when they open lanes. A worker that declines, or whose description is not accepted, is refused; once `decliners_to_end`
+when they open lanes. A worker that declines, or whose description is not accepted, is refused. Once `decliners_to_end`
 different workers have been refused, the start fails with the reason. A worker whose environment fails may come back. If a
 worker that was not asked fails or declines, this doesn't count.
 """
@@ -40,7 +40,7 @@ def accept_any(env: DescribedEnv) -> None:
 
 @dataclass(frozen=True)
 class Unknown:
-    """An environment that a worker is to describe."""
+    """An environment for a worker to describe."""
 
     env: EnvSpec
     vector: str = "loop"
@@ -50,7 +50,7 @@ class Unknown:
 
 
 class DescribeCoordinator(Coordinator[Member]):
-    """The members that wait for the run, one of which describes the environment."""
+    """The members waiting for the run, one of which describes the environment."""
 
     def __init__(self, wait: WaitSpec, first_session: int, *, worker_timeout_s: float, decliners_to_end: int) -> None:
         """The start fails once `decliners_to_end` different workers cannot describe the environment; 0 means never."""
@@ -161,8 +161,8 @@ def _was_not_asked(member: Member) -> bool:
 
 
 def _free_first(member: Member) -> tuple[bool, bool, int]:
-    """Sort key of the workers that may be asked. Those that aren't busy with an earlier order come first.
+    """Sort key for the workers that may be asked. Those that aren't busy with an earlier order come first.
 
-    Among these, the worker that will get the first lane comes first, because it can go on using the copy that it describes.
+    Among these, the worker that will get the first lane comes first, because it can keep using the copy that it describes.
     """
     return bool(member.tickets), member.hello.evaluates, member.join_number

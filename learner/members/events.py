@@ -1,7 +1,7 @@
 """Events in the life of workers. The log shows them, and the hub uses them to decide if the run continues. Plain data.
 
-`json_name` is the `event` field of a line of `--log-json`. Programs read these names, so they must not change. An event
-without such a name isn't logged as an event.
+`json_name` is the `event` field of a line written by `--log-json`. Programs read these names, so they must not change. An
+event without such a name isn't logged as an event.
 """
 
 from __future__ import annotations
@@ -51,8 +51,8 @@ class WorkerRefused:
 class NamelessHello:
     """A Hello arrived over a connection without a routing id, and was refused.
 
-    Usually it is harmless: a worker that reconnected, or its successor of the same name, has taken over the routing id, and
-    this is a leftover message of the older connection. If a client sets no routing id, the refusal tells it so.
+    This is usually harmless: a worker that reconnected, or its successor with the same name, has taken over the routing id,
+    and the Hello is left over from the older connection. A client that never sets a routing id learns so from the refusal.
     """
 
     json_name: ClassVar[str] = "nameless_hello"
@@ -62,7 +62,7 @@ class NamelessHello:
 
 @dataclass(frozen=True)
 class Failed:
-    """A worker failed in code that the user wrote. It may come back. Every such event is one of the three classes below."""
+    """A worker failed in user-written code. It may come back. Every such event is an instance of a subclass below."""
 
     json_name: ClassVar[str]
     raised_as: ClassVar[type[EnvironmentFailed | PolicyFailed]] = EnvironmentFailed
@@ -115,7 +115,7 @@ class WorkerProcessFailed(Failed):
 
 @dataclass(frozen=True)
 class WorkerStartFailed:
-    """A worker's process that this program had started ended by itself before it joined."""
+    """A worker process that this program started ended by itself before the worker joined."""
 
     json_name: ClassVar[str] = "not_started"
     worker: str
@@ -139,7 +139,7 @@ class WorkerToldToRejoin:
 
 @dataclass(frozen=True)
 class EnvironmentNoted:
-    """A worker has seen something in its environment that the user should know."""
+    """A worker has noticed something about its environment that the user should know."""
 
     json_name: ClassVar[str] = "environment_noted"
     worker: str
@@ -201,8 +201,9 @@ Event = LoggedEvent | RolloutRejected | RolloutArrived | EpisodesArrived
 
 
 def as_extra(event: LoggedEvent) -> dict[str, Any]:
-    """The attributes of a log record that describes the event. They are plain data: formatters of other programs write all
-    attributes of a record as JSON.
+    """The attributes of a log record that describes the event.
+
+    They are plain data, because other programs' formatters write all attributes of a record as JSON.
     """
     return {"event": event.json_name, "event_fields": asdict(event)}
 

@@ -1,15 +1,15 @@
-"""How many failures of its environments a run survives. Pure: failures and finished work in, a verdict out.
+"""How many environment failures a run survives. Pure: failures and finished work in, a verdict out.
 
 Rule: there are two counts of failures, and either can end the run.
 
 * In a row: the failures of one lane since its last rollout. `max_env_failures` are allowed, but never more than
   `MOST_IN_A_ROW`, so that an environment that never works ends the run quickly even if many failures are allowed. A failure
-  after env steps counts as only `AFTER_STEPS`, because a simulator that crashes often may by chance fail a few times before
+  after env steps counts only as `AFTER_STEPS`, because a simulator that crashes often may happen to fail a few times before
   a rollout is complete.
 * Within an hour: the failures of all lanes that occurred after env steps. `max_env_failures` × (1 + env copies × h + w /
-  `WORK_S`) are allowed. Here, h is the number of hours since the learner began, but at most 1, and w the number of seconds
-  that the failed workers had worked. So a mistake in an environment's code ends a run that has just begun, but a simulator
-  that crashes now and then does not, as long as its workers work most of the time.
+  `WORK_S`) are allowed. Here, h is the number of hours since the learner began, but at most 1, and w is the total number of
+  seconds that the failed workers had worked. As a result, a bug in an environment's code ends a run that has just begun,
+  but a simulator that crashes now and then doesn't end a run, as long as its workers work most of the time.
 
 These limits end a run late, so the log warns early: at the fourth failure within an hour, and whenever the number of
 failures within an hour has doubled since the last warning.
@@ -30,7 +30,7 @@ TOLD_FIRST = 4
 
 
 class FailureCount:
-    """The failures of a run. Each counts for a lane, by its number, or for a worker without a lane, by its name."""
+    """The failures of a run. Each is attributed to lanes (by number) or to a worker without a lane (by name)."""
 
     def __init__(self, allowed: int, copies: int = 1, began_s: float = 0.0) -> None:
         """`allowed` is `max_env_failures`, `copies` the number of env copies, `began_s` the time when the learner began."""
@@ -43,7 +43,7 @@ class FailureCount:
         self._told_at = TOLD_FIRST  # the number of failures within an hour at which the log warns next
 
     def failed(self, lanes: Collection[int | str], worked_s: float | None, now: float) -> str:
-        """Count one failure, which stopped these lanes. Returns why the run ends, or an empty string.
+        """Count one failure that stopped these lanes. Returns why the run ends, or an empty string.
 
         `worked_s` is the number of seconds for which the worker had been making env steps; None if its process is not known
         to have made one.
@@ -113,9 +113,9 @@ class FailureCount:
         self._in_a_row.pop(lane, None)
 
     def evaluated(self, worker: str | None = None) -> None:
-        """Record that episodes of an evaluation were played. They aren't part of any lane.
+        """Record that evaluation episodes were played. They don't belong to a lane.
 
-        `worker` is the worker that played them alongside training; None if the workers that collect played them.
+        `worker` is the worker that played them alongside training; None if the workers that collect rollouts played them.
         """
         if worker is None:
             self._in_a_row.clear()

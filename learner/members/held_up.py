@@ -1,7 +1,7 @@
-"""What a member is doing, and what holds it up, as text for people. Pure.
+"""What a member is doing, and what holds it up, as human-readable text. Pure.
 
-Rule: a member counts as held up if a single call of the user's code takes long, or if it is silent. If it is slow because of
-many short calls, its env steps per second are shown instead.
+Rule: a member counts as held up if a single call to the user's code takes long, or if the member is silent. If it is slow
+because of many short calls, its env steps per second are shown instead.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ DOING = {
     "evaluating": "in evaluation",
     "closing": "in close",
 }
-"""What a worker is doing, in words. Only workers with a supervisor report it."""
+"""The words for what a worker is doing. This is known only of workers with a supervisor."""
 MOST_TOLD = 4  # the largest number of workers named in one line
 LONG_S = 2.0  # shorter times aren't shown; by default, heartbeats are sent every second
 
 
 def in_words(doing: str, seconds: float) -> str:
-    """What a worker is doing, and for how long if that is long."""
+    """What a worker is doing and, if it has taken at least `LONG_S`, for how long."""
     words = DOING.get(doing, doing or "-")
     return f"{words} for {seconds:.0f} s" if seconds >= LONG_S else words
 
@@ -36,7 +36,7 @@ def in_words(doing: str, seconds: float) -> str:
 def held_up(member: Member, now: float) -> tuple[float, float, str]:
     """For how many seconds a member has been held up, its negated env steps per second, and a line about it.
 
-    The line says which worker it is, on which host, and what it is doing. Tuples can be compared: the largest belongs to the
+    The line says which worker it is, on which host, and what it is doing. The largest of several such tuples belongs to the
     member that has been held up longest or, if none is held up, to the slowest one.
     """
     row = member.status(now)
@@ -59,8 +59,8 @@ def what_they_do(
 ) -> tuple[str, list[str]]:
     """What the workers are doing, in one line, and a line for each worker that wrote something.
 
-    Members come first, those held up longest at the top. The worker processes that have not joined follow.
-    `said` are the last lines of the workers' logs, by name.
+    Members come first, those held up longest at the top. They are followed by the worker processes that have not joined.
+    `said` has the last line of each worker's log, by the worker's name.
     """
     members = list(members)
     lines = [line for *_, line in sorted((held_up(member, now) for member in members), reverse=True)]

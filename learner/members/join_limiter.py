@@ -1,16 +1,16 @@
 """Limits how many `Hello` messages are answered. Pure: `now` is an argument.
 
-Rule: the workers of one key may all start at once, and after that join at a limited rate; workers without keys share one
-limit. A `Hello` beyond the limit is not answered; an honest worker repeats it until it gets an answer. So a peer that joins
-again and again costs the learner little time, and does not keep the workers of another key out.
+Rule: all workers with the same key may start at once, and after that join at a limited rate; workers without keys share one
+limit. A `Hello` beyond the limit is not answered; an honest worker repeats it until it gets an answer. A peer that joins
+again and again therefore costs the learner little time, and doesn't keep out workers with other keys.
 """
 
 from __future__ import annotations
 
 from millrace.protocol.token_bucket import TokenBucket
 
-AT_ONCE = 10_000  # how many Hellos of one key are answered at once
-PER_S = 100.0  # how many Hellos of one key are answered per second after that
+AT_ONCE = 10_000  # how many Hellos from workers with the same key are answered at once
+PER_S = 100.0  # how many of these are answered per second after that
 
 
 class JoinLimiter:

@@ -1,9 +1,9 @@
 """Assignment of lanes to workers. Pure: no clock, no socket.
 
-Rule: every lane has an owner as long as there are workers, and the numbers of lanes of two workers differ by at most one.
+Rule: every lane has an owner as long as there are workers, and the lane counts of any two workers differ by at most one.
 Workers that only evaluate, or that are still describing an environment, have no lanes. A lane moves only between its
-rollouts. The placement is recomputed only after an event that can change it: with a thousand workers, checking all of them
-at each rollout would take longer than the rollout.
+rollouts. The placement is recomputed only after an event that can change it, because with a thousand workers, checking all
+of them at each rollout would take longer than the rollout.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ class PlacedLane:
     owner: bytes | None = None
     """Routing id of the lane's worker; None if no worker has the lane."""
     moving: bool = False
-    """Whether the lane waits for its last tickets to end so that it can move to another worker."""
+    """Whether the lane will move to another worker once its last tickets have ended."""
 
     @property
     def busy(self) -> int:
-        """How many of the lane's tickets its worker holds. A lane moves only if there are none."""
+        """How many of the lane's tickets its worker holds. A lane moves only if its worker holds none."""
         return 0
 
     def restart(self) -> None:
@@ -105,7 +105,7 @@ class LanePlacement(Generic[L]):
             heapq.heapreplace(fewest_first, (count + 1, tie_break, n, member))
 
     def _even_out(self, members: Sequence[Member]) -> list[Outgoing]:
-        """Move lanes from the workers with the most to those with the fewest, until a lane must wait for its tickets."""
+        """Move lanes from the workers with the most to those with the fewest, until one must wait for its tickets to end."""
         self._stop_waiting()
         out: list[Outgoing] = []
         while members:

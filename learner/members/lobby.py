@@ -1,7 +1,7 @@
 """The lobby: the workers of a learner join here before its run begins, and one describes the environment. A shell.
 
-Rule: every wait has a deadline, and the log says what it waits for. The hub of the run takes over the link, and the workers
-with their sessions.
+Rule: every wait has a deadline, and the log says what is awaited. The run's hub takes over the link, and the workers with
+their sessions.
 """
 
 from __future__ import annotations
@@ -83,10 +83,11 @@ class Lobby:
     def describe(self, unknown: Unknown, check_interrupt: Callable[[], None] = _never) -> DescribedEnv:
         """Wait for a worker to describe the environment. Returns the first description that is accepted.
 
-        `check_interrupt` is called at least every 0.1 s, and an exception that it raises ends the wait. Raises `UsageError`
-        if a worker of this program, or each of `launched_workers`, says that there is no such environment or gives a
-        description that is not accepted; `EnvironmentFailed` if the environment fails too often; and `NoWorkers` or
-        `Stalled` if a deadline passes.
+        `check_interrupt` is called at least every 0.1 s, and an exception that it raises ends the wait.
+
+        Raises `UsageError` if a worker started by this program, or each of `launched_workers`, reports that there is no such
+        environment or gives a description that is not accepted. Raises `EnvironmentFailed` if the environment fails too
+        often, and `NoWorkers` or `Stalled` if a deadline passes.
         """
         coordinator = self._coordinator
         server = self._server
@@ -100,7 +101,7 @@ class Lobby:
             check_interrupt()
             self._check()
             now = self._clock()
-            # Time in the environment's code doesn't count, because its calls have timeouts of their own, with better errors.
+            # Time in the environment's code doesn't count, because those calls have their own timeouts, with better errors.
             busy_s = max((member.in_env_code_s for member in members.values()), default=began_s)
             if now - max(began_s, busy_s) > stall_timeout_s and members:
                 told = server.what_workers_do()
@@ -142,7 +143,7 @@ class Lobby:
         self._check()
 
     def hand_over(self) -> Membership[Member]:
-        """Close the lobby. Returns the workers that wait for the run, for its hub to take over."""
+        """Close the lobby. Returns the workers waiting for the run, for its hub to take over."""
         self._server.listen(0.0)  # first, because the hub must not take over ended or revoked workers
         self._server.close()
         return self._coordinator.membership

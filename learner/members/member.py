@@ -1,7 +1,7 @@
-"""A worker as the learner sees it: its own statements, and the work that it was given. Plain data and derived figures.
+"""A worker as the learner sees it: what it has reported, and the work that it was given. Plain data and derived figures.
 
-Rule: a worker may claim anything, so each figure is bounded: seconds by the length of the session, late actions by a number
-that no loop can reach. The list of tickets in a heartbeat is not kept, because it may be long.
+Rule: a worker may report anything, so each figure is bounded. Times are bounded by the session's length, and late actions by
+a number that no loop can reach. The list of tickets in a heartbeat is not kept, because it may be long.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from millrace.protocol.bounds import Stages
 from millrace.protocol.call_timeouts import OUR_CODE
 from millrace.protocol.messages import Heartbeat, Hello, WorkerActivity, WorkerStatus
 
-MEASURE_S = 0.5  # heartbeats closer together than this don't measure a worker's speed; several may be read at once
+MEASURE_S = 0.5  # heartbeats closer together than this don't measure a worker's speed, because several may be read at once
 MAX_LATE_ACTIONS = 1_000_000  # a larger number of late actions between two heartbeats is not believed
 SUPERVISOR_WORD_S = 5.0  # how long a supervisor's statement is valid
 
@@ -86,8 +86,8 @@ class Member:
     welcomed: int = 0
     """The value of `replies` when the run was sent to the worker."""
     describes: bool = False
-    """Whether the worker may still be busy with a description from before the run, because it has not said that it has begun
-    the run.
+    """Whether the worker may still be busy with a description that was requested before the run. True until the worker
+    reports that it has begun the run.
     """
     heartbeat: Heartbeat | None = None
     """Newest heartbeat."""
@@ -106,15 +106,15 @@ class Member:
     hung: bool = False
     """Whether its process was ended because a call took too long."""
     in_env_code_s: float = -math.inf
-    """Time when the supervisor last said that the worker is in code of the environment or of a policy that the user wrote.
-    Up to that time, the worker doesn't count as silent.
+    """Time when the supervisor last reported that the worker was running code of the environment or of a user-written
+    policy. Up to that time, the worker doesn't count as silent.
     """
     supervisor: SharingSupervisor | None = None
-    """Its supervisor, if it shares weights."""
+    """The worker's supervisor, if that supervisor shares weights."""
 
     @property
     def shared_by(self) -> SharingSupervisor | None:
-        """The supervisor that shares weights with the worker, unless it has fallen silent."""
+        """The supervisor that shares weights with the worker, unless the supervisor has fallen silent."""
         found = self.supervisor
         return found if found is not None and self.heard_s - found.heard_s < SUPERVISOR_WORD_S else None
 
@@ -172,7 +172,7 @@ class Member:
         return [ticket for ticket, sent_at in self.tickets.items() if ticket not in held and heartbeat.replies > sent_at]
 
     def begins(self, heartbeat: Heartbeat) -> None:
-        """Check whether a worker that was describing an environment has begun the run, and record that it has."""
+        """If this heartbeat shows that a worker that was describing an environment has begun the run, record that."""
         if not heartbeat.waits:
             self.describes = False
 
@@ -191,7 +191,7 @@ class Member:
     def stages(self) -> Stages:
         """Seconds in each stage during this session, from the newest heartbeat. None exceeds the length of the session.
 
-        The waiting of a member that only evaluates is not counted, because it doesn't wait for training.
+        Waiting time of a member that only evaluates is not counted, because such a member doesn't wait for training.
         """
         lasted_s = self.heard_s - self.joined_s
         return {
@@ -201,7 +201,7 @@ class Member:
         }
 
     def status(self, now: float) -> WorkerStatus:
-        """The worker's row of `millrace status`."""
+        """The worker's row in the output of `millrace status`."""
         heartbeat = self.heartbeat
         said_s = now - self.activity_s
         activity = self.activity if said_s < SUPERVISOR_WORD_S else None

@@ -1,7 +1,8 @@
 """A rate-limited log of workers' messages and events.
 
-Rule: lines and bytes are limited for each worker, and for all workers of one key together; workers without keys share one
-limit. So a peer that keeps joining under new names, or sends long strings, cannot fill the log. Omitted lines are counted.
+Rule: lines and bytes are limited for each worker, and for all workers with the same key together; workers without keys share
+one limit. This way, a peer that keeps joining under new names, or sends long strings, cannot fill the log. Omitted lines are
+counted.
 """
 
 from __future__ import annotations
@@ -81,7 +82,7 @@ class MemberLog:
 
     def _budget_of_worker(self, source: str, worker: str) -> LogBudget:
         budget = self._of_worker.pop((source, worker), None) or LogBudget(OF_A_WORKER)
-        self._of_worker[source, worker] = budget  # moved to the end: the first worker is the one logged least recently
+        self._of_worker[source, worker] = budget  # moved to the end, so the first worker is the one logged least recently
         if len(self._of_worker) > MOST_WORKERS:
             del self._of_worker[next(iter(self._of_worker))]
         return budget

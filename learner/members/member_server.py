@@ -1,11 +1,11 @@
 """The server through which every learner exchanges messages with its workers. A shell around link, clock and log.
 
-Rule: the inbox is emptied before silent workers are removed, and a learner that was away listens for a while first. So a
-long update, or a stopped process, never costs a healthy worker its membership.
+Rule: the inbox is emptied before silent workers are removed, and a learner that was away listens for a while first. A
+healthy worker therefore never loses its membership because the learner was busy with a long update or was suspended.
 
-Rule: peers that send without end take only a limited part of the learner's time. A turn of listening is cut off after a
-while (ZeroMQ reads its connections in turn, so nobody is left out), new sessions are limited for each key, and the time for
-answers to `Inquire` is limited.
+Rule: peers that never stop sending take only a limited share of the learner's time. Each turn of listening has a time limit;
+nobody is left out, because ZeroMQ reads its connections in turn. New sessions are limited for each key, and so is the time
+spent on answers to `Inquire`.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ from millrace.protocol.wire.learner_link import LearnerLink, RefusedMessage
 log = logging.getLogger("millrace.learner")
 
 ASK_PROCESSES_S = 0.25  # interval at which to ask what the workers that this program started are doing
-AWAY_S = 0.5  # a learner that has not listened for longer was away: busy, or its process was stopped
+AWAY_S = 0.5  # a learner that has not listened for longer was away: it was busy, or its process was suspended
 TURN_S = 0.2  # longest time for reading messages before the caller continues
 SHORT_TURN_S = 0.003  # shortest time for reading messages, even in a short turn
 FAIR_SHARE = 10_000  # number of messages after which every connection has been read, because ZeroMQ reads them in turn
@@ -67,7 +67,7 @@ STATUS_SHARE = 20  # answers to Inquire take at most 1 / STATUS_SHARE of the tim
 
 
 class ServedHub(Protocol):
-    """The owner of a server. The server calls it with each event."""
+    """The owner of a server. The server reports each event to it."""
 
     def status(self, now: float) -> Status:
         """The answer to `millrace status`."""
@@ -76,7 +76,7 @@ class ServedHub(Protocol):
         """Called with each event after it was logged."""
 
     def sent(self, peer: bytes) -> None:
-        """Called after each message that was sent, with its receiver."""
+        """Called after each message that was sent. `peer` is its receiver."""
 
 
 @dataclass(frozen=True)
@@ -84,15 +84,15 @@ class ServerSettings:
     """The settings in which the servers of different hubs differ."""
 
     grace_s: float = AWAY_S
-    """After the learner was away, no worker is removed as silent for this many seconds."""
+    """For this many seconds after the learner was away, no worker is removed as silent."""
     log_tracebacks: bool = True
-    """Whether to log the traceback of an environment. False if the hub raises it."""
+    """Whether to log tracebacks from environments. False if the hub raises them as exceptions."""
     log_joins: bool = True
     """Whether to log that a worker joined. False in the lobby, because the worker joins the run shortly after."""
 
 
 class MemberServer:
-    """Exchanges messages with the members. Removes those that are silent or have ended, or whose key was revoked."""
+    """Exchanges messages with the members. Removes those that are silent, have ended, or had their key revoked."""
 
     def __init__(
         self,
@@ -130,7 +130,7 @@ class MemberServer:
     def listen(self, timeout_s: float, short: bool = False) -> None:
         """Wait at most `timeout_s` for messages, answer them, and remove the members that are gone.
 
-        If `short`, it answers for no longer than the caller has worked since the last call; other messages wait.
+        If `short`, it answers messages for no longer than the caller has worked since the last call; the rest wait.
         """
         worked_s = self._clock() - self.listened_s
         self.receive(timeout_s, min(TURN_S, max(SHORT_TURN_S, worked_s)) if short else TURN_S)
@@ -139,7 +139,7 @@ class MemberServer:
         now = self._clock()
         self._record_activities(now)
         if now - self.listened_s > timeout_s + AWAY_S:
-            # Messages that were sent meanwhile may still be in the kernel, because ZeroMQ's thread may have been stopped
+            # Messages that were sent meanwhile may still be in the kernel, because ZeroMQ's thread may have been suspended
             # together with this process.
             self._remove_silent_from_s = now + self._settings.grace_s
         self.listened_s = now
@@ -173,7 +173,8 @@ class MemberServer:
         """Call `turn`, which must listen, until this number of `workers` have joined.
 
         Raises `NoWorkers` after `timeout_s`, or at once if that many can no longer join. Workers that only evaluate don't
-        count. Until `describing_until_s` on the clock, it also waits for those that still describe the environment.
+        count. Until the clock reaches `describing_until_s`, it also waits for workers that are still describing the
+        environment.
         """
         deadline_s = self._clock() + timeout_s
         wait = LongWait(self._clock())
@@ -226,8 +227,10 @@ class MemberServer:
             self._remove_ended_processes(0.0)
 
     def close(self) -> None:
-        """Forget the hub. The hub and this server refer to each other, so without this, both would
-        keep their memory and file descriptors until the garbage collector runs.
+        """Forget the hub.
+
+        The hub and this server refer to each other, so without this call, both would keep their memory and file descriptors
+        until the garbage collector runs.
         """
         del self._hub, self._processes
 
@@ -241,7 +244,7 @@ class MemberServer:
         return NoWorkers(f"waited {timeout_s:g} s for {awaited} at {address}, {joined}; start one: {start}")
 
     def what_workers_do(self) -> str:
-        """What the workers are doing, the one that has been held up longest first; if there are none, what is awaited."""
+        """What the workers are doing, those held up longest first. Without workers, what the learner is waiting for."""
         members = self._membership.members.values()
         processes = self._processes
         doing, wrote = what_they_do(members, processes.activities(), processes.last_lines(), self._clock())
@@ -291,7 +294,7 @@ class MemberServer:
         return [(peer, Refuse(line))] if member is None else self._membership.refuse(member, SentUnusable, line)
 
     def _status_frames(self, now: float) -> Sequence[Buffer]:
-        """The frames of a status. It is kept for `STATUS_SHARE` times as long as it took to compute."""
+        """The frames of a status, which are reused for `STATUS_SHARE` times as long as they took to compute."""
         if now >= self._status[0]:
             frames = status_frames(self._hub.status(now))
             took_s = self._clock() - now

@@ -40,8 +40,8 @@ class KeyRevoked:
     """Event: the worker's key may no longer connect."""
 
 
-# The next state for each message or event. The learner itself sends Drain. Other messages of an unknown worker are answered
-# with Rejoin.
+# The next state for each message or event. The learner itself sends Drain. Other messages from an unknown worker are
+# answered with Rejoin.
 TABLE: dict[MemberState, dict[type, MemberState]] = {
     MemberState.UNKNOWN: {Hello: MemberState.ACTIVE},
     MemberState.ACTIVE: {

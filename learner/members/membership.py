@@ -3,13 +3,13 @@
 Rule: when a session ends, the learner forgets the worker's data, except totals and a limited number of refusals. The number
 of members is limited.
 
-Rule: workers that joined before there is a run keep their sessions when it begins (`take_over`). A worker that was asked for
-a description and has not answered gets no work until it has begun the run, because it may hang.
+Rule: workers that join before the run begins keep their sessions in the run (`take_over`). A worker that was asked for a
+description and has not answered gets no work until it has begun the run, because it may be hanging.
 
-Rule: a process has one session at a time. A repeated Hello is answered with the same Welcome. A Hello of a new attempt, or
-of another process under the same name, ends the previous session. A process that lost its name in this way may join again;
-if processes keep taking a name from each other, the one that loses it the third time is refused. A process that was refused
-stays refused. A worker that is silent for too long is removed.
+Rule: a process has one session at a time. A repeated Hello is answered with the same Welcome. A Hello from a new attempt, or
+from another process with the same name, ends the previous session. A process that lost its name in this way may join again.
+If processes keep taking a name from each other, the one that loses it at the third takeover is refused. A process that was
+refused stays refused. A worker that is silent for too long is removed.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ class Answered:
     out: list[Outgoing]
     """The messages of the answer."""
     changed: bool = False
-    """Whether a worker joined or members were removed, so that work may have to be dealt."""
+    """Whether a worker joined or members were removed. If so, work may have to be dealt."""
 
 
 M = TypeVar("M", bound=Member)
@@ -100,8 +100,8 @@ class Membership(Generic[M]):
         self.draining: str | None = None
         """why the workers were asked to leave; None if they were not"""
         self.progress = {False: 0, True: 0}
-        """how many times a member has reported more env steps, or more finished calls of the environment, than before. The
-        key False counts members that may collect, and True those that only evaluate
+        """how many times a member has reported more env steps, or more finished environment calls, than before. Key False is
+        for members that may collect, True for those that only evaluate
         """
         self.has_policy_code = isinstance(run, RunSpec) and bool(run.policy_code)
         """whether a user-defined policy acts in the workers; if not, a failure is never blamed on the policy"""
@@ -114,7 +114,7 @@ class Membership(Generic[M]):
         self._none_silent_before_s = -math.inf  # before this time, no member can have been silent for too long
         self._of_process: dict[tuple[str, int], M] = {}  # the members by name and process_nonce
         self._removed_for_silence: dict[str, int] = {}  # process_nonce by worker, until it joins again; oldest first
-        self._stages_of_left: Stages = {}  # total seconds in each stage of the members that have left
+        self._stages_of_left: Stages = {}  # total seconds that members that have left spent in each stage
         self._refused: dict[bytes, tuple[int, str]] = {}  # by peer, the nonce of the process that was refused, and why
 
     def active(self) -> list[M]:
@@ -143,7 +143,7 @@ class Membership(Generic[M]):
         return events
 
     def hear(self, peer: bytes, message: ToLearner, now: float) -> M | Answered:
-        """The member in whose session this message was sent, for the caller to answer it; otherwise, the answer."""
+        """The member in whose session this message was sent, if the caller must answer it; otherwise, the answer."""
         match message:
             case Hello():
                 out, joined = self.join(peer, message, now)
@@ -170,7 +170,7 @@ class Membership(Generic[M]):
         return member
 
     def answer_ended_session(self, peer: bytes, message: ToLearner) -> list[Outgoing]:
-        """The answer to a message of a session that has ended: a request to join again, unless the worker is leaving."""
+        """The answer to a message from a session that has ended: a request to join again, unless the worker is leaving."""
         if isinstance(message, Hello | Alive | Goodbye | Failure):  # rule UNKNOWN_SESSION
             return []
         late = message.env_steps if isinstance(message, Rollout) else 0
@@ -224,7 +224,7 @@ class Membership(Generic[M]):
         return [self._welcome(member)], member
 
     def take_over(self, waiting: Membership[Member], now: float) -> list[Outgoing]:
-        """Begin the run for the workers that wait for it. Their sessions continue; another Welcome sends them the run."""
+        """Begin the run for the workers waiting for it. Their sessions continue; another Welcome sends them the run."""
         self._first_session = waiting._first_session
         self._next_session = waiting._next_session
         self._joins = waiting._joins
@@ -241,7 +241,7 @@ class Membership(Generic[M]):
         return [self._welcome(member) for member in self.members.values()]
 
     def welcome_again(self, member: M, heartbeat: Heartbeat) -> list[Outgoing]:
-        """Repeat the Welcome that sends the run if this heartbeat shows that it was lost."""
+        """Repeat the Welcome that sends the run, if this heartbeat shows that the Welcome was lost."""
         lost = heartbeat.waits and not isinstance(self._run, WaitSpec) and heartbeat.replies > member.welcomed
         return [self._welcome(member)] if lost else []
 
@@ -262,7 +262,7 @@ class Membership(Generic[M]):
         """Record a supervisor's statements about members.
 
         A statement counts only if the member has the supervisor's key, and if the supervisor knows the member's nonce.
-        Returns the answer, and the exits of processes that removed members.
+        Returns the answer, and the process exits that led to the removal of a member.
         """
         key = key_of_peer(peer)
         found = [self.record_activity(activity, now, key) for activity in alive.running]
@@ -286,7 +286,7 @@ class Membership(Generic[M]):
     def record_activity(self, activity: WorkerActivity, now: float, key: bytes | None = None) -> M | None:
         """Record what a member's process is doing. Returns the member.
 
-        `key` is the key of the supervisor that says so; None if this program is the supervisor.
+        `key` is the key of the supervisor that reports it; None if this program is the supervisor.
         """
         member = self._of_process.get((activity.worker, activity.process_nonce))
         if member is None or (key is not None and key != key_of_peer(member.peer)):

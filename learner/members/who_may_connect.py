@@ -1,8 +1,8 @@
 """The learner's endpoint: its address, who may connect, and the command that starts a worker on another machine.
 
 Rule: an address that other machines can reach needs keys, unless the user sets `insecure`. Keys are made automatically on
-first use. On loopback they are needed only if a key folder was named. Over ipc and inproc, the operating system decides who
-may connect. Of the workers that may connect, `membership.py` decides which may join a run.
+first use. On loopback they are needed only if a key folder was specified. Over ipc and inproc, the operating system decides
+who may connect. `membership.py` then decides which of the connected workers may join a run.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class Listening(Protocol):
 
     @property
     def keys(self) -> str:
-        """The key folder that was named; empty if none was."""
+        """The key folder that the user specified; empty if none."""
         ...
 
     @property

@@ -27,7 +27,7 @@ class WorkerProcesses:
         return ()
 
     def activities(self) -> Sequence[WorkerActivity]:
-        """What the workers whose processes are running are doing. Stopped processes are left out."""
+        """What each running worker process is doing. Suspended processes are left out."""
         return ()
 
     def last_lines(self) -> Mapping[str, str]:
@@ -46,7 +46,7 @@ class WorkerProcesses:
         return False
 
     def stop(self, timeout_s: float) -> None:
-        """Ask all processes to end, and kill those that still run after `timeout_s`."""
+        """Ask all processes to end, and kill those still running after `timeout_s`."""
 
     def lower_priority(self) -> None:
         """Give these processes, and those that replace them, the lowest CPU priority."""

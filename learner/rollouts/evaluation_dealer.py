@@ -5,10 +5,10 @@ that number. If an evaluation runs alongside training, only the workers that do 
 active workers do, including those without a lane. A ticket whose worker is lost goes to another worker. The numbers of these
 tickets start at `FIRST_TICKET`, far above those of rollouts, and the ledger does not count them.
 
-Rule: a worker that claims to play and never answers must not block the learner forever, but can't be told from a slow one.
-So if a worker takes too long (`stall_watch.py` says when), `share` gives its ticket to a second worker as well. The seeds
-determine the episodes, so it does not matter who answers first: the first answer counts. Until it joins again, the late
-worker gets tickets only if nobody else can play.
+Rule: a worker that claims to play and never answers must not block the learner forever, but it can't be told from a slow
+one. Therefore, if a worker takes too long (`stall_watch.py` says when), `share` gives its ticket to a second worker as well.
+The first answer counts; it does not matter whose it is, because the seeds determine the episodes. Until it joins again, the
+late worker gets tickets only if nobody else can play.
 
 Rule: rows count only together with the answer of the worker that sent them. If a worker is lost, or its answer can't be
 used, its rows are dropped, and its ticket is played again from the start.
@@ -53,13 +53,13 @@ class EvaluationPlan:
     copies: int
     """the number of seeds in a ticket, which is how many episodes a worker plays at the same time"""
     most_steps: int
-    """the number of env steps at which an episode is cut"""
+    """the number of env steps at which an episode is cut off"""
     greedy: bool = True
     """whether to take the most probable actions; if not, actions are sampled"""
     send_rows: bool = False
     send_frames: bool = False
     of_best: bool = False
-    """whether the weights are those of the best policy of the run"""
+    """whether the weights are those of the run's best policy"""
     opponents: tuple[int, ...] = ()
     """in a run with teams, the opponents, which play in turn. They are numbered as in a `Permit`"""
 
@@ -91,7 +91,7 @@ def episode_seeds(seed: int, episodes: int, purpose: Purpose = Purpose.EPISODES)
 
 @dataclass(frozen=True)
 class PlayedEpisode:
-    """An episode that was played to its end or was cut."""
+    """An episode that was played to its end or was cut off."""
 
     episode: Episode
     cut: bool
@@ -133,7 +133,7 @@ class EvaluationDealer:
         self._undealt: list[int] = []  # a heap of the indices of tickets that no worker has
         self._played: dict[int, Evaluated] = {}  # answers, by index of the ticket
         self._rows: dict[tuple[int, bytes], dict[int, list[EpisodeRows]]] = {}  # by ticket index and worker, then by episode
-        self._late: set[int] = set()  # sessions of workers whose ticket a second worker has answered first
+        self._late: set[int] = set()  # sessions of workers whose ticket a second worker answered first
 
     @property
     def pending(self) -> bool:
@@ -197,7 +197,7 @@ class EvaluationDealer:
         return [PlayedEpisode(*both) for answer in answers for both in zip(answer.episodes, answer.cut, strict=True)]
 
     def deal(self, active: Sequence[Member]) -> list[Outgoing]:
-        """Give a ticket to each of these workers that may play; then a second one if there are more tickets than workers.
+        """Give a ticket to each of these workers that may play, then a second one if there are more tickets than workers.
 
         Workers that only evaluate come first, then the others, each in the order of joining. If copies are limited, only the
         first workers play, because a worker keeps its copies.
@@ -218,7 +218,7 @@ class EvaluationDealer:
         return out
 
     def share(self, active: Sequence[Member]) -> list[Outgoing]:
-        """Give the oldest ticket that only one worker plays to a second worker, which must be idle."""
+        """Give the oldest ticket that only one worker is playing to a second, idle worker as well."""
         plan = self._plan
         assert plan is not None
         who = [member for member in active if member.hello.evaluates or not self.beside or self.most_copies is None]

@@ -1,4 +1,4 @@
-"""The hub: it connects link, ticket coordinator and clock, and lets a training loop gather rollouts and publish weights.
+"""The hub connects link, ticket coordinator and clock, and lets a training loop gather rollouts and publish weights.
 
 `millrace.learner.train` deals with workers only through the hub, and so does `millrace.RolloutService` for your own loop. A
 loop waits only in `wait_for`, `gather`, `end_evaluation` and `drain`. Rule: every wait has a deadline, and the log says what
@@ -48,8 +48,8 @@ T = TypeVar("T")
 POLL_S = 0.1
 GOODBYE_WITHIN_S = 5.0  # how long to wait for Goodbyes at the end of a run; late rollouts are still counted meanwhile
 GOODBYE_IF_CUT_SHORT_S = 2.0  # the same, if the work is cut short or no episode is missing
-# Least interval between two pulses that do any work. A pulse takes as long as a small minibatch, of which there may be ten
-# within this interval.
+# Shortest interval between two pulses that do any work. A pulse takes as long as a small minibatch, and ten of those may fit
+# into this interval.
 PULSE_S = 0.003
 
 
@@ -66,7 +66,7 @@ class HubSettings:
 
 
 class HubSnapshot(NamedTuple):
-    """The state of the hub at one moment, for metrics and checkpoints. It is cheap to make, and never changes later."""
+    """The state of the hub at one moment, for metrics and checkpoints. It is cheap to make, and never changes afterwards."""
 
     ledger: Ledger
     """A copy of the hub's ledger."""
@@ -91,15 +91,15 @@ class HubSnapshot(NamedTuple):
     learn_s: float = 0.0
     """Seconds spent on anything but these waits and evaluations, since the learner first waited for rollouts."""
     waiting: str = ""
-    """A line for people that says who waits for whom; empty if nobody has waited for long."""
+    """A human-readable line that says who waits for whom; empty if nobody has waited for long."""
     roles: Mapping[str, str] = {}
     """The `Member.role` of each worker, by its name."""
     worker_stages: Stages = {}
     """Total seconds of all workers in each stage since this learner started, including workers that have left."""
     received: tuple[int, int] = (0, 0)
-    """Number of messages received, and of their bytes."""
+    """Number of messages received, and their total bytes."""
     sent: tuple[int, int] = (0, 0)
-    """Number of messages sent, and of their bytes."""
+    """Number of messages sent, and their total bytes."""
     refused_messages: int = 0
     """Number of messages that were refused because their sender's key was revoked."""
     refused_handshakes: int = 0
@@ -132,7 +132,7 @@ class Hub:
         self._check_interrupt = check_interrupt
         self._observer = observer
         self._clock = clock
-        self._describing_until_s = 0.0  # until then, the run waits for workers that still describe the environment
+        self._describing_until_s = 0.0  # until then, the run waits for workers that are still describing the environment
         self._lags: list[int] = []  # the lag of each rollout of the last `gather`
         self.lag_statistics = LagStatistics()
         self._progress = Progress()
@@ -143,10 +143,11 @@ class Hub:
         self._time = LearnerTime(coordinator, clock(), self._server.awaited, self._processes)
 
     def take_over(self, waiting: Membership[Member], described_in_s: float = 0.0) -> None:
-        """Begin the run for the workers that wait for it. `described_in_s`: how long the environment's description took.
+        """Begin the run for the workers waiting for it. `described_in_s`: how long the environment's description took.
 
-        Some workers may still describe the environment, because that took long. Another one takes as long at most, unless it
-        hangs; if the run began without it, its lanes would be opened by other workers, one after another.
+        If the description took long, other workers may still be describing the environment. The run waits for them for
+        `described_in_s` more seconds, which is enough for a worker that doesn't hang. If the run began without it, other
+        workers would have to open its lanes, one after another.
         """
         self._describing_until_s = self._clock() + described_in_s
         self._server.send(self.coordinator.take_over(waiting, self._clock()))
@@ -171,8 +172,9 @@ class Hub:
     ) -> None:
         """Set the newest weights. The arrays must not change afterwards.
 
-        If `deal`, deals the tickets of the next update now; if not, `gather` deals them, because these weights are evaluated
-        first. `env_steps` is the number of env steps of training so far; with None, the weights never become an opponent.
+        If `deal`, deals the tickets of the next update now. Otherwise, `gather` deals them later; use this for weights that
+        are evaluated first. `env_steps` is the number of training env steps so far; with None, the weights never become an
+        opponent.
         Raises `RunError` if a parameter is too large for `acting_dtype`.
         """
         sent = to_wire_dtype(parameters, self.settings.acting_dtype)
@@ -303,13 +305,13 @@ class Hub:
         self._observer(self)
 
     def waiting(self, now: float) -> str:
-        """A line for people that says who waits for whom; empty if nobody has waited for long."""
+        """A human-readable line that says who waits for whom; empty if nobody has waited for long."""
         return self._time.line(now)
 
     # ---------------------------------------------------------------- progress and state
 
     def report_progress(self, progress: Progress) -> None:
-        """Store the progress of the run, for the answers to status requests."""
+        """Store the run's progress, for answers to status requests."""
         self._progress = progress
 
     def progress(self) -> RunProgress:
@@ -401,7 +403,7 @@ class Hub:
         return result
 
     def _share_evaluation(self, now: float) -> None:
-        """Let an idle worker, if there is one, also play the ticket that another worker has played for too long."""
+        """Let an idle worker, if there is one, also play the ticket that another worker has been playing for too long."""
         if out := self.coordinator.share_evaluation():
             seconds = self.settings.stall_timeout_s
             line = self.waiting(now)

@@ -1,8 +1,9 @@
-"""The lag rule: how far the acting weights may be behind the newest ones, and so which weights act in which round. Pure.
+"""The lag rule: how far the acting weights may be behind the newest ones, and thus which weights act in which round. Pure.
 
-Rule: update u uses round u, which is one rollout of every lane. All rollouts of a round are collected with one version of
-the weights: the newest one when update u - L began, or when the first update began if u < L, where L is `max_lag`. So
-results don't depend on the speed of workers or learner. Once update u has begun, the rounds up to u + L may be collected.
+Rule: update u uses round u, which is one rollout from every lane. All rollouts of a round are collected with one version of
+the weights. With L = `max_lag`, this is the version that was the newest when update u - L began or, if u < L, when the first
+update began. Results therefore don't depend on the speed of the workers or the learner. Once update u has begun, the rounds
+up to u + L may be collected.
 """
 
 from __future__ import annotations
@@ -15,14 +16,14 @@ class Rounds:
     """The rounds of one run, counted from 0."""
 
     def __init__(self, max_lag: int, next_round: int = 0, versions: Mapping[int, int] = MappingProxyType({})) -> None:
-        """For a resumed run, `next_round` is the round of its next update, and `versions` act in its open rounds."""
+        """For a resumed run, `next_round` is its next update's round, and `versions` has the version of each open round."""
         self.max_lag = max_lag
         """L"""
         self.next = next_round
         """the round of the next update"""
-        # The versions in rounds that were open when the run was interrupted and have not been opened again, by round.
+        # By round, the versions in rounds that were open when the run was interrupted and have not been opened again.
         self._saved = {number: versions[number] for number in sorted(versions) if number <= next_round + max_lag}
-        # The versions in open rounds, which may be collected and have not been taken, by round.
+        # By round, the versions in open rounds: those that may be collected and have not been taken.
         self._versions: dict[int, int] = {}
 
     def begin(self, newest: int) -> range:
@@ -40,7 +41,7 @@ class Rounds:
         self.next += 1
 
     def reopen(self, version: int) -> None:
-        """Open the round that was closed last, in which this version acts, because its rollouts were put back."""
+        """Reopen the round that was closed last, because its rollouts were put back. `version` acts in it."""
         self.next -= 1
         self._versions = {self.next: version} | self._versions
 
@@ -50,7 +51,7 @@ class Rounds:
 
     @property
     def versions(self) -> Mapping[int, int]:
-        """By round, the version that acts in it: for open rounds, and for those that a resumed run will open again."""
+        """The version that acts in each open round, and in each round that a resumed run will open again, by round."""
         return self._saved | self._versions
 
     def acting(self) -> set[int]:

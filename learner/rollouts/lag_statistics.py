@@ -1,7 +1,7 @@
 """Measures the lag of rollouts, and how long new weights take to reach the environments. Pure.
 
-The lag of a rollout is the learner's version minus the rollout's version at the time when the rollout is used. The first-use
-time of a worker is the time from the publication of weights to the arrival of the worker's first rollout with them. It
+The lag of a rollout is the learner's version when the rollout is used, minus the rollout's version. A worker's first-use
+time is the time from the publication of weights to the arrival of the worker's first rollout collected with them. It
 includes the time on the network, the time in the worker and the time that one rollout takes.
 """
 
@@ -36,7 +36,7 @@ class LagStatistics:
         newest = self._newest_used.pop(worker, -1)
         if version > newest and version in self._published_s:
             self._first_use_s[worker].append(now - self._published_s[version])
-        self._newest_used[worker] = max(version, newest)  # moved to the end: the first was heard from longest ago
+        self._newest_used[worker] = max(version, newest)  # moved to the end, so the first was heard from longest ago
         if len(self._newest_used) > MOST_WORKERS:
             forgotten = next(iter(self._newest_used))
             del self._newest_used[forgotten]
@@ -47,7 +47,7 @@ class LagStatistics:
         self.lags.update(lags)
 
     def not_used(self, lags: Iterable[int]) -> None:
-        """Take back the lags of rollouts whose update was undone."""
+        """Subtract the lags of rollouts whose update was undone."""
         self.lags.subtract(lags)
         self.lags = +self.lags  # drops counts that are 0 now
 

@@ -1,9 +1,9 @@
 """The learner's record of a lane's past, accumulated from its rollouts. Pure.
 
-Rule: a history is a fold over the rollouts of a lane in the order of their rounds, whoever collected them. It keeps only
-what a worker needs to continue where the rollouts end (`protocol/lane_past.py`): how the newest episode of each copy began,
-and the actions since. An episode cannot be replayed if it is longer than the limit, or if it isn't known how it began. If
-the lane is lost, the copy of such an episode starts afresh.
+Rule: a history is a fold over a lane's rollouts in round order, whoever collected them. It keeps only what a worker needs to
+continue where the rollouts end (`protocol/lane_past.py`): how the newest episode of each copy began, and the actions since.
+An episode cannot be replayed if it is longer than the limit, or if it isn't known how it began. If the lane is lost, a copy
+with such an episode starts afresh.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class LaneHistory:
     copies: list[LastEpisode]
     """[N] the newest episode of each copy; rows are counted since the history began"""
     most_steps: int
-    """the largest number of steps of an episode that is replayed"""
+    """episodes with more steps than this are not replayed"""
     rows: deque[_OfRound] = field(default_factory=deque)
     """the rows since the beginning of the earliest episode that can be replayed"""
     count: int = 0
@@ -85,8 +85,8 @@ class LaneHistory:
     def start_anew(self, attempts: int, *, from_past: bool = True) -> None:
         """Let all copies start afresh after this many failed attempts to continue. No start number is used twice.
 
-        `from_past` says whether one of them began from this history. If so, only some of the copies started afresh in that
-        attempt.
+        `from_past` says whether one of these attempts began from this history. If so, only some of the copies started afresh
+        in that attempt.
         """
         tried = [last.start + (from_past and not last.goes_on) for last in self.copies]  # the start numbers of that attempt
         self.copies = [LastEpisode(number + attempts - 1, None, self.count, False) for number in tried]
@@ -186,7 +186,7 @@ def _resets(rollout: Rollout) -> Bools:
 
 
 def _changes(kept: Iterable[_OfRound], start: int) -> dict[int, bytes]:
-    """The rows at which the attributes change, counted from `start`, with the new attributes."""
+    """The new attributes at each row where they change, by row, counted from `start`."""
     found: dict[int, bytes] = {}
     before = b""
     for rows in kept:
@@ -202,7 +202,7 @@ class LaneHistories:
     copies: int = 1
     """N, the number of env copies of a lane"""
     most_steps: int = -1
-    """the largest number of steps of an episode that is replayed; -1 if none is"""
+    """episodes with more steps than this are not replayed; -1 if none are replayed"""
     pasts: Sequence[LanePast] = ()
     """the pasts of lanes, from a checkpoint"""
 

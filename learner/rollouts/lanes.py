@@ -1,9 +1,9 @@
 """The coordinator's records of lanes and tickets. Pure.
 
 Rule: a lane has one owner at a time. A new owner has new env copies for it, so the incarnation rises, and rollouts are
-counted from 0 again. The new owner continues the lane's past, unless the lane's environment has failed or every attempt to
-continue it ended with the loss of a worker. In these cases the copies start afresh, so that they don't fail in the same way
-forever.
+counted from 0 again. The new owner continues the lane's past, unless the environment has failed or `MOST_ATTEMPTS` workers
+were lost since the lane's last rollout arrived. In these cases the copies start afresh, so that they don't fail in the same
+way forever.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from millrace.protocol.arrays import Bools
 from millrace.protocol.messages import Hello, LanePast, Permit
 from millrace.protocol.rollout import Rollout
 
-MOST_ATTEMPTS = 3  # copies start afresh after this many attempts to continue their lane have each lost a worker
+MOST_ATTEMPTS = 3  # copies start afresh once this many attempts to continue their lane have each lost a worker
 
 
 @dataclass
@@ -45,8 +45,8 @@ class TicketedLane(PlacedLane):
     failures: int = 0
     """How many times its environment has failed since its last rollout arrived."""
     continued_in_vain: bool = False
-    """Whether an attempt to continue the lane was lost since its last rollout arrived. In this attempt, copies that couldn't
-    be continued have used the next start number.
+    """Whether, since the lane's last rollout arrived, a worker was lost in an attempt to continue the lane. In this attempt,
+    copies that couldn't be continued have used the next start number.
     """
     losses: int = 0
     """How many times its worker was lost while collecting, since its last rollout arrived."""
@@ -78,7 +78,7 @@ class TicketedLane(PlacedLane):
     def past(self, histories: LaneHistories, waiting: Iterable[tuple[int, Rollout, bytes]]) -> LanePast | None:
         """The past that a new owner continues; None if the lane has not begun.
 
-        `waiting` are the rollouts that follow the history, in order. Each entry consists of the incarnation, the rollout,
+        `waiting` has the rollouts that follow the history, in order. Each entry consists of the incarnation, the rollout,
         and the attributes of the env copies.
         """
         history = None if self.history is None else self.history.copy()
@@ -99,7 +99,7 @@ class TicketedLane(PlacedLane):
     ) -> Bools:
         """Take the rollout of the next round. Returns [N], True for env copies that don't continue the previous rollout.
 
-        `from_past` says whether its worker was told to continue the lane's past.
+        `from_past` says whether the rollout's worker was told to continue the lane's past.
         """
         sequence = rollout.sequence
         continues = self.newest_taken == (incarnation, sequence - 1)
@@ -133,7 +133,7 @@ class TicketedLane(PlacedLane):
 
     @property
     def _attempts(self) -> int:
-        """How many attempts the copies have had for which they start afresh; 0 while attempts continue the lane."""
+        """The number of lost attempts because of which copies start afresh; 0 as long as a new owner continues the lane."""
         return self.failures + self.losses // MOST_ATTEMPTS
 
     def arrived(self, sequence: int) -> None:

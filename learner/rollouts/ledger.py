@@ -17,7 +17,7 @@ from msgspec import Meta
 from millrace.protocol.bounds import LARGEST
 
 Past = Annotated[int, Meta(ge=0, le=LARGEST >> 2)]
-"""A count that a resumed run reads from a file and continues. It is limited, so that it fits into messages even later."""
+"""A count that a resumed run reads from a file and continues. It is limited so that it still fits into messages later."""
 
 
 class Ledger(msgspec.Struct, kw_only=True):
@@ -41,7 +41,7 @@ class Ledger(msgspec.Struct, kw_only=True):
     messages_bad: Past = 0
     """messages that could not be read"""
     late_actions: Past = 0
-    """actions that a program with its own loop received too late, so that it chose an action itself"""
+    """actions that reached a program with its own loop too late, so it chose an action itself"""
 
     @property
     def outstanding(self) -> int:

@@ -1,8 +1,8 @@
 """Self-play: which opponents there are, who meets whom, and how strong they are. Pure.
 
 Rule: the opponent of a rollout is a pure function of the seed, the lane, the round, and the pool as it was when the acting
-weights were made. So it depends neither on speed nor on the number of workers. Opponents are the newest snapshots of the
-policy, and programs that the user wrote.
+weights were made. It therefore depends neither on speed nor on the number of workers. Opponents are the newest snapshots of
+the policy, and programs that the user wrote.
 
 Rule: ratings are computed from the episodes that updates used, in order (Elo 1978; ML-Agents' self-play). An opponent's
 rating changes by the same amount as the policy's, in the opposite direction. Episodes against a version that isn't a
@@ -25,7 +25,7 @@ from millrace.protocol.rollout import Episode
 FIRST_RATING = 1200.0
 ELO_KEY = "self_play/elo"
 K = 8.0
-"""Elo's K: the largest change of a rating by one episode."""
+"""Elo's K: the largest change in a rating caused by one episode."""
 SCALE = 400.0
 """The rating difference at which the weaker of two players loses ten times as often as it wins."""
 
@@ -50,7 +50,7 @@ class PoolState(msgspec.Struct, kw_only=True):
 
 
 def teams_of(seats: tuple[str, ...], patterns: Sequence[str] = ()) -> tuple[tuple[int, ...], ...]:
-    """The seats of each team, from patterns of their names; without patterns, each seat is a team.
+    """The seats of each team, selected by patterns for seat names; without patterns, each seat is a team.
 
     Raises `UsageError` if the patterns don't divide the seats into teams of equal size.
     """
@@ -74,7 +74,7 @@ class PoolSettings(NamedTuple):
 
     seed: int
     window: int
-    """How many of the newest snapshots play."""
+    """How many of the newest snapshots serve as opponents."""
     save_steps: Count
     """Env steps between two snapshots."""
     latest: float
@@ -121,9 +121,9 @@ class OpponentPool:
         return True
 
     def of(self, lane: int, round_number: int, version: int) -> int:
-        """The opponent in episodes that begin in the rollout of this lane and round, which is collected with this version.
+        """The opponent in episodes that begin in this lane's rollout of this round. The rollout is collected with `version`.
 
-        A number of at least 0 is the version of a snapshot or of the acting weights; -1 - k is program k.
+        A result of at least 0 is the version of a snapshot or of the acting weights; -1 - k is program k.
         """
         settings = self._settings
         window = [each for each in self.versions if each <= version][-settings.window :] if settings.window else []
@@ -138,7 +138,7 @@ class OpponentPool:
         return {ELO_KEY: self.state.rating, "self_play/snapshots": float(len(self.versions))}
 
     def played(self, episodes: Iterable[Episode]) -> None:
-        """Change the ratings according to episodes that an update used."""
+        """Update the ratings with the episodes that an update used."""
         state = self.state
         by_version = {snapshot.version: snapshot for snapshot in state.snapshots}
         for episode in episodes:

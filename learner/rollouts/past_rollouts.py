@@ -1,7 +1,7 @@
-"""The state of rollouts that a resumed run needs: numbers, the past of each lane, and the weights of open rounds.
+"""The rollout state that a resumed run needs: round numbers, each lane's past, and the weights of open rounds.
 
-Rule: with this state, the next learner deals the tickets that the last one would have dealt: for the same rounds, with the
-same versions, on lanes that continue where their last rollout ended.
+Rule: with this state, a new learner deals the same tickets that the previous one would have dealt: for the same rounds, with
+the same versions, on lanes that continue where their last rollout ended.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """The tickets for rollouts: which rounds are open, which worker collects what, and what has arrived. Pure.
 
 Rule: a ticket permits one rollout, of one lane, in one round, with one version of the weights. `lag_rule.py` says which
-rounds are open, and each lane gets a ticket for each of them. If a ticket is lost, its round is dealt again, with the same
-version, and the worker that gets it continues the lane where its last rollout ended. Every ticket and every transition is
-counted in the ledger.
+rounds are open, and each lane gets a ticket for each of them. If a ticket is lost, a new ticket is dealt for the same round,
+with the same version, and the worker that gets it continues the lane where the lane's last rollout ended. Every ticket and
+every transition is counted in the ledger.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ class AcceptedRollout:
     incarnation: int
     """The incarnation of the lane when the ticket was dealt. Each incarnation has new env copies."""
     fresh: Bools | bool = True
-    """[N] True for env copies that don't continue the previous rollout taken from the lane, because the copy has started
-    afresh or a rollout in between was rejected. A single value applies to all copies.
+    """[N] True for env copies that don't continue the lane's previous taken rollout, because the copy has started afresh or
+    a rollout in between was rejected. A single value applies to all copies.
     """
     from_past: bool = False
     """Whether the worker was told to continue the lane's past with this rollout."""
@@ -73,14 +73,14 @@ class RolloutDealer:
         """the rollouts that have arrived and were not taken, by round and by lane"""
         self.rounds = rounds
         self.attributes: dict[int, bytes] = {}
-        """the attributes of env copies, packed, by the version of the weights with which they were sent; versions without
+        """the packed attributes of env copies, by the version of the weights with which they were sent; versions without
         attributes may be missing
         """
         self._first_round = rounds.next
         self._steps_before = self.ledger.transitions_used  # before the run was resumed
         self._absent = list(incarnations[lanes:])  # incarnations of lanes that the run had earlier, and may have again
         self._absent_pasts = [past for past in self.histories.pasts if past.lane >= lanes]
-        self._to_deal = set[int]()  # lanes for which open rounds have no ticket
+        self._to_deal = set[int]()  # lanes that lack a ticket for an open round
 
     # ---------------------------------------------------------------- the learner's side
 
@@ -106,7 +106,7 @@ class RolloutDealer:
     def not_used(self, taken: list[AcceptedRollout]) -> None:
         """Put back the rollouts that `take` returned last, because their update was undone.
 
-        The state is the one before `take`: these rollouts wait, and the next update uses their round.
+        This restores the state before `take`: the rollouts wait again, and the next update uses their round.
         """
         self.rounds.reopen(taken[0].rollout.version)
         self.ready[self.rounds.next] = {arrived.rollout.lane: arrived for arrived in taken}
@@ -139,7 +139,7 @@ class RolloutDealer:
     # ---------------------------------------------------------------- out
 
     def deal(self, members: Mapping[bytes, Member]) -> list[Outgoing]:
-        """Deal the rounds that no worker collects, each to the owner of its lane."""
+        """For each lane that has an owner, deal a ticket for every open round without one."""
         dealt: dict[bytes, list[int]] = {}
         for lane in [self.lanes[number] for number in sorted(self._to_deal)]:
             if lane.owner is None or lane.moving:
@@ -161,7 +161,7 @@ class RolloutDealer:
     def send(self, member: Member, tickets: Iterable[int]) -> list[Outgoing]:
         """Make the orders for the rollout tickets among these: one order for each version that the tickets name.
 
-        A ticket that includes the past of a lane has an order of its own, because a past is long.
+        A ticket that includes a lane's past gets its own order, because a past is long.
         """
         chosen = [self.held[number] for number in tickets if number in self.held]
         member.tickets |= {ticket.number: member.replies for ticket in chosen}
@@ -209,7 +209,7 @@ class RolloutDealer:
     def longest_episode(self, number: int, rollout_steps: int) -> int:
         """The largest number of steps that an episode can have by the end of this ticket's rollout of `rollout_steps`.
 
-        Rollouts before a resume may have been longer, and only the number of all their env steps is known.
+        Rollouts before a resume may have been longer, and only their total number of env steps is known.
         """
         ticket = self.held.get(number)
         last = self.rounds.next + self.rounds.max_lag if ticket is None else ticket.round
@@ -241,7 +241,7 @@ class RolloutDealer:
             self.lose(member, number)
 
     def lose(self, member: Member, number: int) -> None:
-        """Record that this ticket of this member is lost, so that its round is dealt again."""
+        """Record that this member's ticket is lost, so that a new ticket is dealt for its round."""
         ticket = self.held[number]
         insort(self._end(member, ticket).due, ticket.round)
         self._to_deal.add(ticket.lane)
@@ -263,7 +263,7 @@ class RolloutDealer:
         return lane.past(self.histories, waiting)
 
     def _drop_after(self, lane: TicketedLane, first: int) -> None:
-        """Drop the lane's rollouts after round `first`. It was lost, and they don't continue the one that replaces it."""
+        """Drop the lane's rollouts after the lost round `first`, because they don't continue its replacement."""
         for number in [number for number in self.ready if number > first and lane.number in self.ready[number]]:
             dropped = self.ready[number].pop(lane.number)
             self.ledger.lost += 1

@@ -3,11 +3,11 @@
 Rule: weights are kept while they are the newest, act in an open round, are being evaluated, or are an opponent. They are
 sent to a worker after the first order that names them, and again if its Heartbeat shows that they were lost. A worker drops
 weights only when told to: every order lists the versions to keep, which are those that the worker's outstanding tickets
-name. So the learner knows which weights the worker holds, even while messages are on their way.
+name. The learner therefore knows which weights the worker holds, even while messages are on their way.
 
 If a supervisor shares weights among its workers, it gets them once, in place of the first worker that needs them. For all
-these workers, the weights count as being on the way until a message of the supervisor shows that they have arrived or are
-lost. From then on, a worker has as much time to load them as if they had just been sent to it; if it still lacks them
+these workers, the weights count as being on the way until a message from the supervisor shows that they have arrived or are
+lost. From then on, a worker has as much time to load them as if they had just been sent to it. If it still lacks them
 afterwards, they are sent to it directly.
 """
 
@@ -38,7 +38,7 @@ class SentAfter:
 
 @dataclass(frozen=True)
 class FromSupervisor:
-    """The worker gets the weights from its supervisor, to which they may still be on the way."""
+    """The worker gets the weights from its supervisor, which may not have received them yet."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class WeightsHeld:
         self.named: dict[bytes, dict[int, set[int]]] = {}
         """the versions that each ticket names, by routing id and ticket; may include tickets that have ended"""
         self.by_supervisor = WeakKeyDictionary[SharingSupervisor, dict[int, SentAfter]]()
-        """by supervisor, its weights by version, the newest last; dropped with the last member of that supervisor"""
+        """for each supervisor, its weights by version, the newest last; dropped with the supervisor's last member"""
 
     def versions(self, peer: bytes) -> Set[int]:
         """The versions that this worker holds or is about to get."""
@@ -84,7 +84,7 @@ class WeightsHeld:
         return supervisor.peer
 
     def needs(self, member: CollectingMember, tickets: Collection[int]) -> set[int]:
-        """The versions that these tickets name, apart from tickets that the worker doesn't hold or that have ended."""
+        """The versions that these tickets name. Tickets that have ended, or that the worker doesn't hold, are ignored."""
         named = self.named.get(member.peer, {})
         return {version for ticket in member.tickets.keys() & tickets for version in named[ticket]}
 

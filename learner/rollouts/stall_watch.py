@@ -1,14 +1,14 @@
-"""Decides whether a run has stalled, and which workers cause it. Pure.
+"""Decides whether a run has stalled, and which workers cause the stall. Pure.
 
-Rule: env steps, constructions, resets and rollouts are progress. While the learner waits for rollouts, the progress of
-workers that only evaluate doesn't count. While a call of the environment runs within its timeout, the run has not stalled,
-because either the call ends or its worker is ended. If nothing happens for `stall_timeout_s`, the workers that hold tickets
-are refused, and others get the tickets. The run ends only if no worker would remain. A worker that holds its tickets, for
-rollouts or for an evaluation, longer than all their calls of the environment may take together is refused, whatever it
-claims.
+Rule: env steps, constructions, resets and rollouts count as progress. While the learner waits for rollouts, the progress of
+workers that only evaluate doesn't count. While an environment call is within its timeout, the run has not stalled, because
+either the call ends or its worker is ended. If there is no progress for `stall_timeout_s`, the workers that hold tickets are
+refused, and others get the tickets. The run ends only if no worker would remain. A worker is refused, whatever it claims, if
+it holds its tickets for longer than all their environment calls together may take. This applies to tickets for rollouts and
+for evaluations.
 
-That limit may be days for an evaluation. So if none of its episodes has arrived for `stall_timeout_s` while the learner
-waits for it, a second worker plays the oldest ticket as well, whatever the first worker claims.
+For an evaluation, that limit may be days. Therefore, if none of its episodes has arrived for `stall_timeout_s` while the
+learner waits for it, a second worker plays the oldest ticket as well, whatever the first worker claims.
 """
 
 from __future__ import annotations
@@ -58,8 +58,8 @@ class StallWatch:
     def check(self, now: float, progress: object, *, evaluating: bool = False) -> Standstill | Overdue | None:
         """The verdict; None if the run continues.
 
-        `progress` is a value that changes whenever the awaited work makes progress. `evaluating` says that the learner waits
-        for an evaluation, and not for rollouts.
+        `progress` is a value that changes whenever the awaited work makes progress. `evaluating` says whether the learner
+        waits for an evaluation instead of rollouts.
         """
         of_collectors, of_evaluators = self._coordinator.membership.progress.values()
         mark = (of_collectors, evaluating and of_evaluators, progress)
@@ -84,7 +84,7 @@ class StallWatch:
         return Standstill(idle, f"it holds tickets and has made no progress for {self._stall_timeout_s:.0f} s")
 
     def _takes_too_long(self, now: float) -> bool:
-        """Whether no episode of the evaluation has arrived for too long. If so, starts to measure the time again."""
+        """Whether no episode of the evaluation has arrived for too long. If so, restarts the timer."""
         answered = self._coordinator.evaluation.episodes_played
         overdue = answered == self._answered and now - self._answered_s > self._stall_timeout_s
         if overdue or answered != self._answered:
@@ -93,7 +93,7 @@ class StallWatch:
         return overdue
 
     def _in_call(self, member: Member, now: float) -> bool:
-        """Whether the member is, according to its supervisor, in a call of the environment that is within its timeout."""
+        """Whether the member, according to its supervisor, is in an environment call that is within its timeout."""
         said = member.activity
         if said is None or now - member.in_env_code_s > self._coordinator.worker_timeout_s:
             return False

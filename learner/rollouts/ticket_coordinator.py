@@ -1,6 +1,6 @@
 """The learner's half of the conversation of a run. Pure: messages and `now` in, messages out; no socket, clock or torch.
 
-Rule: every task of a worker has a ticket. Two dealers decide which tickets to give out and how to handle an answer:
+Rule: every task for a worker has a ticket. Two dealers decide which tickets to give out and how to handle an answer:
 `rollout_dealer.py` and `evaluation_dealer.py`. This file connects them to the workers. A lane has one owner at a time and
 moves only between rollouts; its new owner has new env copies for it, so its incarnation rises. When a worker is lost, its
 lanes go to other workers, which continue them, and its tickets are dealt again. There is no other failure handling. If a
@@ -74,7 +74,7 @@ class TicketCoordinator(Coordinator[CollectingMember]):
         self.version = -1  # version of the newest weights; -1 before the first `publish`
         self._placement = LanePlacement(lanes, _by_joining)
         self.weights = SentWeights()
-        self._notes = set[str]()  # notes that were logged, because workers with the same environment send the same notes
+        self._notes = set[str]()  # notes already logged; workers with the same environment send the same notes
         self._check_rows = check_rows
 
     # ---------------------------------------------------------------- in
@@ -101,8 +101,8 @@ class TicketCoordinator(Coordinator[CollectingMember]):
     ) -> None:
         """Set the newest weights, which later orders name. Then call `begin_update` or `begin_evaluation`.
 
-        `env_steps` is the number of env steps of training so far; with None, the weights never become an opponent. Without
-        `env_attributes`, weights that are published again keep those that they have.
+        `env_steps` is the number of training env steps so far; with None, the weights never become an opponent. Without
+        `env_attributes`, weights that are published again keep the attributes that they have.
         """
         if env_attributes is None and version in self.weights.kept:
             env_attributes = self.weights.kept[version].env_attributes
@@ -155,11 +155,11 @@ class TicketCoordinator(Coordinator[CollectingMember]):
         return self._deal()
 
     def share_evaluation(self) -> list[Outgoing]:
-        """Let an idle worker, if there is one, also play the oldest ticket: no answer has arrived for a long time."""
+        """Let an idle worker, if there is one, also play the oldest ticket, because no answer has arrived for long."""
         return self.weights.after(self.evaluation.share(self.membership.active()), self.members)
 
     def collected(self) -> int:
-        """The env steps of the next update's rollouts, both complete and running, as workers report them."""
+        """The env steps made so far for the next update's rollouts, complete and running, as workers report them."""
         rollouts = self.rollouts
         of_one = self.run.rollout_steps * self.run.copies
         awaited = Counter(ticket.peer for ticket in rollouts.awaited())
@@ -295,5 +295,5 @@ class TicketCoordinator(Coordinator[CollectingMember]):
 
 
 def _by_joining(member: Member) -> int:
-    """Sort key of workers with equally few lanes: the one that joined first gets the next lane."""
+    """Sort key for workers with equally few lanes: the one that joined first gets the next lane."""
     return member.join_number

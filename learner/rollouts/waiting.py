@@ -2,9 +2,9 @@
 
 Rule: waits shorter than `LONG_S` aren't mentioned. Between two long waits for rollouts, the line mentions the last wait, so
 that the text does not appear and disappear all the time. While the learner waits, the line names the lanes whose rollouts
-are missing for the next update, and says how many of that update's env steps have been made, because with a slow simulator
-the first update may be far away. While the learner learns, the line says how many workers wait for weights. The shares are
-fractions of the training time since the learner started, without evaluations.
+are missing for the next update. It also says how many of that update's env steps have been made, because with a slow
+simulator the first update may be far away. While the learner learns, the line says how many workers wait for weights. The
+shares are fractions of the training time since the learner started, without evaluations.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class LearnerTime:
     def __init__(
         self, coordinator: TicketCoordinator, now: float, no_worker: Callable[[], str], processes: WorkerProcesses
     ) -> None:
-        """`no_worker` returns a clause that says what is awaited while there is no member."""
+        """While there is no member, `no_worker` returns a clause that says what the learner is waiting for."""
         self.phase: Phase = "starting"
         self.since_s = now
         self._last = ""  # the last wait for rollouts in words; empty if it was short
@@ -56,7 +56,7 @@ class LearnerTime:
         self.since_s = now
 
     def learned(self, now: float) -> None:
-        """Record that an update has ended, and that workers that wait for its weights are about to get them."""
+        """Record that an update has ended, and that the workers waiting for its weights are about to get them."""
         if self.phase == "learning":
             if now - self.since_s >= LONG_S:
                 self._last = self._learning(now)
@@ -121,7 +121,7 @@ class LearnerTime:
         return f"; {which} rollouts: {made:,} of {of:,} env steps{left}"
 
     def _played(self, plan: EvaluationPlan, now: float) -> str:
-        """How far an evaluation has got, and which of the workers that play it has been held up longest."""
+        """How far an evaluation has got, and which of the workers playing it has been held up longest."""
         evaluation = self._coordinator.evaluation
         who = self._held_up_longest(evaluation.players, now)
         done = f"{evaluation.episodes_played} of {len(plan.seeds)} episodes"
