@@ -1,9 +1,9 @@
 """Checks that every reader of zip archives finds the same files in a checkpoint.
 
-Rule: a checkpoint is checked with Python's `zipfile` and then read by torch, which reads archives with code of its own. The
-zip format lets two readers find different files in the same archive: it states the place of the directory twice, and an
-extra field may override an entry's name. So an archive must have exactly the directory that torch.save writes: the two
-statements agree, and an extra field only contains numbers that need more than 32 bits.
+Rule: a checkpoint is checked with Python's `zipfile` and then read by torch, which reads archives with its own code. The zip
+format lets two readers find different files in the same archive, because it states the directory's position twice, and an
+extra field may override an entry's name. Therefore, an archive must have exactly the directory that torch.save writes: both
+positions agree, and an extra field contains only numbers that need more than 32 bits.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ import os
 import struct
 from typing import BinaryIO
 
-MAX16, MAX32 = (1 << 16) - 1, (1 << 32) - 1  # in place of a number that is stored elsewhere, because it needs more bits
+MAX16, MAX32 = (1 << 16) - 1, (1 << 32) - 1  # stands for a number that is stored elsewhere, because it needs more bits
 ENTRY = struct.Struct("<4sHHHHHHIIIHHHHHII")
 END = struct.Struct("<4sQHHIIQQQQ 4sIQI 4sHHHHIIH")
-"""The record of the directory in 64 bits, its locator, and the record in 32 bits"""
-END64_BYTES = 56  # the record in 64 bits
+"""The zip64 end of central directory record, its locator, and the (32-bit) end of central directory record"""
+END64_BYTES = 56  # size of the zip64 record
 MOST_BYTES = 1 << 26  # limit on the size of a directory
 
 

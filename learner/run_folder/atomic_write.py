@@ -1,9 +1,9 @@
 """Writes files atomically, and retries writes that have failed.
 
 Rule: a file is written next to its target under a name that ends with `.tmp`, flushed to the disk, and then renamed to the
-target; the folder is flushed, too. If anything fails, the target stays unchanged and the temporary file is removed. Only
-files that nobody needs after a power failure are not flushed. If a write fails, for example because the disk is full, a
-warning is logged while the run trains; the run fails if the write still fails at its end.
+target; the folder is flushed, too. If anything fails, the target stays unchanged and the temporary file is removed. Files
+that nobody needs after a power failure are the only ones that aren't flushed. If a write fails during training, for example
+because the disk is full, a warning is logged; the run fails only if the write still fails at its end.
 """
 
 from __future__ import annotations

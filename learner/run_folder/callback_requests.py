@@ -1,6 +1,6 @@
-"""Holds the requests of callbacks until the run takes them: numbers to log, and attributes to set on env copies.
+"""Holds callbacks' requests until the run takes them: numbers to log, and attributes to set on env copies.
 
-Rule: a request is checked when it is made, so that a traceback shows the user's line.
+Rule: a request is checked when it is made, so that the traceback shows the line in the user's code.
 """
 
 from __future__ import annotations

@@ -3,9 +3,9 @@
 Rule: a checkpoint is written atomically; a resumed run uses the newest undamaged one; and reading one executes no code
 (`weights_only`). A state therefore consists of tensors and plain data; a numpy generator is stored as its
 `bit_generator.state`. torch's loader does not detect damaged data, so the checksums of the file (a zip archive) are verified
-first. The file must contain each element of a tensor: a tensor with a stride of 0 has only a few bytes in the file, but
-could grow to any size when copied. And the calls of the loader are checked in advance, because they could fill the memory
-(`learner/rehearsed_pickle.py`); the loader reads the pickle that was checked (`archive_directory.py`).
+first. The file must contain every element of a tensor, because a tensor with a stride of 0 has only a few bytes in the file,
+but could grow to any size when copied. The loader's calls are also checked in advance, because they could fill the memory
+(`learner/rehearsed_pickle.py`). `archive_directory.py` ensures that the loader reads the same pickle that was checked.
 """
 
 from __future__ import annotations
@@ -64,8 +64,8 @@ class _Unreadable(Exception):
 def save(folder: Path, state: dict[str, Any], env_steps: int, keep: int) -> Path:
     """Write a checkpoint into the run folder.
 
-    Keeps the newest `keep` checkpoints up to this one. It doesn't remove later ones, which are damaged and which a resumed
-    run has skipped. Raises `CheckpointError` if the checkpoint cannot be written; older ones are then untouched. Raises
+    Keeps the newest `keep` checkpoints up to this one. Later ones also stay: a resumed run has skipped them, because they
+    are damaged. Raises `CheckpointError` if the checkpoint cannot be written; older ones are then untouched. Raises
     `UsageError` if the state contains something that could not be read back.
     """
     import torch

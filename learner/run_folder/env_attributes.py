@@ -16,7 +16,7 @@ from millrace.protocol.bounds import MAX_NAME, one_line
 from millrace.protocol.errors import UsageError, safe_repr
 from millrace.protocol.wire.plain_values import pack, unpack
 
-MOST_BYTES = 1 << 20  # limit on the size of all attributes together, because they are sent along with all weights
+MOST_BYTES = 1 << 20  # limit on the total size of all attributes, because they are sent with every version of the weights
 
 
 class AttributesState(msgspec.Struct, kw_only=True):

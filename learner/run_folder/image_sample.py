@@ -1,8 +1,9 @@
-"""A picture of what the policy sees: some image observations of the first rollouts. Pure.
+"""A picture of what the policy sees: some image observations from the first rollouts. Pure.
 
 The picture has a row for each of four steps, from the first to the last of one env copy's rollout. The channels, such as
 stacked frames, are side by side; three channels are shown as red, green and blue. Large images are reduced to every second,
-third, … pixel. If the bounds aren't 0 and 255, the largest value is shown as white, so that planes of 0 and 1 are visible.
+third, … pixel. If the bounds aren't 0 and 255, the largest value is shown as white, so that planes of zeros and ones are
+visible.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
 """The log as JSON, one event per line: all of it on stderr (`--log-json`), and its warnings and notices in a file.
 
-The file is log.jsonl in the run folder. Every line has `time` (UTC, ISO 8601), `level`, `event` and `message`, the text for
-people. `event` is "joined", "left", "refused", "environment_raised", "policy_raised", "process_failed" or "asked_to_rejoin"
-(`millrace.learner.members.events`, with the fields of the event), "progress", or "said" for any other line of the log.
+The file is log.jsonl in the run folder. Every line has `time` (UTC, ISO 8601), `level`, `event` and `message` (the text that
+people read). `event` is "joined", "left", "refused", "environment_raised", "policy_raised", "process_failed" or
+"asked_to_rejoin" (`millrace.learner.members.events`, with the fields of the event), "progress", or "said" for any other line
+of the log.
 
 Rule: the size of log.jsonl is bounded, and nothing depends on the file. If it grows too long, only the newer half is kept.
 Lines that can't be written are dropped. The file is opened for each line, because somebody may delete it, or its folder, in
@@ -65,7 +66,7 @@ class LoggedLine(msgspec.Struct, frozen=True):
     time: Annotated[datetime, Meta(tz=True)]
     level: str
     message: str
-    """The text for people. If it has several lines, those after the first are a traceback."""
+    """The text that people read. If it has several lines, those after the first are a traceback."""
 
 
 @contextmanager
@@ -81,7 +82,7 @@ def kept_log(folder: Path) -> Iterator[None]:
 
 
 def newest_lines(folder: Path) -> list[LoggedLine]:
-    """The last lines of the log of a run folder, the oldest first. Empty if none can be read."""
+    """The last lines of a run folder's log, the oldest first. Empty if none can be read."""
     try:
         with os.fdopen(open_regular(folder / RUN_LOG_FILE), "rb") as file:
             lines = _end(file.fileno(), READ_BYTES).splitlines()

@@ -1,6 +1,6 @@
-"""The last line of a program that trains: why it ended, and how to continue the run. Pure.
+"""The last line that a training program prints: why it ended, and how to continue the run. Pure.
 
-Rule: it is one line. The notes of the error (`BaseException.__notes__`) follow its message.
+Rule: it is one line. The error's notes (`BaseException.__notes__`) follow its message.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def last_line(program: str, error: BaseException, hints: Sequence[str] = (), *, 
 
 
 def users_code(error: BaseException) -> str:
-    """The FILE:LINE where user code called by the learner, such as an algorithm's loss, raised this; else empty.
+    """The FILE:LINE where user code that the learner called, such as an algorithm's loss, raised the error; else empty.
 
     An error in a library counts as raised by the code that called the library.
     """

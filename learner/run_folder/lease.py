@@ -82,7 +82,7 @@ class Owner(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def decoded(content: bytes) -> Owner | None:
-    """The owner that this content describes; None if the content is cut off, or is just being written.
+    """The owner that this content describes; None if the content is cut off, or is being written at this moment.
 
     Its addresses are kept only if they are valid, because commands connect to them, and pages show them for people to type.
     """

@@ -2,12 +2,12 @@
 
 Rule: the file ends with a complete row, and there is one row for each update. Rows that can't be written now are written
 later. The rows up to a checkpoint are flushed to the disk before the checkpoint, because a resumed run doesn't write them
-again. It removes the rows after its checkpoint. If the run was interrupted before an evaluation, the resumed run makes this
-evaluation and adds its metrics to the row of the same update. If the run was killed while it wrote a row, the resumed run
-keeps the numbers of this row that are complete.
+again. A resumed run removes the rows after its checkpoint. If the run was interrupted before an evaluation, the resumed run
+does this evaluation and adds its metrics to the row of the same update. If the run was killed while it wrote a row, the
+resumed run keeps those numbers of the row that are complete.
 
 A row has room for one evaluation. If evaluations of two policies end after the same update, the row is repeated with the
-metrics of the second.
+second evaluation's metrics.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ log = logging.getLogger("millrace.learner")
 
 METRICS_FILE = "metrics.jsonl"
 MOST_LINE_BYTES = 1 << 16  # size of the longest row that is read while the file grows
-MOST_COMMAS = 10  # how many commas the last number of a row that is cut off may have in its name
+MOST_COMMAS = 10  # how many commas the name of the last number in a cut-off row may contain
 
 
 class MetricsLog:
     """Writes metrics.jsonl."""
 
     def __init__(self, folder: Path, from_env_steps: int = 0, from_update: float = math.inf) -> None:
-        """Rows after the checkpoint from which the run continues, at `from_env_steps` and `from_update`, are removed.
+        """Removes the rows after the checkpoint that the run continues, which is at `from_env_steps` and `from_update`.
 
         Both numbers are needed, because an update whose rows only reset env copies adds no env step. Raises `RunError`, with
         a one-line message, if the file cannot be written.
@@ -66,7 +66,7 @@ class MetricsLog:
 
     @property
     def gone(self) -> bool:
-        """Whether metrics.jsonl was deleted, or its folder renamed, since its last row. `flush` recreates it."""
+        """Whether metrics.jsonl was deleted, or its folder renamed, since the last row was written. `flush` recreates it."""
         return self._table.gone
 
     def write(self, progress: Progress, train: Row) -> None:
@@ -95,7 +95,7 @@ class MetricsLog:
         self._table.flush()
 
     def sync(self) -> None:
-        """Like `flush`, but also waits until the rows are on the disk, because a checkpoint of their updates follows."""
+        """Like `flush`, but also waits until the rows are on the disk. Called before a checkpoint of their updates."""
         self._table.sync()
 
     def close(self) -> None:
@@ -149,7 +149,7 @@ def decoded_row(line: bytes) -> dict[str, Any] | None:
 
 
 def _cut_off_rows(path: Path) -> list[dict[str, Any]]:
-    """The last row, if its end is missing, with the numbers before the place where it is cut off. Raises OSError.
+    """The last row, if its end is missing, with the numbers before the point where it is cut off. Raises OSError.
 
     Empty if the last row is complete, or if it isn't known to which update it belongs.
     """

@@ -20,7 +20,7 @@ AUTO = Path("auto")
 
 
 def newest_run(config: RunSettings) -> Path | None:
-    """The newest run folder in `run_dir` with a checkpoint and with this environment, algorithm and seed, or None.
+    """The newest run folder in `run_dir` that has a checkpoint and this environment, algorithm and seed, or None.
 
     The name of a run folder ends with the start time, and with a number if several runs began in that second.
     """

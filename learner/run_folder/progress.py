@@ -19,12 +19,12 @@ ENV_STEPS_KEY = "time/total_timesteps"
 UPDATES_KEY = "time/iterations"
 RETURN_KEY = "rollout/ep_rew_mean"
 NOT_SHOWN = ("at_s", "settings", "episodes", "rollouts", "incarnations", "fresh", "requests")
-"""Fields of `Progress` that a log of the progress leaves out."""
+"""Fields of `Progress` that are left out when the progress is logged."""
 Row = Mapping[str, float | None]
 
 
 class Progress(RunProgress, frozen=True, kw_only=True):
-    """The progress of a run, which callbacks get: how far the run has got, what is new, and methods for requests.
+    """The progress of a run, as callbacks get it: how far the run has got, what is new, and methods for requests.
 
     Returns are sums of raw rewards, undiscounted. Times are in seconds, speeds in env steps per second over all workers. A
     number that does not exist yet is None. If only some methods of `Callback` get a field, its description says so. Don't
@@ -50,8 +50,8 @@ class Progress(RunProgress, frozen=True, kw_only=True):
     settings: dict[str, Any] = {}
     """all settings of the run, by name; `algorithm` has those of the algorithm"""
     metrics: dict[str, float] = {}
-    """the algorithm's numbers, such as losses, in the last update (before the first update, those of cloning), by the names
-    under which they are logged
+    """the algorithm's numbers from the last update, such as losses, by the names under which they are logged; before the
+    first update, the numbers from cloning
     """
     episodes: tuple[Episode, ...] = ()
     """the episodes that ended in the rollouts of the last update"""
@@ -60,7 +60,7 @@ class Progress(RunProgress, frozen=True, kw_only=True):
     evaluation: Evaluation | None = None
     """the last evaluation"""
     evaluated: EvaluatedPolicy = EvaluatedPolicy()
-    """`version` and `env_steps` of the evaluated policy, which with `eval_workers` is older than the newest policy"""
+    """`version` and `env_steps` of the evaluated policy; with `eval_workers`, it is older than the newest policy"""
     best: tuple[float, int] | None = None
     """the mean return of the best evaluation so far, and the env steps of the policy that it evaluated"""
     checkpoint: str = ""
@@ -72,8 +72,8 @@ class Progress(RunProgress, frozen=True, kw_only=True):
     copies; `Rollout.sequence` then starts from 0 again
     """
     fresh: tuple[Bools | bool, ...] = ()
-    """only in `Callback.on_rollouts`: for each rollout, [N], True for env copies that started afresh, so that its first row
-    doesn't continue the lane's previous rollout; a single value applies to all copies
+    """only in `Callback.on_rollouts`: for each rollout, [N], True for env copies that started afresh, which means that the
+    copy's first row doesn't continue the lane's previous rollout; a single value applies to all copies
     """
     requests: Requests | None = None
     """the requests of callbacks"""
@@ -95,9 +95,10 @@ class Progress(RunProgress, frozen=True, kw_only=True):
     def set_env_attr(self, name: str, value: Any) -> None:
         """Set an attribute of every training env copy from the next weights on, for example for a curriculum.
 
-        `value` is plain data: numbers, text, lists, dicts or numpy arrays. Each rollout is collected with the attributes of
-        its version, so the result is the same for any number of workers. Checkpoints save the attributes. Evaluations use
-        env copies without them. Raises `UsageError` if the value cannot be sent, and always in `on_checkpoint` and `on_end`.
+        `value` must be plain data: numbers, text, lists, dicts or numpy arrays. Each rollout is collected with the
+        attributes that belong to its version of the weights, so the result is the same for any number of workers.
+        Checkpoints save the attributes. Evaluations use env copies without them. Raises `UsageError` if the value cannot be
+        sent, and always in `on_checkpoint` and `on_end`.
         """
         if self.requests is None:
             raise UsageError(f"set_env_attr {name}: this is not the progress of a run")
@@ -132,5 +133,5 @@ def steps_per_second(env_steps: int, seconds: float) -> float:
 
 
 def named(train: Row) -> dict[str, float | None]:
-    """The metrics of an algorithm or an evaluation, under the names by which they are logged."""
+    """The metrics of an algorithm or an evaluation, by the names under which they are logged."""
     return {name if "/" in name else f"train/{name}": value for name, value in train.items()}

@@ -1,8 +1,8 @@
 """A file of a run that grows by whole records, such as metrics.jsonl.
 
 Rule: the file ends with a whole record. Records that can't be written now wait in memory and are written later. A record
-that replaces the newest one is written over it, from the first byte that differs, so that a process that is killed leaves
-at least the bytes that both have in common, and no mixture of two numbers.
+that replaces the newest one is written over it, starting at the first byte that differs. If the process is killed while it
+writes, the file keeps at least the bytes that both records have in common, and no mixture of two numbers.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ MOST_WAITING = 100_000  # limit on the records that wait to be written; that man
 
 
 class RecordFile:
-    """A file to which whole records are appended. A record that was written only in part is removed and written again.
+    """A file to which whole records are appended. A partially written record is removed and written again.
 
     If the file is no longer at its path, it is recreated there, with its folder.
     """

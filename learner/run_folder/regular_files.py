@@ -50,7 +50,7 @@ def read(path: Path, most_bytes: int = MOST_TEXT_BYTES) -> bytes:
 
 
 def regular_files(run: Path, pattern: str) -> list[Path]:
-    """The regular files of a run folder that match a pattern, such as `videos/*.mp4`, in the order of their names.
+    """The regular files of a run folder that match a pattern, such as `videos/*.mp4`, sorted by name.
 
     Anything else with such a name is left out, and the log says so.
     """

@@ -22,7 +22,7 @@ EVALUATION_LENGTH_KEY = "eval/mean_ep_length"
 Z_95 = 1.959964
 """The quantile of the normal distribution for a 95 % interval."""
 EVALUATED_AT_KEY = "eval/env_steps"
-"""The env steps of a policy that was evaluated alongside training. The row with the result has more env steps than this."""
+"""The metric for the env steps of a policy that was evaluated alongside training. Its row's own env steps are higher."""
 
 
 class FactMean(msgspec.Struct, frozen=True):
@@ -41,8 +41,8 @@ class FactMean(msgspec.Struct, frozen=True):
 METRICS_BESIDE_FACTS = frozenset(
     {"ep_rew_mean", "ep_len_mean", "exploration_rate", "mean_reward", "mean_ep_length", "env_steps"}
 )
-"""The names of other values that are logged as rollout/NAME or eval/NAME. A fact can't have such a name, because then one of
-the two would be lost."""
+"""The names of other values that are logged as rollout/NAME or eval/NAME. A fact can't have such a name, because otherwise
+one of the two values would be lost."""
 
 
 def fact_means(names: Sequence[str], episodes: Iterable[Sequence[float]]) -> dict[str, FactMean]:
@@ -196,8 +196,8 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     """evaluation of the final policy by greedy episodes; None if the run was cut short before it"""
     ended_by: Real | None = None
     """the mean return of the evaluation that ended the run by reaching `target_return`; if a callback ended the run, the
-    mean return of the final policy if the callback could know it. Such a return is biased upwards, so if it is a return of
-    the final policy, `evaluation` is a second evaluation, on other episodes
+    mean return of the final policy, provided that the callback could know it. Such a return is biased upwards. If it belongs
+    to the final policy, `evaluation` is therefore a second evaluation, on other episodes
     """
     best: Best | None = None
     """the best policy of the run's own evaluations, if there were any"""
@@ -206,8 +206,8 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     lags: dict[str, Natural] = {}
     """the number of rollouts that updates used, by lag, since this process started"""
     first_use_s: dict[str, Real] = {}
-    """by worker, the median of the seconds from publishing new weights to the arrival of the first rollout with them, since
-    this process started
+    """for each worker, the median number of seconds from the publication of new weights to the arrival of the worker's first
+    rollout with them, since this process started
     """
     stages: dict[str, Real] = {}
     """the seconds that the learner, and all workers together, spent in each stage, such as collecting and updating"""

@@ -113,7 +113,7 @@ class PolicyDescription(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class StoredPolicy(NamedTuple):
-    """A policy read from its files. Reading imports none of the modules they name; acting imports the encoder's module."""
+    """A policy read from its files. Reading imports no module that the files name; acting imports the encoder's module."""
 
     card: PolicyDescription
     parameters: Floats
@@ -154,11 +154,11 @@ class RunFolder:
     """The folder of one run."""
 
     def __init__(self, path: Path, made: Path | None = None) -> None:
-        """For a new folder, `made` is the topmost folder that was made for it."""
+        """For a new folder, `made` is the topmost folder that was created for it."""
         self.path = path
         self._made = made
         self._is_relative = False
-        self._workers_elsewhere = False  # the value of this argument in the last call of `write_config`
+        self._workers_elsewhere = False  # the value of this argument in the last call to `write_config`
         self.started_from = ""
         """See `RunFormat`."""
         self.writes = Writes()
@@ -252,7 +252,7 @@ class RunFolder:
                 parent.rmdir()
 
     def remove_temporary(self) -> None:
-        """Remove incomplete files that a killed process has left."""
+        """Remove incomplete files that a killed process has left behind."""
         for left in self.path.glob(f"*{TEMPORARY}"):
             with suppress(OSError):
                 left.unlink()
@@ -393,7 +393,7 @@ class RunFolder:
             return None
 
     def write_images(self, files: Mapping[str, bytes]) -> None:
-        """Write pictures into the folder. `files` has the content of each, by the name of its file."""
+        """Write pictures into the folder. `files` has the content of each picture, by file name."""
         for name, content in files.items():
             self._write(name, content)
 

@@ -1,7 +1,7 @@
 """The files that identify a run folder: its settings (config.toml) and its format (run.json), written when it is made.
 
-Rules: a folder of the current format or an older one can be evaluated, reported and resumed; one of a newer format is
-rejected with a one-line error. When you change the format so that older code can't read it, increase `RUN_FORMAT`. Modules
+Rules: a folder in the current format or an older one can be evaluated, reported and resumed; one in a newer format is
+rejected with a one-line error. If you change the format such that older code can't read it, increase `RUN_FORMAT`. Modules
 are never imported from a run folder, because it may come from a stranger.
 """
 
@@ -34,8 +34,8 @@ HEAD = "# Repeat this run: millrace train --config THIS_FILE (it is whole if it 
 END = "# end\n"
 """The last line of config.toml; `HEAD` is the first. Without it, a file that was cut off could still be valid TOML."""
 MOST_CONFIG_BYTES = 1 << 18
-MOST_NESTED = 1_000_000  # limit of (lines) × (dots in a line): for each line, tomllib visits all parts of a table's name
-MOST_PREFIXES = 10_000_000  # limit of the sum of (dots in a line)²: of a key such as a.b.c, tomllib stores each prefix
+MOST_NESTED = 1_000_000  # limit on (lines) × (dots in a line): for each line, tomllib visits all parts of a table's name
+MOST_PREFIXES = 10_000_000  # limit on the sum of (dots in a line)²: for a key such as a.b.c, tomllib stores each prefix
 
 
 class RunFormat(msgspec.Struct, frozen=True, kw_only=True):
@@ -45,7 +45,7 @@ class RunFormat(msgspec.Struct, frozen=True, kw_only=True):
     millrace: str
     """the version of millrace that wrote the file"""
     workers_elsewhere: bool = False
-    """whether the run's workers were started elsewhere, so that its setting `workers` has no meaning"""
+    """whether the run's workers were started elsewhere; if so, its setting `workers` has no meaning"""
     started_from: str = ""
     """the line about the run from which this run started, as it was printed; empty if it began with random weights"""
 
@@ -145,7 +145,7 @@ def _texts(value: Any) -> Iterator[str]:
 
 
 def check_format(folder: Path) -> RunFormat:
-    """Read the run.json of a run folder. Raises `UsageError`, with a one-line message, if this version cannot read it."""
+    """Read a run folder's run.json. Raises `UsageError`, with a one-line message, if this millrace can't read it."""
     try:
         run_format = msgspec.json.decode(read(folder / RUN_FILE), type=RunFormat)
     except FileNotFoundError:

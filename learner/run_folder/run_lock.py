@@ -2,10 +2,10 @@
 
 Rule: the file `run.lock` names the owner. On a single machine, the system's lock on this file (flock) decides; the kernel
 releases it when the process dies, however it dies. Machines that share the folder may not see each other's system locks, or
-may still see the lock of a machine that died. So the owner also rewrites the file every few seconds (`lease.py`); an owner
-on another machine that stops doing so counts as dead. The lock of a dead owner is taken over. An owner that finds the file
-missing recreates it, unless it hasn't renewed the file for so long that another process may have taken over the run and
-ended. Commands that only read a run folder don't need the lock.
+may still see the lock of a machine that died. Therefore, the owner also rewrites the file every few seconds (`lease.py`); an
+owner on another machine that stops doing so counts as dead. The lock of a dead owner is taken over. An owner that finds the
+file missing recreates it, unless it hasn't rewritten the file for so long that another process may have taken over the run
+and ended since. Commands that only read a run folder don't need the lock.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ WHY_UNREACHABLE = {
         "with --transport tcp and --keys, the keys of its local workers are not in any file; run it with --transport ipc"
     ),
 }
-JOIN_S = 5.0  # how long to wait for the thread at the end: a file system that doesn't answer must not block it
+JOIN_S = 5.0  # how long to wait for the thread at the end, because a file system that doesn't answer must not block the end
 
 
 class RunLock:
@@ -131,16 +131,16 @@ class RunLock:
 
     @property
     def taken_over(self) -> bool:
-        """Whether another process is known to have taken the run over. Reads no file."""
+        """Whether another process is known to have taken over the run. Reads no file."""
         return bool(self._lost)
 
     def check(self) -> None:
-        """Raise `RunTakenOver` if another process is known to have taken the run over. Reads no file."""
+        """Raise `RunTakenOver` if another process is known to have taken over the run. Reads no file."""
         if self._lost:
             raise RunTakenOver(f"run {self._folder}: {self._lost}")
 
     def confirm(self) -> None:
-        """Read the lock file. Raises `RunTakenOver` if another process has taken the run over. Called before writing."""
+        """Read the lock file. Raises `RunTakenOver` if another process has taken over the run. Called before writing."""
         self._rewrite()
         self.check()
 
@@ -287,8 +287,8 @@ class RunLock:
     def _make_again(self) -> None:
         """Recreate the file after somebody has removed it, unless the whole folder is gone.
 
-        Doesn't recreate the file if another process had the time to take over the run, and may have removed the file at its
-        end.
+        Doesn't recreate the file if another process had enough time to take over the run, because that process may have
+        removed the file when it ended.
         """
         unseen_s = self._wall_clock() - self._seen_s  # other clocks may stop while the machine is suspended
         if unseen_s >= self._pace.dead_after:

@@ -1,9 +1,9 @@
-"""Words and sentences for people: how far a run has got, what slows it down, what went wrong in it, and how it ended. Pure.
+"""Descriptions of a run in words: how far it has got, what slows it down, what went wrong, and how it ended. Pure.
 
 Everything that shows a `RunProgress` takes its words from here, so that the same words are used everywhere.
 
-Rule: the side that waits less is the slower one. If learner and workers take turns, one waits while the other works, so the
-shares of time that they wait add up to about 1; if they work at the same time, only the faster one waits. If the shares add
+Rule: the side that waits less is the slower one. If learner and workers take turns, one waits while the other works, so
+their shares of waiting time add up to about 1. If they work at the same time, only the faster one waits. If the shares add
 up to more than 1, both sides sometimes wait at the same time, for some of the workers or for messages on their way. A
 sentence says so only if the learner waits for longer than it works, because otherwise faster workers or messages would
 change little.
@@ -21,7 +21,7 @@ from millrace.protocol.progress import RunProgress
 ABOUT_EQUAL = 0.2  # learner and workers whose shares of waiting time differ by less count as equally fast
 BOTH_WAIT = 0.1  # how far the sum of the two shares must exceed 1 before both sides are said to wait at once
 LEAST_PER_S = 1e-4  # one env step in three hours; a lower speed is shown as 0
-LONG_RETURN = 1e12  # larger returns are rounded: all their digits would make a table too wide
+LONG_RETURN = 1e12  # larger returns are rounded, because all their digits would make a table too wide
 COLLECTING = ("act", "step", "wait")
 WRONG = {
     "lost": ("rollout was lost and dealt again", "rollouts were lost and dealt again"),
@@ -31,11 +31,11 @@ WRONG = {
     "messages_bad": ("message could not be read", "messages could not be read"),
     "late_actions": ("action came too late", "actions came too late"),
 }
-"""For each count of the ledger, the words for one and for several."""
+"""For each ledger count, the wording for one and for several."""
 
 
 def steps_in_words(progress: RunProgress) -> str:
-    """How many env steps have been made, out of how many in all."""
+    """How many env steps have been made, and how many there will be in all."""
     made = f"{progress.env_steps_made:,}"
     return f"{made} of {progress.total_steps:,}" if progress.total_steps else made
 
@@ -53,7 +53,7 @@ def return_in_words(mean: float | None) -> str:
 
 
 def workers_in_words(progress: RunProgress) -> str:
-    """How many workers are alive, out of how many that are expected."""
+    """How many workers are alive, and how many are expected."""
     expected = f" of {progress.workers_expected}" if progress.workers_expected else ""
     return f"{progress.workers_alive}{expected}"
 
@@ -140,14 +140,14 @@ def duration(seconds: float) -> str:
 
 
 def last_sign(progress: RunProgress) -> str:
-    """The local time since which a run without results has shown no sign of life, in words. Empty if it is not known."""
+    """Words that say since when (local time) a run without results has shown no sign of life. Empty if it is not known."""
     if not progress.at_s:
         return ""
     return time.strftime("no sign since %Y-%m-%d %H:%M:%S", time.localtime(progress.at_s))
 
 
 def ending(reason: str, after: str = "", *, cut_short: bool) -> str:
-    """How a run ended, and why. `after` are words that say how long it ran."""
+    """How a run ended, and why. `after` says, in words, how long it ran."""
     how = "Interrupted" if cut_short else "Finished"
     return f"{how}{after}" if reason == how.lower() else f"{how}{after}: {reason}"
 
