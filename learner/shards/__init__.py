@@ -1,1 +1,1 @@
-"""Several learner processes for one run. They share the shards of each batch, and add gradients in a fixed order."""
+"""Several learner processes for one run. They divide each batch's shards among them, and add gradients in a fixed order."""

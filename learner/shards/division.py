@@ -2,7 +2,7 @@
 
 Law: shard s of S has the lanes whose number modulo S is s. Each shard passes through the network on its own, so the shapes
 of the passes don't depend on the number R of processes. Sums over shards are computed in a fixed order, as a tree of pairs.
-Therefore every R that divides S gives the same bits.
+Therefore, every R that divides S gives bit-identical results.
 """
 
 from __future__ import annotations

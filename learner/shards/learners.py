@@ -1,8 +1,8 @@
 """The learner processes of a run, connected by torch.distributed: gloo between CPUs, NCCL between GPUs. A thin shell.
 
-Rules: the messages of rank 0 determine the number of collective operations, and each of these transfers one tensor of a
-fixed size. If a process is gone, or takes longer than the timeout, all processes end with `LearnerLost`, so that the program
-that started them can restart them. torch.distributed authenticates nobody, so it listens on loopback unless the settings say
+Rules: rank 0's messages determine the number of collective operations, and each of these transfers one tensor of a fixed
+size. If a process is gone, or takes longer than the timeout, all processes end with `LearnerLost`, so that the program that
+started them can restart them. torch.distributed authenticates nobody, so it listens on loopback unless the settings say
 otherwise.
 """
 
@@ -42,7 +42,7 @@ log = logging.getLogger("millrace.learner")
 
 POLL_S = 0.1
 TELL_EVERY_S = 30.0
-TELL_BEFORE = 0.1  # a sign of life is sent after this fraction of the time for which others wait for a message
+TELL_BEFORE = 0.1  # a sign of life is sent after this fraction of the time that the others wait for a message
 PATIENCE_S = 3.0  # timeout of one attempt to connect
 JOINED = "millrace/rank/"
 
@@ -53,7 +53,7 @@ class Timeouts(NamedTuple):
     join_s: float
     """until all processes have connected"""
     reply_s: float
-    """in a collective operation, or for the next message of rank 0"""
+    """in a collective operation, or for the next message from rank 0"""
 
 
 class Header(msgspec.Struct, frozen=True):
@@ -73,7 +73,7 @@ class Learners:
         """`reply_s` is the number of seconds for which the others wait for a message."""
         self.division = division
         self.others_wait = True
-        """Whether the others wait for a message. False in an update or while sending, and after either is interrupted."""
+        """Whether the others wait for a message. False during an update or a send, and after either was interrupted."""
         self._tell_every_s = reply_s * TELL_BEFORE
         self._told_s = time.monotonic()
 
@@ -107,7 +107,7 @@ class Learners:
             raise UsageError(errors[0])
 
     def still_waits(self) -> None:
-        """Tell the others, now and then, that rank 0 is alive and waits for rollouts. You may call this at any time."""
+        """Tell the others, if it is time to, that rank 0 is alive and waits for rollouts. You may call this at any time."""
         if self.others_wait and time.monotonic() - self._told_s > self._tell_every_s:
             self.tell_all(StillThere())
 
@@ -136,7 +136,7 @@ class Learners:
                     distributed.send(_bytes_of(array), rank)
 
     def hear(self) -> tuple[FromRankZero, list[Array]]:
-        """Wait for the next message of rank 0. Returns it and its arrays."""
+        """Wait for the next message from rank 0. Returns it and its arrays."""
         with _lost():
             size = torch.zeros(1, dtype=torch.int64)
             distributed.recv(size, 0)

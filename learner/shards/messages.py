@@ -46,7 +46,7 @@ class Learn(msgspec.Struct, frozen=True, tag=True):
     state: bool
     """whether the whole state of rank 0's algorithm follows, because the receiver does not have it"""
     digest: str
-    """the digest of rank 0's state, for the receiver to compare with that of its own state; empty if it need not compare"""
+    """the digest of rank 0's state, for the receiver to compare with its own; empty if it need not compare"""
 
 
 class StillThere(msgspec.Struct, frozen=True, tag=True):
@@ -65,7 +65,7 @@ FromRankZero = Begin | Learn | StillThere | End
 
 
 def arrays_of(batch: Batch, columns: Array) -> list[Array]:
-    """The arrays of a batch that are sent to a process. Observations have only `columns`; the others have all columns."""
+    """The arrays of a batch that are sent to a process. Observations have only `columns`; other arrays have all columns."""
     optional = [array for array in (batch.mask, batch.resets) if array is not None]
     return [
         *(getattr(batch, name) for name in SMALL),
@@ -76,7 +76,7 @@ def arrays_of(batch: Batch, columns: Array) -> list[Array]:
 
 
 def batch_of(learn: Learn, arrays: Sequence[Array], columns: Array) -> Batch:
-    """Make the batch from the arrays of `arrays_of`, without episodes. The observations of other columns are zeros.
+    """Make the batch, without episodes, from the result of `arrays_of`. The observations of other columns are zeros.
 
     The operating system allocates no memory for these zeros.
     """

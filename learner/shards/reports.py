@@ -1,6 +1,6 @@
-"""Reports of the shards on their parts of a minibatch. They have a fixed size, so gathering them needs no negotiation.
+"""The shards' reports on their parts of a minibatch. They have a fixed size, so gathering them needs no negotiation.
 
-Law: the numbers of a minibatch are means over its rows. So they are averages of its parts' numbers, each weighted by the
+Law: a minibatch's numbers are means over its rows. They are therefore averages of its parts' numbers, each weighted by the
 part's number of rows. If one process fails, all processes learn why, and none takes the step.
 """
 

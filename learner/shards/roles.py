@@ -50,8 +50,8 @@ def follow(config: Config, place: Place) -> Path:
     Returns the path of the run folder, which may be on another machine; if the run had already finished, the path of the
     folder of all runs.
 
-    Ctrl-C and SIGTERM don't end this process once the run has begun: launchers send them to all processes, and rank 0 ends
-    the run. Of `config`, only the timeouts, `shards`, `device` and `run_dir` matter.
+    Ctrl-C and SIGTERM don't end this process once the run has begun, because launchers send them to all processes, and rank
+    0 then ends the run. Of `config`, only the timeouts, `shards`, `device` and `run_dir` matter.
     """
     interrupts = Interrupts()
 

@@ -1,10 +1,10 @@
 """An actor-critic whose updates are divided among learner processes. Its state is identical in all of them, bit for bit.
 
 Law of an update: rank 0 sends the batch to the others. Every process passes its own shards through the network, one shard at
-a time, and gathers the numbers and the gradients of all shards. From then on, all processes make the same computations. The
-gradient is that of a mean over the rows of a minibatch, so the loss must be a mean over the rows that it gets.
+a time, and gathers the numbers and the gradients of all shards. From then on, all processes do the same computations. The
+gradient is that of a mean over a minibatch's rows, so the loss must be a mean over the rows that it receives.
 
-If rank 0 changes the state in any other way than by an update (by a resume, `--from`, cloning, or undoing an update), it
+If something other than an update changes rank 0's state (a resume, `--from`, cloning, or the undoing of an update), rank 0
 sends the whole state along with the next batch.
 """
 
@@ -53,7 +53,7 @@ class Sharded(ActorCritic):
     _failed: Exception | None = None
     """the exception that this process raised in the current minibatch"""
 
-    # ---------------------------------------------------------------- how the processes make the same update
+    # ---------------------------------------------------------------- how the processes do the same update
 
     def update(self, batch: Batch, pulse: Callable[[], None]) -> UpdateMetrics:
         """See `ActorCritic`. If `pulse` raises, all processes stop the update at its next gradient step, or at its end."""
@@ -92,7 +92,7 @@ class Sharded(ActorCritic):
         self._others_know_state = True
 
     def follow(self, learn: Learn, arrays: Sequence[Array]) -> None:
-        """Make the same update that rank 0 makes now, from its message and arrays."""
+        """Do the same update that rank 0 is doing now, from rank 0's message and arrays."""
         statistics, *rest = arrays
         division = self.learners.division
         if learn.state:

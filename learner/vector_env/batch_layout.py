@@ -17,7 +17,7 @@ class BatchLayout:
     """Which rows and env copies belong to each lane."""
 
     def __init__(self, lane_sizes: Sequence[int], seats: int = 1) -> None:
-        """`lane_sizes` are the numbers of env copies of the lanes. `seats` is A, the number of seats of each copy."""
+        """`lane_sizes` has the number of env copies of each lane. `seats` is A, the number of seats of each copy."""
         ends = list(accumulate(lane_sizes))
         self._seats = seats
         self.count = ends[-1]
@@ -26,7 +26,7 @@ class BatchLayout:
         self._copies = [range(end - size, end) for end, size in zip(ends, lane_sizes, strict=True)]
         self._firsts = [copies.start for copies in self._copies]
         self.rows = [slice(copies.start * seats, copies.stop * seats) for copies in self._copies]
-        """The rows of each lane, by lane."""
+        """The rows of each lane, in lane order."""
 
     def copies(self, lane: int) -> range:
         """The env copies of a lane, numbered as in the whole batch."""

@@ -1,4 +1,4 @@
-"""Calls env copies, and gets descriptions of them: makes the orders to each lane, and reads the answers."""
+"""Calls env copies, and gets descriptions of them: makes the orders for each lane, and reads the answers."""
 
 from __future__ import annotations
 

@@ -74,7 +74,7 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         self.merge_infos = True
         """whether to return infos, merged as gymnasium does; if not, only `infos_by_row` has them"""
         self.infos_by_row: dict[int, Infos] = {}
-        """the newest infos that are not empty, by row, as each copy returned them"""
+        """the newest non-empty infos, by row, as each copy returned them"""
         self.hub = hub
         """the hub that sends the orders; set its `while_waiting` to have a function called while it waits"""
         self.address = hub.address
@@ -94,7 +94,7 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         self._send_recv = SendRecv(parts, timeout_s)
         spaces = {"observation_space": self.single_observation_space, "action_space": self.single_action_space}
         self.calls = CopyCalls(self._send_recv, parts, {"spec": self.spec, **spaces})
-        """calls, reads and assigns attributes of some of the copies"""
+        """calls methods of some of the copies, and reads and assigns their attributes"""
         self._close_once = weakref.finalize(self, _call_in_process, os.getpid(), on_close)
 
     # ---------------------------------------------------------------- reset and step
@@ -122,7 +122,7 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         *,
         env_ids: Sequence[int] | Array | None = None,
     ) -> None:
-        """Begin episodes as `reset` does, but only in the copies `env_ids` if these are given.
+        """Begin episodes as `reset` does, but only in the copies that `env_ids` names, if it is given.
 
         With `env_ids`, a list of seeds has one seed for each of these copies. Get the results with `reset_wait`, which
         returns what `reset` returns, or with `recv`, which returns the copies that are ready, with reward 0. Raises
@@ -154,14 +154,15 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         [num_envs] float64; terminated and truncated are [num_envs] bool; infos are a dict, merged as gymnasium does.
 
         With seats, the action of a row counts only if `infos["acts"]` was True for it in the previous results.
-        `infos["complete"]` says which rows are complete transitions: from the observation in which the row's seat last acted
-        to the present one, with this reward, terminated and truncated. Agents that take turns may have acted some steps
-        earlier, so keep their actions until their rows are complete. Don't learn from other rows; `infos["outside"]` has
-        rewards that belong to no transition. An episode is over when no seat of its copy acts. If a worker is lost, its rows
-        are truncated and not complete.
+        `infos["complete"]` says which rows are complete transitions. Such a transition leads from the observation at which
+        the row's seat last acted to the current one, with this reward, terminated and truncated. Agents that take turns may
+        have acted some steps earlier, so keep their actions until their rows are complete. Don't learn from other rows;
+        `infos["outside"]` has rewards that belong to no transition. An episode is over when no seat of its copy acts. If a
+        worker is lost, its rows are truncated and not complete.
 
-        Raises `UsageError` for copies that must be reset first, `TypeError` and `ValueError` for wrong actions,
-        `EnvironmentFailed`, `NoWorkers`, and, with `on_worker_loss="raise"`, `WorkerLost`.
+        Raises `UsageError` for copies that must be reset first, and `TypeError` or `ValueError` for wrong actions. Raises
+        `EnvironmentFailed` if an environment fails, `NoWorkers` if a lane has no worker and gets none in time, and, with
+        `on_worker_loss="raise"`, `WorkerLost` if a worker is lost.
         """
         self._check_idle("step_async")
         try:
@@ -185,7 +186,7 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         """Wait for the pending step. Returns what `step` returns.
 
         Raises what `step` raises, and `NoAsyncCallError` if no step is pending. A worker that does not answer within
-        `timeout` seconds (by default, the timeout of the vector environment) is treated as lost.
+        `timeout` seconds (by default, the vector environment's timeout) is treated as lost.
         """
         return self._wait(AsyncState.WAITING_STEP, timeout)
 
@@ -200,7 +201,7 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         """Wait for the step of these lanes. Returns what `step` returns, but only the rows of these lanes are meaningful.
 
         Raises what `step` raises, and `NoAsyncCallError` for lanes whose step is not under way. After an error, these lanes
-        are no longer awaited; others are.
+        are no longer awaited, but other lanes still are.
         """
         self._check_idle("end_step", of_sent=True)
         return self._rows(self._send_recv.recv_some(lanes))
@@ -216,7 +217,7 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
     def send(self, actions: Any, env_ids: Sequence[int] | Array | None = None) -> None:
         """Begin a step of these copies, by default all, with one action each; `recv` returns the results.
 
-        Actions are [len(env_ids), *leaf], in the order of `env_ids`. A lane is stepped as a whole, so `env_ids` must have
+        Actions are [len(env_ids), *leaf], in the order of `env_ids`. A lane is stepped as a whole, so `env_ids` must contain
         all copies of a lane or none (`make_vec(lanes=num_envs)` makes each copy a lane). Autoreset works as in `step`.
 
         Raises `AlreadyPendingCallError` if one of the copies has not come back, `ValueError` for invalid `env_ids` or a
@@ -239,13 +240,15 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         """Wait until at least `min_envs` copies are ready (0 does not wait). Returns the results of all ready copies.
 
         Observations, rewards, terminated, truncated and infos have a row for each of these copies, or for each of their
-        seats, in ascending order of the copies. `infos["env_id"]` has the numbers of the copies, int64. The arrays are
-        copies that you may keep. Each row equals the one that `step` or `reset` would have returned.
+        seats, in ascending order of the copies. `infos["env_id"]` has the numbers of the copies, int64. You may keep the
+        arrays, because later calls don't change them. Each row equals the one that `step` or `reset` would have returned.
 
-        A worker that does not answer within `timeout` seconds (by default, the timeout of the vector environment) is treated
-        as lost, just as by `step`; only time in which you wait for it counts. Raises `NoAsyncCallError` if nothing was sent,
-        `EnvironmentFailed`, `WorkerLost` and `NoWorkers`. After an error, all other copies can still be received, and those
-        that are lost come back truncated or are named by `WorkerLost`.
+        A worker that does not answer within `timeout` seconds (by default, the vector environment's timeout) is treated as
+        lost, just as by `step`; only the time that you spend waiting for it counts.
+
+        Raises `NoAsyncCallError` if nothing was sent, and otherwise `EnvironmentFailed`, `WorkerLost` and `NoWorkers`, as
+        `step` and `reset` do. After an error, all other copies can still be received, and those that are lost come back
+        truncated or are named by `WorkerLost`.
         """
         self._check_idle("recv", of_sent=True)
         self._state = AsyncState.DEFAULT
@@ -267,7 +270,7 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         Raises `UsageError` for a name that cannot be sent, `TypeError` for arguments that cannot be sent, `AttributeError`
         or `EnvironmentFailed` if an environment raised, and `WorkerLost` if a worker is lost.
 
-        `spec`, `observation_space` and `action_space` can't be sent; they are made from a worker's description of them.
+        `spec`, `observation_space` and `action_space` can't be sent, so they are made from a worker's description of them.
         """
         if name not in self.calls.known:
             self._check_idle("call")

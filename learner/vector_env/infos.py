@@ -1,4 +1,4 @@
-"""The infos of a step: unpacks the bytes of each lane to a dict for each row, and merges these as gymnasium does."""
+"""The infos of a step: unpacks each lane's bytes into one dict for each row, and merges these dicts as gymnasium does."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class InfoReader:
         """`refuse` is called with a lane whose infos cannot be read, and the reason."""
         self._layout = layout
         self._refuse = refuse
-        self._warned: set[str] = set()  # keys of infos about which the log has warned, because their values arrived as texts
+        self._warned: set[str] = set()  # info keys about which the log has warned, because their values arrived as text
 
     def by_row(self, ready: Ready) -> dict[int, Infos]:
         """The infos that are not empty, by row, in the order of the rows."""

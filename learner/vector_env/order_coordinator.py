@@ -2,7 +2,7 @@
 
 Rule: an order goes to one lane, and a lane has one order at a time; lanes do not wait for each other. Either the order is
 answered, or its lane is lost with its worker. A lost lane starts again on new env copies, in its next incarnation. A lane
-leaves its worker only if the worker is lost: elsewhere it would have new env copies, without the random states and
+leaves its worker only if the worker is lost, because elsewhere it would have new env copies, without the random states and
 attributes of the old ones. If a Heartbeat shows that an order was lost on the way, the order is sent again. Steps through
 shared memory don't count as orders here. If the infos of such a step are too long for the shared memory, they arrive as a
 message.
@@ -68,9 +68,9 @@ class OrderCoordinator(Coordinator[Member]):
         self.answers: dict[int, Answer] = {}
         """The newest answer of each lane, by lane, until `forget` removes it."""
         self.shared_orders: dict[int, int] = {}
-        """By lane, the number of its step through shared memory that is under way."""
+        """By lane, the number of the step through shared memory that is under way."""
         self.infos: dict[int, bytes] = {}
-        """By lane, the packed infos of its step through shared memory, if they arrived as a message."""
+        """By lane, the packed infos of the step through shared memory, if they arrived as a message."""
         self.lost: dict[int, str] = {}
         """Lanes whose env copies are gone, with the reason, until the vector environment has handled them."""
         self._placement = LanePlacement(self.lanes, _by_name)
@@ -79,7 +79,7 @@ class OrderCoordinator(Coordinator[Member]):
     def give_up(self, member: Member, why: str) -> list[Outgoing]:
         """Remove this worker, because the learner no longer waits for it.
 
-        A worker of the same name that uses another key stays.
+        A worker with the same name but another key stays.
         """
         self.membership.remove(member, TimedOut, why)
         return []
@@ -113,7 +113,7 @@ class OrderCoordinator(Coordinator[Member]):
         return None if peer is None else self.members[peer]
 
     def order(self, lane: int, make_order: MakeOrder) -> list[Outgoing]:
-        """Make an order to a lane, which must have a worker, and return the message to send."""
+        """Make an order for a lane, which must have a worker, and return the message to send."""
         member = self.owner(lane)
         record = self.lanes[lane]
         assert member is not None
@@ -179,7 +179,7 @@ class OrderCoordinator(Coordinator[Member]):
 
 
 def _by_name(member: Member) -> tuple[int, str]:
-    """Sort key of workers with equally few lanes: the one whose name comes first gets the next lane."""
+    """Sort key for workers with equally few lanes: the one whose name comes first gets the next lane."""
     return len(member.hello.worker), member.hello.worker
 
 

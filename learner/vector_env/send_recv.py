@@ -50,7 +50,7 @@ class VectorEnvParts:
     seeds: list[int | None]
     """the seed of each copy's last reset with a seed"""
     ever_reset: Bools
-    """[copies] True for copies that were ever reset"""
+    """[copies] True for copies that have been reset at least once"""
     on_worker_loss: Literal["truncate", "raise"] = "truncate"
 
     def replacement_seeds(self, lane: int) -> tuple[int | None, ...]:
@@ -160,7 +160,7 @@ class SendRecv:
     def recv(self, min_envs: int, timeout_s: float | None = None) -> tuple[Ready, list[int]]:
         """Wait until at least `min_envs` copies are ready. Returns the ready lanes, and the numbers of their copies.
 
-        Raises `EnvironmentFailed`, `WorkerLost` and `NoWorkers`. If it raises, the next call can still take lanes that are
+        May raise `EnvironmentFailed`, `WorkerLost` or `NoWorkers`. Even then, the next call can take the lanes that are
         ready.
         """
         sent = self._sent
@@ -194,14 +194,15 @@ class SendRecv:
         sent = self._sent
         if idle := [lane for lane in lanes if lane not in sent.sent]:
             raise NoAsyncCallError(f"lanes {idle} are not under way: expected an order to them first", "send")
-        # Look first: a result may have arrived while other lanes were waited for, and then no worker wakes this process.
+        # Look first: a result may have arrived during a wait for other lanes, and then no worker wakes this process again.
         self._wait_until(lambda: sent.are_ready(lanes), self.timeout_s, lanes, look_first=True, together=False)
         return sent.take_some(lanes)
 
     def look(self, timeout_s: float) -> None:
         """Record which of the lanes under way have returned a result or were lost. Never waits.
 
-        Raises `EnvironmentFailed` and `NoWorkers`.
+        Raises `EnvironmentFailed` if an environment has failed, and `NoWorkers` if an order waits for a worker and none can
+        join any more.
         """
         self._take_results()
         self._parts.hub.raise_failure()
@@ -331,7 +332,7 @@ class SendRecv:
         return bytes(answer.infos.data)
 
     def _give_up_late(self, timeout_s: float) -> None:
-        """Treat the workers that take too long as lost. Raises `NoWorkers` if a lane had no worker all that time."""
+        """Treat workers that take too long as lost. Raises `NoWorkers` if a lane had no worker all that time."""
         now = self._watched.look(self._parts.hub.now())
         for lane in self._sent.overdue(now, timeout_s):
             try:

@@ -20,7 +20,7 @@ from millrace.protocol.messages import Returned
 
 Infos = dict[str, Any]
 """The info that an environment returns alongside a row."""
-LONGEST_GAP_S = 0.5  # a caller that looks less often is busy, or its process was stopped
+LONGEST_GAP_S = 0.5  # a caller that looks less often is busy, or its process was suspended
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Sent(NamedTuple):
     attempts: int = 1
     """how many times the reset has been sent"""
     last_observations: Mapping[int, Any] | None = None
-    """by row, the final observations of the episodes of lost copies, while their new copies are reset"""
+    """by row, the final observations of lost copies' episodes, while the new copies are reset"""
 
 
 class Ready(NamedTuple):
@@ -204,8 +204,8 @@ class SentLanes:
 class WatchedTime:
     """A clock for the timeouts of workers. Between two looks at the clock, at most `LONGEST_GAP_S` counts.
 
-    So if the learner computed for a minute, or was stopped together with its workers, no worker is treated as lost because
-    of that.
+    This way, no worker is treated as lost because the learner computed for a minute, or was suspended together with its
+    workers.
     """
 
     def __init__(self, now: float) -> None:

@@ -41,9 +41,9 @@ class VectorEnvSettings:
     on_worker_loss: Literal["truncate", "raise"] = "truncate"
     timeout_s: float = 60.0
     worker_timeout_s: float = 5.0
-    """A worker that was started elsewhere is lost if it is silent for this many seconds while the learner listens."""
+    """A worker that was started elsewhere counts as lost if it is silent for this many seconds while the learner listens."""
     call_timeouts: CallTimeouts = field(default_factory=CallTimeouts)
-    """How long a call of the environment may take before its worker is ended."""
+    """How long a call to the environment may take before its worker is ended."""
     max_env_failures: int = 3
     """How many times workers may die in the environment's code before `make_vec` raises. See `FailureCount`."""
     copy: bool = True
@@ -53,11 +53,11 @@ class VectorEnvSettings:
     wrappers: Sequence[WrapperLike] = ()
     """Wrappers of every env copy, the innermost first."""
     single_lanes: int = 0
-    """Number of additional copies for evaluations, which follow the others. Each is a lane of its own, and can be stepped
+    """Number of additional evaluation copies, which follow the other copies. Each is a lane of its own, and can be stepped
     alone with `ZmqVectorEnv.begin_step`.
     """
     evaluates: bool = False
-    """Whether all copies are for evaluations."""
+    """Whether all copies are evaluation copies."""
 
     def __post_init__(self) -> None:
         if not self.timeout_s > 0:  # this way, NaN is refused, too

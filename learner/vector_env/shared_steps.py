@@ -21,7 +21,7 @@ class SharedSteps:
     def __init__(
         self, memory: SharedMemory, to_workers: Mapping[str, WakePipe], to_learner: WakePipe, spin_s: float = 0.0
     ) -> None:
-        """`to_workers` are the pipes that wake the workers that inherited the memory, by name.
+        """`to_workers` has, by worker name, the pipes that wake the workers that inherited the memory.
 
         `to_learner` is the pipe that wakes this process. `spin_s` is how many seconds to spin before sleeping.
         """

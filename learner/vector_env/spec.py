@@ -1,6 +1,7 @@
 """A vector environment as data: its env copies and lanes follow from the settings, its spaces from a worker's description.
 
-Rule: the observations of all copies have the same shapes and dtypes, because they share arrays; so do the actions. Pure.
+Rule: the observations of all copies have the same shapes and dtypes, because they share arrays; the same holds for actions.
+Pure.
 """
 
 from __future__ import annotations
@@ -55,7 +56,7 @@ class RequestedCopies:
     call_timeouts: CallTimeouts
     learner_timeout_s: float
     evaluation_copies: int
-    """the number of copies that play evaluations; they are the last ones"""
+    """the number of evaluation copies, which are the last ones"""
 
     @property
     def to_describe(self) -> Unknown:
@@ -89,7 +90,7 @@ class RequestedCopies:
 
 
 def _identity(spec: EnvSpec) -> tuple[str, PickledCallable | None, str]:
-    """A key that is equal for specs that make the same environment. Wrappers are left out: all copies have the same."""
+    """A key that is equal for specs that make the same environment. Leaves out wrappers, which all copies share."""
     return spec.id, spec.factory, repr(spec.kwargs)
 
 

@@ -1,7 +1,7 @@
 """The hub of a vector environment: a shell around its coordinator and its shared memory.
 
 Rule: a lane gets its orders as messages, or steps through shared memory; results are taken lane by lane. A worker that does
-not answer in time is treated as lost, and killed if it is a child of this process. Workers that have been silent for too
+not answer in time is treated as lost, and is killed if it is a child of this process. Workers that have been silent for too
 long are removed only while the hub listens, so the caller may take as long as it likes between two waits.
 """
 
@@ -31,7 +31,7 @@ POLL_S = 0.05  # interval at which to check whether a child process has ended
 LISTEN_EVERY_S = 0.5  # interval at which heartbeats are answered while steps go through shared memory
 # How long a lost lane waits for a restarted worker, at most half the timeout, before it goes to a worker that has lanes.
 PATIENCE_S = 10.0
-BUSY_S = 1.0  # how long closing waits for a step under way, which may hang and whose result nobody uses
+BUSY_S = 1.0  # how long `close` waits for a running step, which may hang and whose result nobody uses
 
 
 class StepHub:
@@ -50,7 +50,7 @@ class StepHub:
     ) -> None:
         """A worker that is silent for longer than `worker_timeout_s` while the hub listens is treated as lost.
 
-        The timeout is infinite if this program learns of the end of worker processes in another way.
+        The timeout is infinite if this program notices in another way that worker processes have ended.
         """
         self.shared = shared
         self.now = clock
@@ -74,13 +74,13 @@ class StepHub:
         self._patience_s = PATIENCE_S
         self._listen_due_s = 0.0
         self._failure: Failed | None = None  # the first failure since the last `raise_failure`
-        # Losing a worker costs the user episodes. So after this process was away, each worker gets its whole timeout to be
-        # heard again, instead of the server's short grace. After a long suspension, a worker must even reconnect.
+        # Losing a worker costs the user episodes. Therefore, after this process was away, each worker has its whole timeout
+        # to be heard again, instead of the server's short grace. After a long suspension, a worker even has to reconnect.
         settings = ServerSettings(grace_s=worker_timeout_s, log_tracebacks=False)
         self._server = MemberServer(link, self.coordinator, self, processes, settings, clock)
 
     def take_over(self, waiting: Membership[Member]) -> None:
-        """Begin the vector environment for the workers that wait for it."""
+        """Begin the vector environment for the workers waiting for it."""
         self._server.send(self.coordinator.take_over(waiting, self.now()))
 
     @property
@@ -102,9 +102,9 @@ class StepHub:
         self.shared.step(lanes, together=together)
 
     def can_share(self, lane: int) -> bool:
-        """Whether a step of this lane may use shared memory: its worker must have the memory, and the lane no order.
+        """Whether a step of this lane may use shared memory: its worker must have the memory, and no order may be pending.
 
-        The lane still has an order if the wait for the answer was interrupted. The worker might execute that order after the
+        An order is still pending if the wait for its answer was interrupted. The worker might execute that order after the
         step.
         """
         shared = self.shared
@@ -120,7 +120,7 @@ class StepHub:
 
     def take(self) -> dict[int, Answer | bytes]:
         """Take the results of the newest orders, by lane: answers that arrived as messages, and packed infos of steps
-        through shared memory. A lane without a result yet, or that is lost, is left out.
+        through shared memory. Lanes that have no result yet, or are lost, are left out.
         """
         newest = self._newest_tickets  # an answer with another ticket belongs to an earlier order
         answers: dict[int, Answer | bytes] = {

@@ -15,8 +15,8 @@ from millrace.protocol.progress import RunProgress
 def status(coordinator: OrderCoordinator, now: float, of_run: Callable[[float], Status] | None = None) -> Status:
     """The status message of a vector environment, which by itself has no weights, no target and no ledger.
 
-    `of_run` returns the status of the run that acts on its copies, if there is one. The result then has the figures of that
-    run, and the workers of this vector environment.
+    `of_run` returns the status of the run that acts on the environment's copies, if there is one. The result then has the
+    figures of that run, and the workers of this vector environment.
     """
     workers = coordinator.membership.status(now)
     members = coordinator.members.values()
