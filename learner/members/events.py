@@ -70,7 +70,7 @@ class Failed:
     worker: str
     host: str
     error: str
-    """The error, in one line, which names the lane if there is one."""
+    """The error as one line, including the lane if there is one."""
     traceback: str = ""
     lanes: tuple[int, ...] = ()
     """The lane that failed if it is known; otherwise all lanes that the worker held."""
@@ -85,7 +85,7 @@ class Failed:
         return f"worker {self.worker} ({self.host}): {self.error}"
 
     def exception(self, why: str = "") -> EnvironmentFailed | PolicyFailed:
-        """The error to raise for this failure. `why` says why the run ends with it."""
+        """The error to raise for this failure. `why` says why this failure ends the run."""
         return self.raised_as(joined(self.line, why), self.traceback)
 
 
@@ -98,7 +98,7 @@ class EnvironmentRaised(Failed):
 
 @dataclass(frozen=True)
 class PolicyRaised(Failed):
-    """A policy that the user wrote raised in a worker, returned an unusable result, crashed the worker's process, or did not
+    """In a worker, a user-written policy raised an exception, returned an unusable result, crashed the process, or did not
     return in time.
     """
 

@@ -38,9 +38,9 @@ class SharingSupervisor:
 class Speed:
     """How fast a worker steps.
 
-    A step may take minutes, and a client may count the steps of a rollout only when the rollout is complete. So the speed is
-    measured between the last two heartbeats that reported more steps than before. The speed falls once the next measurement
-    is overdue.
+    A step may take minutes, and a client may count the steps of a rollout only when the rollout is complete. Therefore, the
+    speed is measured between the last two heartbeats that reported more steps than before. The speed falls once the next
+    measurement is overdue.
     """
 
     steps: int

@@ -170,7 +170,7 @@ class MemberServer:
             self._log_events(cause)
 
     def wait_for(self, workers: int, timeout_s: float, turn: Callable[[], None], *, describing_until_s: float = 0.0) -> None:
-        """Call `turn`, which must listen, until this number of `workers` have joined.
+        """Call `turn`, which must listen, until this many `workers` have joined.
 
         Raises `NoWorkers` after `timeout_s`, or at once if that many can no longer join. Workers that only evaluate don't
         count. Until the clock reaches `describing_until_s`, it also waits for workers that are still describing the

@@ -73,7 +73,7 @@ class HubSnapshot(NamedTuple):
     incarnations: list[int]
     """The next incarnation of each lane."""
     lags: list[int]
-    """The lag of each rollout of the last `gather`."""
+    """The lag of each rollout that the last `gather` returned."""
     taken_s: float = 0.0
     """Time of the snapshot, by the hub's clock."""
     progress: Progress = Progress()
@@ -155,7 +155,7 @@ class Hub:
     # ---------------------------------------------------------------- what the loop calls
 
     def wait_for(self, workers: int) -> None:
-        """Wait until this number of `workers` have joined. Raises `NoWorkers` after `no_workers_timeout_s`."""
+        """Wait until this many `workers` have joined. Raises `NoWorkers` after `no_workers_timeout_s`."""
         timeout_s = self.settings.no_workers_timeout_s
         until_s = self._describing_until_s
         self._server.wait_for(workers, timeout_s, lambda: self._turn(POLL_S), describing_until_s=until_s)

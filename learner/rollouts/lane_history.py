@@ -138,7 +138,7 @@ class LaneHistory:
             return LastEpisode(start, random, self.count + int(np.flatnonzero(resets)[-1]) + 1, False)
         if began is not None:
             return LastEpisode(start, random, self.count, False)
-        # The rows before a saved state were dropped. So unless a newer state was saved, the episode can't be continued.
+        # The rows before a saved state were dropped. Unless a newer state was saved, the episode can't be continued.
         return LastEpisode(start, None, self.count, False) if last.saved else last
 
     def _saved(self, n: int) -> None:

@@ -32,11 +32,11 @@ class AcceptedRollout:
     incarnation: int
     """The incarnation of the lane when the ticket was dealt. Each incarnation has new env copies."""
     fresh: Bools | bool = True
-    """[N] True for env copies that don't continue the lane's previous taken rollout, because the copy has started afresh or
-    a rollout in between was rejected. A single value applies to all copies.
+    """[N] True for env copies that don't continue the previous rollout taken from the lane, because the copy has started
+    afresh or a rollout in between was rejected. A single value applies to all copies.
     """
     from_past: bool = False
-    """Whether the worker was told to continue the lane's past with this rollout."""
+    """Whether the worker was told to continue the lane's past in this rollout."""
 
 
 class RolloutDealer:

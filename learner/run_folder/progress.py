@@ -56,7 +56,7 @@ class Progress(RunProgress, frozen=True, kw_only=True):
     episodes: tuple[Episode, ...] = ()
     """the episodes that ended in the rollouts of the last update"""
     lags: tuple[int, ...] = ()
-    """the lag of each rollout of the last update"""
+    """the lag of each rollout that the last update used"""
     evaluation: Evaluation | None = None
     """the last evaluation"""
     evaluated: EvaluatedPolicy = EvaluatedPolicy()

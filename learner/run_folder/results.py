@@ -67,7 +67,7 @@ def fact_metrics(group: str, facts: Mapping[str, FactMean]) -> dict[str, float |
 
 
 class Evaluation(msgspec.Struct, frozen=True, kw_only=True):
-    """The result of an evaluation by greedy episodes, in raw rewards.
+    """The result of an evaluation with greedy episodes, in raw rewards.
 
     >>> import millrace
     >>> result = millrace.evaluate(run, episodes=2, workers=1)
@@ -163,7 +163,7 @@ class Best(msgspec.Struct, frozen=True, kw_only=True):
 class Summary(msgspec.Struct, frozen=True, kw_only=True):
     """The results of a run, from its summary.json. `Run.summary` is None until the run has ended.
 
-    Returns are sums of raw rewards, undiscounted. Numbers count from the beginning of the run, even after a resume, unless
+    Returns are sums of raw rewards, undiscounted. Numbers cover the whole run, including the time before a resume, unless
     their description says otherwise.
 
     >>> import millrace
@@ -193,7 +193,7 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     facts_100: dict[str, FactMean] = {}
     """for each name in `info_keys`, the mean of the numbers that the environment reported at the ends of these episodes"""
     evaluation: Evaluation | None
-    """evaluation of the final policy by greedy episodes; None if the run was cut short before it"""
+    """evaluation of the final policy with greedy episodes; None if the run was cut short before it"""
     ended_by: Real | None = None
     """the mean return of the evaluation that ended the run by reaching `target_return`; if a callback ended the run, the
     mean return of the final policy, provided that the callback could know it. Such a return is biased upwards. If it belongs
@@ -202,7 +202,7 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     best: Best | None = None
     """the best policy of the run's own evaluations, if there were any"""
     ledger: dict[str, Natural] = {}
-    """the number of tickets and of transitions in each state"""
+    """the numbers of tickets and of transitions in each state"""
     lags: dict[str, Natural] = {}
     """the number of rollouts that updates used, by lag, since this process started"""
     first_use_s: dict[str, Real] = {}

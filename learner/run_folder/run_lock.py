@@ -335,7 +335,7 @@ class LearnerOfRun(NamedTuple):
     keys: Path | None
     """The learner's key folder, which may be on another machine; None if no key is needed."""
     is_here: bool
-    """Whether the learner is on this machine and in this network, so that `address` is its own address."""
+    """Whether the learner is on this machine and in this network. If so, `address` is its own address."""
 
 
 def learner_of_run(folder: Path) -> LearnerOfRun:

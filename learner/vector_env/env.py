@@ -246,9 +246,9 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         A worker that does not answer within `timeout` seconds (by default, the vector environment's timeout) is treated as
         lost, just as by `step`; only the time that you spend waiting for it counts.
 
-        Raises `NoAsyncCallError` if nothing was sent, and otherwise `EnvironmentFailed`, `WorkerLost` and `NoWorkers`, as
-        `step` and `reset` do. After an error, all other copies can still be received, and those that are lost come back
-        truncated or are named by `WorkerLost`.
+        Raises `NoAsyncCallError` if nothing was sent. Raises `EnvironmentFailed`, `WorkerLost` and `NoWorkers` in the same
+        cases as `step` and `reset`. After an error, all other copies can still be received, and those that are lost come
+        back truncated or are named by `WorkerLost`.
         """
         self._check_idle("recv", of_sent=True)
         self._state = AsyncState.DEFAULT

@@ -201,8 +201,8 @@ class SendRecv:
     def look(self, timeout_s: float) -> None:
         """Record which of the lanes under way have returned a result or were lost. Never waits.
 
-        Raises `EnvironmentFailed` if an environment has failed, and `NoWorkers` if an order waits for a worker and none can
-        join any more.
+        Raises `EnvironmentFailed` if an environment has failed, and `NoWorkers` if a lane has had no worker for
+        `timeout_s`.
         """
         self._take_results()
         self._parts.hub.raise_failure()

@@ -207,7 +207,7 @@ class StepHub:
             self._server.send(self.coordinator.reject_message(member.peer, why, self.now()))
 
     def wait_for(self, workers: int, timeout_s: float) -> None:
-        """Wait until this number of `workers` have joined. Raises `NoWorkers` after `timeout_s`."""
+        """Wait until this many `workers` have joined. Raises `NoWorkers` after `timeout_s`."""
         self._server.wait_for(workers, timeout_s, lambda: self._turn(POLL_S))
 
     def no_workers(self, timeout_s: float) -> NoWorkers:
