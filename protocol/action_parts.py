@@ -1,8 +1,9 @@
 """Converts a Dict or Tuple of actions to one row of numbers, and back. Pure.
 
 Rule: a row has the choices of all Discrete and MultiDiscrete parts, then the bits of all MultiBinary parts, then the numbers
-of all Box parts. Within each of these three groups, the parts are in the order of the space. So a mixed action has at most
-three distributions, whatever its parts are, and only the code that converts it for the environment knows the parts.
+of all Box parts. Within each of these three groups, the parts are in the order of the space. A mixed action therefore has at
+most three distributions, whatever its parts are, and only the code that converts it for the environment needs to know the
+parts.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ Path = tuple[str | int, ...]
 
 
 class PlacedPart(NamedTuple):
-    """A part of a mixed action: its spec as an action by itself, and its place in the mixed action."""
+    """A part of a mixed action: its spec as a stand-alone action, and its place in the mixed action."""
 
     path: Path
     spec: ActionSpec
@@ -79,7 +80,7 @@ Nest = Callable[[Sequence[Any]], Any]
 
 
 def make_nest(paths: Sequence[Path]) -> Nest:
-    """Return a function that puts values into a dict or tuple, one at each of these paths. It takes them in this order.
+    """Return a function that takes one value for each of these paths, in this order, and puts them into a dict or tuple.
 
     If there is only one path, it may be empty: the function then returns the value itself. Raises `ValueError` unless the
     paths describe a Dict or Tuple.
@@ -88,7 +89,7 @@ def make_nest(paths: Sequence[Path]) -> Nest:
 
 
 def _nest(placed: Sequence[tuple[int, Path]]) -> Nest:
-    """Like `make_nest`, for some of the values. `placed` has each value's index, and the rest of its path."""
+    """Like `make_nest`, but for only some of the values. `placed` has each value's index, and the rest of its path."""
     number, path = placed[0]
     if not path and len(placed) == 1:
         return itemgetter(number)

@@ -27,7 +27,7 @@ class WorkerActivity(msgspec.Struct, frozen=True, array_like=True):
     for_s: Seconds
     """seconds since it started this activity"""
     env_calls: Natural
-    """calls of the environment (make, reset, step) that have returned since the worker started"""
+    """calls to the environment (make, reset, step) that have returned since the worker started"""
 
 
 class WorkerExit(msgspec.Struct, frozen=True, array_like=True):
@@ -40,7 +40,7 @@ class WorkerExit(msgspec.Struct, frozen=True, array_like=True):
     failed: bool
     """whether the environment, the policy, or the worker is to blame for the worker's end"""
     of_policy: bool = False
-    """whether it failed in a call of a user-defined policy, so that no environment is to blame"""
+    """whether it failed in a call to a user-defined policy, in which case no environment is to blame"""
     hung: bool = False
     """whether its supervisor ended it because a call took too long; its steps are then not replayed"""
 
@@ -61,15 +61,14 @@ class StartFailed:
 class Alive(Message, frozen=True):
     """A supervisor reports which of its workers are running, and which have ended.
 
-    The learner believes what a report says about a worker if it contains the worker's `process_nonce` and comes from a peer
-    with the worker's key.
-    Once the run is over, the learner answers with `Drain`, and the supervisor ends the workers that don't leave by
-    themselves.
+    The learner believes what a report says about a worker if the report contains the worker's `process_nonce` and comes from
+    a peer with the worker's key. Once the run is over, the learner answers with `Drain`, and the supervisor ends the workers
+    that don't leave by themselves.
     """
 
     running: Annotated[tuple[WorkerActivity, ...], Meta(max_length=MAX_WORKERS)]
     ended: Annotated[tuple[WorkerExit, ...], Meta(max_length=MAX_WORKERS)]
-    """workers that ended a short while ago; repeated, because a message may be lost"""
+    """workers that ended recently; several reports name each of them, because a message may be lost"""
     replies: Natural | None = None
     """number of the last HeartbeatReply that the supervisor received, if its workers share the weights that it gets; null if
     they don't

@@ -1,7 +1,7 @@
 """Bounds of the texts, numbers and lists in a message, as types for its fields. `millrace.protocol.wire.message_sizes`
 bounds the size of the message itself. Pure.
 
-Rule: every text, number and list in a message has a bound, and decoding refuses what exceeds it. So a peer can't fill the
+Rule: every text, number and list in a message has a bound, and decoding refuses what exceeds it, so a peer can't fill the
 memory or a log, or write control characters to a terminal. A sender shortens its own texts (`one_line`, `text`).
 """
 
@@ -26,7 +26,7 @@ LARGEST = 2**53  # every whole number up to here is exact as a float64 too
 MAX_TICKETS = 1 << 16  # tickets in one message
 MAX_WORKERS = 1_024  # workers that one supervisor speaks for
 MAX_COPIES = 1 << 16  # env copies in one lane
-MAX_SAVED_BYTES = 1 << 22  # bytes of the state of one env copy, as its environment saved it
+MAX_SAVED_BYTES = 1 << 22  # bytes of one env copy's state, as its environment saved it
 MAX_SEEDS = 1_024  # seeds in one order to evaluate
 MAX_FACTS = 32  # facts about one episode
 MOST_FRAMES = 1_500  # frames of one episode that are sent: a minute of video at 25 frames per second
@@ -79,7 +79,7 @@ def escaped_json(text: str) -> str:
 
 
 def indented(text: str) -> str:
-    """A text of several lines, safe to show, each line indented. So none of them looks like a line of a log."""
+    """A text of several lines, safe to show, each line indented so that none of them looks like a log line."""
     return indent(escaped(text).strip("\n"), "    ", lambda line: True)
 
 

@@ -1,6 +1,6 @@
-"""What a worker is doing, and how long a call of user code may take. Imports neither numpy nor gymnasium. Pure.
+"""What a worker is doing, and how long a call to user code may take. Imports neither numpy nor gymnasium. Pure.
 
-Rule: every call of user code has a limit, and a worker that exceeds it is ended (by `WorkerProcess.end_if_hung`). Millrace's
+Rule: every call to user code has a limit, and a worker that exceeds it is ended (by `WorkerProcess.end_if_hung`). Millrace's
 own code has no limit.
 """
 
@@ -16,8 +16,8 @@ Doing = Literal[
 ]  # fmt: skip
 """What a worker is doing, as its supervisor sees it. User code runs in all of these except `starting` and `waiting`.
 
-`making` is making an env copy. `repeating` is repeating a step of an episode that another worker has lost. `preparing` is
-making a policy, including its imports. `acting` is a call of a user-defined policy.
+`making` is making an env copy. `repeating` is replaying a step of an episode that another worker has lost. `preparing` is
+making a policy, including its imports. `acting` is a call to a user-defined policy.
 """
 CLOSE_S = 10.0  # limit for closing one env copy; short, because the environment has already done its work
 OUR_CODE: frozenset[Doing] = frozenset({"starting", "waiting"})
@@ -33,11 +33,11 @@ CALLS: dict[Doing, str] = {
     "evaluating": "a step of an evaluation",
     "closing": "close() of its environment",
 }
-"""The phrase that names each call of user code in the line that says why a worker was ended."""
+"""The phrase for each kind of call to user code, used in the line that says why a worker was ended."""
 
 
 class CallTimeouts(msgspec.Struct, frozen=True):
-    """How many seconds one call of user code may take before the supervisor ends its worker. 0 means no limit.
+    """How many seconds one call to user code may take before the supervisor ends the worker. 0 means no limit.
 
     The fields have the names of the flags.
     """
@@ -45,7 +45,7 @@ class CallTimeouts(msgspec.Struct, frozen=True):
     start_s: float = 600.0
     """making or resetting an env copy, or making the policy"""
     step_s: float = 600.0
-    """a step of an env copy, or a call of a policy that the user wrote"""
+    """a step of an env copy, or a call to a user-defined policy"""
 
     def limit_s(self, doing: Doing) -> float:
         """The limit of this activity; infinite if it has none."""
@@ -65,7 +65,7 @@ class CallTimeouts(msgspec.Struct, frozen=True):
         return max(self.limit_s("making"), self.limit_s("stepping"))
 
     def reason(self, doing: Doing) -> str:
-        """Why a worker that exceeds its limit is ended. The line names the flag."""
+        """Why a worker that exceeds its limit is ended, in a line that names the flag."""
         flag = "step" if doing in ("stepping", "repeating", "acting", "evaluating") else "start"
         named = f" (--{flag}-timeout-s)" if doing != "closing" else ""
         return f"was ended: {CALLS[doing]} took longer than {self.limit_s(doing):g} s{named}"

@@ -1,11 +1,11 @@
-"""The environment of a run as plain data, how to make it, and how much code a learner may have a worker run.
+"""A run's environment as plain data, how to make it, and how much code a learner may make a worker run.
 
 Only this file may unpickle, and only in `PickledCallable.load`: a callable that the *learner* sent to a worker which allows
 `AllowedCode.CALLABLES`. Nothing that a worker sends is ever unpickled.
 
-Rule: things that other processes can find by name are sent by name. Things that only this process has (a function, a class
-or a registered id of a script or notebook) are sent as a pickled callable, with the specs of the ids that this callable may
-request from gymnasium.
+Rule: things that other processes can find by name are sent by name. Things that only this process has (a function, class or
+registered id defined in a script or notebook) are sent as a pickled callable, with the specs of the ids that this callable
+may request from gymnasium.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class AllowedCode(Enum):
     """
 
     def refuses_to_call(self, what: str) -> str:
-        """Why a worker that allows only this code does not call `what`, by name or pickled; empty if it does.
+        """Why a worker that allows only this code does not call `what`, whether named or pickled; empty if it does.
 
         A name can be any function of any module, with any arguments, so it can do as much as a pickled callable.
         """
@@ -131,8 +131,8 @@ class PickledCallable:
 def check_arguments(arguments: Mapping[str, Any], of: str, makes: str = "gymnasium.make(ID, {name}={name})") -> None:
     """Raise `UsageError` for a keyword argument that no message can carry.
 
-    `of`: what the arguments are for, in the words of the error. `makes`: for a value of another type, the error suggests
-    that the user put this call into a function of their own.
+    `of`: what the arguments are for, as the error says it. `makes`: for a value of another type, the error suggests that the
+    user put this call into a function of their own.
     """
     for name, value in arguments.items():
         try:
@@ -148,14 +148,14 @@ def check_arguments(arguments: Mapping[str, Any], of: str, makes: str = "gymnasi
 
 
 class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The environment: a gymnasium id, the name of a function that returns one, or a factory that the learner pickled."""
+    """The environment: a gymnasium id, the name of a function that makes it, or a factory that the learner pickled."""
 
     id: str
     """any id that `gymnasium.make` accepts: `CartPole-v1`, `ALE/Pong-v5`, `my_package.envs:MyEnv-v0`; or a function or
     class, `my_package.envs:MyEnv`, that returns an environment
     """
     kwargs: dict[str, Scalar] = {}
-    """keyword arguments of `gymnasium.make`. A text may contain expressions in braces, such as `{5000 + slot}`, which are
+    """keyword arguments for `gymnasium.make`. A string may contain expressions in braces, such as `{5000 + slot}`, which are
     computed for each copy: integers, `+ - * // %`, and at least one of `number`, `lane`, `copy` and `slot`
     (`millrace.EnvCopy`). A worker that cannot compute them declines the run
     """
@@ -163,10 +163,10 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """a cloudpickled callable that returns one environment; `id` is then only its name"""
     wrappers: tuple[str, ...] = ()
     """wrappers of every copy, the innermost first: `module:Class`, or `module:Class(key=value)` with plain values. A factory
-    applies them itself, and these are only their names.
+    applies the wrappers itself; this field then only lists their names.
     """
     eval_kwargs: dict[str, Scalar] = {}
-    """keyword arguments of copies that play evaluations, in addition to `kwargs`; they override those of the same name"""
+    """keyword arguments for evaluation copies, in addition to `kwargs`; they override those of the same name"""
 
     @staticmethod
     def of(
@@ -195,7 +195,7 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return EnvSpec(name, kwargs or {}, pickled, names, eval_kwargs or {})
 
     def for_evaluation(self) -> EnvSpec:
-        """The spec for env copies that play evaluations: `eval_kwargs` are merged into `kwargs`."""
+        """The spec for evaluation copies: `eval_kwargs` are merged into `kwargs`."""
         if not self.eval_kwargs:
             return self
         return msgspec.structs.replace(self, kwargs=self.kwargs | self.eval_kwargs, eval_kwargs={})
@@ -276,7 +276,7 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             raise
         except (gymnasium.error.Error, ImportError, TypeError) as error:  # TypeError: wrong keyword arguments
             raise UsageError(why_not_made(self.id, error, failed, _why_not)) from error
-        except Exception as error:  # the constructor of an environment can raise anything
+        except Exception as error:  # an environment's constructor can raise anything
             line = f"environment {self.id} cannot be made: {type(error).__name__}: {first_line(error)}"
             raise UsageError(line, traceback.format_exc()) from error
 
@@ -337,7 +337,7 @@ class _Factory:
 
 
 class _UnpickledLater:
-    """A class or function that is unpickled only when it is called. Without a call, a process doesn't need its modules."""
+    """A class or function that is unpickled only when called, so a process that never calls it doesn't need its modules."""
 
     def __init__(self, point: Callable[..., object]) -> None:
         """Pickle `point`. Raises `UsageError` if it can't be sent."""
@@ -375,8 +375,8 @@ class _SpecFactory:
 def _sent(spec: GymnasiumSpec) -> GymnasiumSpec:
     """The spec in a form that another process can use.
 
-    A class of this script is contained in the spec itself, because its name means nothing elsewhere. A class that gymnasium
-    can import is given by its name, so that only a process that makes this environment needs the module.
+    A class defined in this script is part of the spec itself, because its name means nothing elsewhere. A class that
+    gymnasium can import is given by its name, so that only a process that makes this environment needs the module.
     """
     point = spec.entry_point
     name = point if isinstance(point, str) else name_of(point)
@@ -394,7 +394,7 @@ def remembered_name(env: EnvLike | EnvSpec) -> str:
 def _given(env: EnvLike) -> tuple[str, Callable[..., object] | None]:
     """The name of the user's argument, and a callable that makes the environment if workers can't find it by that name.
 
-    Raises `UsageError` if it is only a name, and this process can't find it either.
+    Raises `UsageError` if the argument is only a name and this process can't find it either.
     """
     name, factory = _named(env)
     if factory is None and not found_by_others(name):

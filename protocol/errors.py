@@ -1,4 +1,4 @@
-"""All errors of millrace, in two families.
+"""All millrace errors, in two families.
 
     MillraceError
     ├── UserFacingError         raised: this side cannot continue; the command line prints the line, exits with `exit_code`
@@ -17,8 +17,8 @@
         ├── BadMessage            not a valid message: shape, size, type or version
         └── BadRollout            a rollout that breaks the row format
 
-The message of an error is one line: who, what, expected, got, what to do next. `WorkerTraceback` is in neither family,
-because it is only the `__cause__` of other errors.
+An error's message is one line: who, what, expected, got, what to do next. `WorkerTraceback` is in neither family, because it
+is only the `__cause__` of other errors.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def safe_repr(value: object) -> str:
 def words_an_error(words: Callable[WordedFrom, str]) -> Callable[WordedFrom, str]:
     """Decorates a function that composes an error message or advice, so that it returns an empty string instead of raising.
 
-    Such a function inspects arbitrary objects of the user or of other packages, and must not hide the original error by
+    Such a function inspects arbitrary objects from the user or from other packages, and must not hide the original error by
     failing itself.
     """
 
@@ -84,7 +84,7 @@ def did_you_mean(name: str, known: Iterable[str], prefix: str = "") -> str:
 
 
 class MillraceError(Exception):
-    """Base of all errors of millrace. `str(error)` is one line: who, what, what was expected, what it got, what to do next.
+    """Base of all millrace errors. `str(error)` is one line: who, what, expected, got, what to do next.
 
     >>> import millrace
     >>> try:
@@ -136,7 +136,7 @@ class UsageError(UserFacingError):
 
 
 def usage_error(error: OSError) -> UsageError | None:
-    """The `UsageError` for an operating system error that is caused by the user's request; None for any other error."""
+    """The `UsageError` for an operating system error that the user's request caused; None for any other error."""
     match error.errno:
         case errno.ENAMETOOLONG:
             return UsageError(f"path {one_line(str(error.filename), 500)}: {error.strerror}; choose a shorter one")
@@ -155,7 +155,7 @@ class Refused(UserFacingError):
 
 
 class RunTakenOver(UserFacingError):
-    """Another process trains this run now, because this one seemed dead. Nothing more may be written."""
+    """Another process is now training this run, because this one seemed dead. Nothing more may be written."""
 
 
 class RunError(UserFacingError):
@@ -173,7 +173,7 @@ class RunError(UserFacingError):
 
 @contextmanager
 def refusals_of(package: str) -> Iterator[None]:
-    """A context that turns errors of another package into a `RunError`: one line with the package and its message.
+    """A context that turns errors raised by another package into a `RunError`: one line with the package and its message.
 
     Use it for packages that do a separate job for the user, such as logging elsewhere, writing a video or starting machines.
     Don't use it for torch or numpy, whose errors mostly mean a mistake in millrace.
@@ -197,7 +197,7 @@ def _whole_message(error: Exception) -> str:
 class CheckpointError(RunError):
     """A checkpoint, or a file that `RolloutService.save` wrote, is missing, broken, of another format or of another policy.
 
-    A resumed run uses its newest undamaged checkpoint; this is raised if there is none.
+    A resumed run uses its newest undamaged checkpoint; this error is raised if there is none.
 
     >>> import millrace, pathlib
     >>> _ = pathlib.Path("state.npz").write_bytes(b"not a saved state")
@@ -210,11 +210,12 @@ class CheckpointError(RunError):
 
 
 class NoWorkers(RunError):
-    """No worker is left, or none ever joined, for as long as `no_workers_timeout_s`. The line says how to start one.
+    """There has been no worker for `no_workers_timeout_s` seconds. The line says how to start one.
 
-    If this program started the workers and no others can join, the error is raised as soon as none of them is left, and
-    gives the reason why the last one ended. A training run that had begun has written a checkpoint. A vector environment
-    waits a minute for workers that it starts itself, and `timeout` for those that join from elsewhere.
+    Either no worker is left, or none ever joined. If this program started the workers and no others can join, the error is
+    raised as soon as none of them is left, and says why the last one ended. A training run that had begun has written a
+    checkpoint. A vector environment waits a minute for workers that it starts itself, and `timeout` for those that join from
+    elsewhere.
 
     >>> import millrace
     >>> try:
@@ -260,10 +261,10 @@ class WorkerLost(RunError):
 
 
 class Stalled(RunError):
-    """Workers have joined, but sent nothing for ten minutes, or for as long as one call of the environment may take.
+    """Workers have joined, but have sent nothing for ten minutes, or for as long as one call to the environment may take.
 
-    The line says what the learner was waiting for. The usual cause is an environment that hangs: set `step_timeout_s`, so
-    that the worker of such an environment is ended.
+    The line says what the learner was waiting for. The usual cause is an environment that hangs. If `step_timeout_s` is set,
+    the worker of such an environment is ended.
 
     >>> import millrace
     >>> try:
@@ -367,7 +368,7 @@ class BadRollout(PeerError):
 
 
 def unexpected_arguments(words: Sequence[str], *, one_run: bool) -> str:
-    """The error message for a command that got these extra words. `one_run`: the command takes one run and has it."""
+    """The error message for a command that got these extra words. `one_run`: the command takes one run, which it has."""
     if one_run:
         return f"expected one run, got {1 + len(words)}; name one of them"
     return f"unexpected argument {words[0]}"

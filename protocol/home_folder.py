@@ -1,4 +1,4 @@
-"""Paths that may begin with `~`, the home folder of this user, or `~NAME`, the home folder of another.
+"""Paths that may begin with `~`, this user's home folder, or `~NAME`, another user's.
 
 Rule: if the home folder is unknown, because the user doesn't exist or the container has none, the error is one line.
 """

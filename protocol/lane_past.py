@@ -1,15 +1,15 @@
-"""The part of a lane's past that is needed to continue the lane on new env copies. Plain data.
+"""The part of a lane's history that is needed to continue the lane on new env copies. Plain data.
 
 Law: an episode is determined by how it began and by its actions. A copy is seeded once, when it starts. Each later episode
-begins with a reset without a seed, from the environment's random state at that time. So if the environment is deterministic,
-you get the old copy again as follows: seed a new copy like the old one, give it the random state that the old copy had
-before its last reset, reset it, and repeat the actions. A worker reports with each rollout which episodes began in it
+begins with a reset without a seed, from the environment's random state at that time. If the environment is deterministic,
+the old copy can therefore be recreated: seed a new copy like the old one, give it the random state that the old copy had
+before its last reset, reset it, and replay the actions. A worker reports with each rollout which episodes began in it
 (`EpisodeBegin`). The learner accumulates the rollouts, and sends the result (`LanePast`) to the worker that continues the
-lane. The episodes of an environment that can save its state are not repeated: the state after the last row is in
+lane. If an environment can save its state, its episodes are not replayed, because the state after the last row is in
 `LanePast.memory`.
 
-Each copy counts its starts. The number of a start determines the seed; it rises when a copy is replaced by a new one because
-it failed or could not be continued.
+Each copy counts its starts. A start's number determines its seed; the number rises when a copy is replaced by a new one
+because it failed or could not be continued.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class EpisodeBegin(msgspec.Struct, frozen=True, array_like=True):
     start: Natural
     """number of the copy's start"""
     random: RandomState | None
-    """None if the episode cannot be repeated"""
+    """None if the episode cannot be replayed"""
 
 
 class LastEpisode(msgspec.Struct, frozen=True, array_like=True):
@@ -49,13 +49,13 @@ class LastEpisode(msgspec.Struct, frozen=True, array_like=True):
     start: Natural
     """number of the copy's start"""
     random: RandomState | None
-    """None if the episode cannot be repeated; then, unless `saved`, a new copy is started, with the next start number"""
+    """None if the episode cannot be replayed; then, unless `saved`, a new copy is started, with the next start number"""
     first: Natural
     """index of the episode's first row in `LanePast.action`"""
     over: bool
     """whether the previous episode is over, so that the next step begins this one"""
     saved: bool = False
-    """whether `LanePast.memory` has the state of the copy after the last row, so that nothing needs to be repeated"""
+    """whether `LanePast.memory` has the state of the copy after the last row, so nothing needs to be replayed"""
 
     @property
     def goes_on(self) -> bool:
@@ -64,12 +64,12 @@ class LastEpisode(msgspec.Struct, frozen=True, array_like=True):
 
     @property
     def is_repeated(self) -> bool:
-        """Whether the copy is continued by repeating the actions of a running episode."""
+        """Whether the copy is continued by replaying the actions of its running episode."""
         return self.random is not None and not (self.saved or self.over)
 
 
 class AttributeChanges(msgspec.Struct, frozen=True, array_like=True):
-    """Attributes that were set on the env copies (`Weights.env_attributes`), each time before a row.
+    """Attributes that were set on the env copies (`Weights.env_attributes`), and the rows before which they were set.
 
     There may be any number of changes. They share three arrays, because a message has at most 256 frames.
     """
@@ -95,7 +95,7 @@ class AttributeChanges(msgspec.Struct, frozen=True, array_like=True):
 
 
 class LanePast(msgspec.Struct, frozen=True, array_like=True):
-    """The past of a lane of N env copies with A columns each, up to the round of its next rollout."""
+    """The history of a lane of N env copies with A columns each, up to the round of its next rollout."""
 
     lane: Natural
     copies: Annotated[tuple[LastEpisode, ...], Meta(max_length=MAX_COPIES)]
@@ -111,14 +111,14 @@ class LanePast(msgspec.Struct, frozen=True, array_like=True):
 
     @classmethod
     def unknown(cls, lane: int, copies: int) -> LanePast:
-        """The past of a lane whose copies were started once and can't be continued, so that all of them are replaced."""
+        """The history of a lane whose copies were started once and can't be continued, so all of them are replaced."""
         nothing = np.zeros(0, np.float32)
         unknown = (LastEpisode(0, None, 0, False),) * copies
         return cls(lane, unknown, nothing, AttributeChanges.of({}), obs=(), memory=())
 
     @property
     def repeated_steps(self) -> int:
-        """Number of env steps that must be repeated to continue the lane, summed over its copies."""
+        """Number of env steps that must be replayed to continue the lane, summed over its copies."""
         return sum(len(self.action) - last.first for last in self.copies if last.is_repeated)
 
     @property

@@ -55,12 +55,13 @@ class Hello(Message, frozen=True, array_like=False):  # a map in every version, 
     learner (rule REAPPEARS)"""
     software: Line
     attempt: Natural
-    """`process_nonce` + 1 when the process first joins, and one more each time that it starts to join again. A repeated
-    Hello keeps the number. So it also shows which process a Welcome answers (rules HELLO, HELLO_AGAIN)"""
+    """`process_nonce` + 1 when the process first joins; it rises by one each time the process starts to join again. A
+    repeated Hello keeps the number, which therefore also shows which process a Welcome answers (rules HELLO, HELLO_AGAIN)
+    """
     evaluates: bool = False
     """true: the worker only plays evaluations, and gets no lane (rule EVALUATES)"""
     continues: bool = False
-    """true: the worker can continue a lane that another worker had, from the lane's past (rule PAST)"""
+    """true: the worker can continue a lane that another worker had, from the lane's history (rule PAST)"""
 
     @property
     def is_first_attempt(self) -> bool:
@@ -93,7 +94,7 @@ class Rejoin(Message, frozen=True):
 
 
 class Weights(Message, frozen=True):
-    """Weights that an order names. The message contains no session, so that it is encoded once for all workers."""
+    """Weights that an order names. The message contains no session, so it is encoded only once for all workers."""
 
     version: Natural
     parameters: Array
@@ -103,9 +104,9 @@ class Weights(Message, frozen=True):
     has action values, or the scale of the noise, if its actions are deterministic; last, for actions in [-1, 1], 1 while
     they are drawn uniformly, else 0"""
     env_attributes: Array | None = None
-    """[bytes] uint8, `plain_values`: values of attributes by name, which are set on the copies of a lane before its next
-    rollout under these weights, and on new copies before their first reset. The copies keep them until other weights name
-    the same attributes. They are not set on copies that play evaluations (rule ATTRIBUTES)
+    """[bytes] uint8, `plain_values`: attribute values by name. They are set on a lane's copies before its next rollout under
+    these weights, and on new copies before their first reset. The copies keep the values until other weights name the same
+    attributes. The values are not set on evaluation copies (rule ATTRIBUTES)
     """
 
 
@@ -128,8 +129,9 @@ class Permit(msgspec.Struct, frozen=True, array_like=True):
     """who plays the other teams in the episodes that begin in this rollout: the version of some weights, or −1 − k for
     `RunSpec.scripted[k]` (rule OPPONENT)"""
     past: LanePast | None = None
-    """with sequence 0: the past from which to continue the lane; null: new episodes begin, as they do when a lane first
-    starts (rule PAST)"""
+    """with sequence 0: the history from which to continue the lane; null: new episodes begin, as they do when a lane first
+    starts (rule PAST)
+    """
 
     def of_new_episodes(self, copies: int) -> Permit:
         """The same ticket for a lane of `copies` copies that can't be continued: each begins a new episode, which differs
@@ -158,8 +160,9 @@ class Collect(Message, frozen=True):
     received: tuple[Received, ...]
     """one entry for each lane of this worker; a lane that is not listed belongs to another worker"""
     keep: Versions
-    """the weights that the learner counts as held from now on, ascending: drop all others, except those that unfinished
-    tickets name"""
+    """the versions that the learner counts as held from now on, ascending; the worker drops all others, except those that
+    unfinished tickets name
+    """
 
     @property
     def versions(self) -> set[int]:
@@ -192,14 +195,15 @@ class Heartbeat(Message, frozen=True):
     """number of the last HeartbeatReply received; what the learner sent before that has arrived or is lost
     (rule HEARTBEAT_REPLIES)"""
     versions: Versions
-    """of the weights held, ascending (rule HEARTBEAT_VERSIONS)"""
+    """the versions of the weights held, ascending (rule HEARTBEAT_VERSIONS)"""
     tickets: Tickets
-    """tickets that the worker holds and has not finished: those that wait, and those of the work in progress
-    (rule HEARTBEAT_TICKETS)"""
+    """tickets that the worker holds and has not finished: those that are waiting, and those of the work in progress (rule
+    HEARTBEAT_TICKETS)
+    """
     steps: Natural
-    """env steps since the worker started, in all sessions. They include those of rollouts and evaluations, preferably
-    counted as they are made, and, with `StepSpec`, one for each copy that a Step steps; a copy that a Step only resets may
-    count too (rule HEARTBEAT_STEPS)
+    """env steps since the worker started, in all sessions, including those of evaluations, and preferably counted as they
+    are made. With `StepSpec`, each copy that a Step steps counts as one; a copy that a Step only resets may count too (rule
+    HEARTBEAT_STEPS)
     """
     stages: Stages
     """seconds spent in each stage since the worker started"""
@@ -271,7 +275,8 @@ class Described(Message, frozen=True):
 
 
 class Evaluate(Message, frozen=True):
-    """Play one episode for each seed, on env copies of no lane, under weights of this version. Answered by `Evaluated`.
+    """Play one episode for each seed, on env copies outside all lanes, under weights of this version. Answered by
+    `Evaluated`.
 
     (rule EVALUATE)
     """
@@ -280,7 +285,7 @@ class Evaluate(Message, frozen=True):
     ticket: Natural
     version: Natural
     seeds: Annotated[tuple[Natural, ...], Meta(min_length=1, max_length=MAX_SEEDS)]
-    """reset seed of each episode; all episodes are stepped as one batch, in which those that have ended stay, unused"""
+    """reset seed of each episode; all episodes are stepped as one batch, and those that have ended stay in it, unused"""
     greedy: bool
     """true: take the most probable actions; false: draw them, with random numbers that are derived from the first seed and
     differ from those that an environment with this seed draws (rule GREEDY)"""
@@ -348,7 +353,7 @@ class Reset(Message, frozen=True):
     copies: tuple[Natural, ...]
     """which of the lane's copies, from 0"""
     seeds: tuple[int | None, ...]
-    """one seed for each of `copies`; null: reset without a seed, so that the copy's random generator goes on"""
+    """one seed for each of `copies`; null: reset without a seed, so that the copy's random generator continues"""
     options: Array
     """[bytes] uint8, `plain_values`: the options for `Env.reset`, or None; a list has one entry per copy (rule OPTIONS)"""
 

@@ -55,8 +55,8 @@ def import_own(module: str, what: str) -> ModuleType:
 def refuse_modules_in(folder: Path, names: Iterable[str]) -> None:
     """Raise `UsageError` if one of these names, `module:name` or `package.module_v1`, would be imported from the run folder.
 
-    A run folder may come from a stranger, and its files name modules that are imported. So a module is never imported from
-    the folder itself.
+    A run folder may come from a stranger, and its files name modules that are imported. Therefore, no module is ever
+    imported from the folder itself.
     """
     inside = folder.resolve()
     entries = [

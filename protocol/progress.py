@@ -19,7 +19,7 @@ class RunProgress(msgspec.Struct, frozen=True, kw_only=True):
     env_steps: Natural = 0
     """env steps that updates have used so far, including those before a resume"""
     collected: Natural = 0
-    """env steps of the rollouts that the learner waits for, as workers report them; 0 while it waits for none"""
+    """env steps of the rollouts that the learner is waiting for, as workers report them; 0 while it waits for none"""
     total_steps: Natural = 0
     """env steps to train for; 0 if there is no end, as for your own learner, or a vector environment"""
     updates: Natural = 0

@@ -1,7 +1,7 @@
 """All random streams: each is derived from a seed and its purpose. Pure; imports no torch.
 
 Law: no two streams of a seed share both purpose and indices, and none is the stream of the seed itself, because purpose and
-indices form the spawn key of numpy's `SeedSequence`. gymnasium's environments draw from the seed itself (`np_random`). So
+indices form the spawn key of numpy's `SeedSequence`. gymnasium's environments draw from the seed itself (`np_random`), so
 the random numbers that choose actions, or rows to learn from, are independent of the environment's, even if both have the
 same seed.
 """

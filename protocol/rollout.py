@@ -90,8 +90,9 @@ class Rollout(msgspec.Struct, frozen=True, tag=True, array_like=True, forbid_unk
     """for each copy that has begun an episode since the previous rollout, how its newest one began; empty from a worker that
     cannot report this (rule PAST)"""
     memory: tuple[Array, ...] = ()
-    """whatever else the worker needs in order to continue the lane after these rows: the learner returns it unchanged, in
-    `LanePast`. Empty from a worker that cannot continue a lane (rule PAST)"""
+    """whatever else the worker needs in order to continue the lane after these rows. The learner returns it unchanged, in
+    `LanePast`. Empty from a worker that cannot continue a lane (rule PAST)
+    """
     saved: Annotated[tuple[Natural, ...], Meta(max_length=MAX_COPIES)] = ()
     """the copies whose environment has saved its state; the states are in `memory` (rule PAST)"""
 

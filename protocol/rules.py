@@ -4,7 +4,7 @@ The text of a rule is written once, in README.md, after a marker with the rule's
 
     <!-- rule ORDER_ONCE -->An order that comes again is not executed again: the same answer is sent again.
 
-Rule: all code that keeps, checks or breaks a rule names it. State tables and other code name it in a comment (`rule
+Rule: all code that follows, checks or breaks a rule names it. State tables and other code name it in a comment (`rule
 ORDER_ONCE`). The model's invariants and mutations, the checks of clients, and the mutants of a client name it as
 `Rule.ORDER_ONCE`. `tests/protocol/test_rules.py` lists all of them, and checks that none is missing.
 
@@ -241,6 +241,6 @@ def in_document() -> dict[str, Words]:
 
 
 def _plain(text: str) -> str:
-    """A part of the document in one line, without bold markers, links, and the punctuation at its end."""
+    """A part of the document in one line, without bold markers, links or punctuation at its end."""
     unlinked = re.sub(r"\[([^]]+)\]\(#[^)]*\)", r"\1", text.replace("**", ""))
     return " ".join(unlinked.split()).rstrip(".;,:")

@@ -22,7 +22,7 @@ MAX_DEPTH = 8
 MAX_WRAPPERS = 1 << 8  # classes of an environment's wrappers
 MAX_SPACES = 1 << 12  # spaces of an environment, including nested ones, whose random generators are sent
 MAX_SEATS = 1 << 10  # agents of an environment
-MAX_ELEMENTS = 1 << 24  # elements of all leaves of a space together
+MAX_ELEMENTS = 1 << 24  # total elements across all leaves of a space
 
 Shape = Annotated[tuple[Natural, ...], Meta(max_length=8)]
 Dtype = Literal[
@@ -107,7 +107,7 @@ class EnvDescription(msgspec.Struct, frozen=True, array_like=True):
     render_mode: Name
     generators: Annotated[tuple[GeneratorState, ...], Meta(max_length=MAX_SPACES)] = ()
     """the random generator of each space, if any is seeded: that of the observation space, those of the spaces inside it,
-    depth first, then likewise for the action space. So the learner draws the same samples as the environment would
+    depth first, then likewise for the action space. With them, the learner draws the same samples as the environment would
     """
     wrappers: Annotated[tuple[Line, ...], Meta(max_length=MAX_WRAPPERS)] = ()
     """the classes of the copy's gymnasium wrappers, as `module:Class`, and the wrapper classes from which these derive"""

@@ -180,9 +180,10 @@ class PolicySpec(msgspec.Struct, frozen=True):
     to ±10 (not images)"""
     head: Literal["actor_critic", "q", "squashed", "deterministic"] = "actor_critic"
     """the outputs. `actor_critic`: a distribution over actions, and a state value. `q`: the value of every discrete action,
-    for epsilon-greedy acting. `squashed` and `deterministic`: an actor with two critics, for a bounded Box, whose action is
-    a squashed Gaussian (tanh), or deterministic (tanh) plus noise; these actions are stored in [-1, 1] and scaled to low …
-    high for the environment"""
+    for epsilon-greedy acting. `squashed` and `deterministic`: an actor with two critics, for a bounded Box. Its action is a
+    squashed Gaussian (tanh), or deterministic (tanh) plus noise. These actions are stored in [-1, 1] and scaled to low …
+    high for the environment
+    """
     shared_net: bool = False
     """whether actor and critic share their hidden layers"""
     dueling: bool = False
@@ -250,10 +251,10 @@ class WaitSpec(msgspec.Struct, frozen=True, tag=True):
     """
 
     call_timeouts: CallTimeouts = CallTimeouts()
-    """how long a call of user code may take before the worker's supervisor ends it; ignored by a worker without one"""
+    """how long a call to user code may take before the worker is ended by its supervisor, if it has one"""
     heartbeat_s: float = HEARTBEAT_S
     learner_timeout_s: float = 600.0
-    """seconds after a Heartbeat at which a worker says Hello again if the learner has sent nothing since. Before the run
+    """how many seconds after a Heartbeat a worker says Hello again if the learner has sent nothing since. Before the run
     begins, the learner may read a checkpoint or a dataset for a long time, without reading messages
     """
 
@@ -295,13 +296,14 @@ class RunSpec(msgspec.Struct, frozen=True, tag=True):
     opponent: PolicySpec | None = None
     """the policy of the opponents, if it differs from `policy`"""
     call_timeouts: CallTimeouts = CallTimeouts()
-    """how long a call of user code may take before the worker's supervisor ends it; ignored by a worker without one"""
+    """how long a call to user code may take before the worker is ended by its supervisor, if it has one"""
     heartbeat_s: float = HEARTBEAT_S
     restart_episodes: int = 0
-    """after this many episodes, a worker that can do so closes an env copy and creates it again, so that the new copy
-    continues exactly as the old one would have; 0: never"""
+    """after this many episodes, a worker that can do so closes an env copy and creates a new one, which continues exactly as
+    the old one would have; 0: never
+    """
     learner_timeout_s: float = 30.0
-    """seconds after a Heartbeat at which a worker says Hello again if the learner has sent nothing since"""
+    """how many seconds after a Heartbeat a worker says Hello again if the learner has sent nothing since"""
 
     @property
     def columns(self) -> int:
@@ -410,17 +412,17 @@ class StepSpec(msgspec.Struct, frozen=True, tag=True):
     render_mode: str | None = None
     """the render mode with which each copy is made"""
     evaluation_copies: int = 0
-    """how many of the copies play evaluations; they are the last ones, and have numbers of their own, from 0"""
+    """how many of the copies are evaluation copies; they are the last ones, and are numbered separately, from 0"""
     seats: tuple[str, ...] = ()
     """names of the A agents of each copy; empty if the environments are gymnasium's. With seats, arrays have N · A rows
     instead of N, where the rows of a copy are adjacent, and three more arrays follow those of the observation: `acts` and
     `complete` (bool), and `outside` (float64)
     """
     call_timeouts: CallTimeouts = CallTimeouts()
-    """how long a call of user code may take before the worker's supervisor ends it; ignored by a worker without one"""
+    """how long a call to user code may take before the worker is ended by its supervisor, if it has one"""
     heartbeat_s: float = HEARTBEAT_S
     learner_timeout_s: float = 600.0
-    """seconds after a Heartbeat at which a worker says Hello again if the learner has sent nothing since. Between two steps,
+    """how many seconds after a Heartbeat a worker says Hello again if the learner has sent nothing since. Between two steps,
     the caller may compute for a long time, without reading messages; infinite for workers that end with the learner's
     process
     """

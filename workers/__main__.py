@@ -2,8 +2,8 @@
 
 The supervisor imports neither numpy nor gymnasium. The same program with `--parent` is a worker (`workers/program.py`).
 
-Exit codes: 0 if it was drained or asked to leave; 1 if it failed, or no learner answered; 2 if it was refused, or its
-flags were wrong. With --stay, it ends only if it is asked to leave, or refused.
+Exit codes: 0 if the workers were drained or asked to leave; 1 if one failed, or no learner answered; 2 if one was refused,
+or the flags were wrong. With --stay, the program ends only if it is asked to leave, or refused.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """How the actions of a rollout are chosen: by a built-in policy, for all lanes in one pass, or by a user-defined one.
 
-Rule: the actions of a lane depend on its observations, state and random generator, and not on other lanes. Calls of user
-code are recorded on the worker's page (`workers/activity.py`), so that the supervisor can enforce their timeouts. Calls of
+Rule: the actions of a lane depend on its observations, state and random generator, and not on other lanes. Calls to user
+code are recorded on the worker's page (`workers/activity.py`), so that the supervisor can enforce their timeouts. Calls to
 built-in policies aren't, because recording takes time. In a masked run, the last array of an observation is the mask of the
 allowed actions (`millrace.protocol.policy.masks`).
 """
@@ -24,8 +24,8 @@ from millrace.protocol.specs import RunSpec
 from millrace.workers.activity import ACTING, activity
 
 Stream = Callable[[], np.random.Generator]
-"""Returns a random generator, the same one in each call. Call it only if you need the generator: seeding it takes as long as
-a step, and greedy actions need none.
+"""Returns a random generator, the same one on each call. Call it only if you need the generator, because seeding takes as
+long as a step, and greedy actions need no generator.
 """
 
 
@@ -87,7 +87,7 @@ def acting_of(run: RunSpec, policy: Policy | CalledPolicy) -> Acting:
 
 
 class _EncodingPolicy:
-    """A built-in policy with a user-defined encoder. Calls of the encoder are recorded on the worker's page, and its errors
+    """A built-in policy with a user-defined encoder. Calls to the encoder are recorded on the worker's page, and its errors
     are raised as `PolicyFailed`.
     """
 

@@ -1,10 +1,10 @@
 """A worker's current activity, in a page of memory that the worker shares with its supervisor.
 
 Rule: only the worker writes to the page, and the supervisor only reads it. The worker writes what it is doing, since when,
-and how many calls of the environment have returned. When a learner welcomes it, it also writes how long a call may take, and
-before it leaves on purpose, it writes its exit code. So the supervisor sees what a worker is doing even while a C extension
-holds the worker's interpreter lock. The memory is an unlinked file that a child process inherits. When the supervisor sends
-a signal, the worker writes the stacks of its threads after the page, into the same file.
+and how many calls to the environment have returned. When a learner welcomes it, it also writes how long a call may take, and
+before it leaves on purpose, it writes its exit code. The supervisor can therefore see what a worker is doing even while a C
+extension holds the worker's interpreter lock. The memory is an unlinked file that a child process inherits. When the
+supervisor sends a signal, the worker writes the stacks of its threads after the page, into the same file.
 
 A worker in a thread has its own page, which isn't shared.
 """
@@ -69,13 +69,13 @@ class Activity:
         self.numbers[DOING] = doing
 
     def end(self, calls: int = 1) -> None:
-        """Record that this many calls of the environment have returned, and that the worker runs its own code again."""
+        """Record that this many calls to the environment have returned, and that the worker runs its own code again."""
         self.numbers[ENV_CALLS] += calls
         self.begin(WAITING)
 
     @contextmanager
     def during(self, doing: int) -> Iterator[None]:
-        """A context in which the worker makes one call of the environment or of a policy. Contexts may be nested."""
+        """A context in which the worker makes one call to the environment or to a policy. Contexts may be nested."""
         before = self.numbers[DOING]
         self.begin(doing)
         try:
@@ -86,7 +86,7 @@ class Activity:
                 self.begin(before)
 
     def limit(self, timeouts: CallTimeouts) -> None:
-        """Set how long a call of user code may take from now on. There is no limit until this method is first called."""
+        """Set how long a call to user code may take from now on. There is no limit until this method is first called."""
         self.seconds[START_TIMEOUT_S] = timeouts.start_s
         self.seconds[STEP_TIMEOUT_S] = timeouts.step_s
 

@@ -1,6 +1,7 @@
-"""A worker's collector and evaluator. They share a policy that acts in the env copies of a run.
+"""A worker's collector and evaluator. They share a policy that acts in a run's env copies.
 
-Rule: the policy has the weights of the current task. Weights are loaded only if a task needs others than the task before it.
+Rule: the policy has the weights of the current task. Weights are loaded only if a task needs other weights than the task
+before it did.
 """
 
 from __future__ import annotations

@@ -1,12 +1,12 @@
 """The env copies that this process makes: which one is being made now, and their slots.
 
-Rule: a copy holds its slot from before it is made until after it was closed, so no two live copies have the same slot. If
-the constructor of a copy raises, it may have started a process; so the slot then becomes free only when this process and its
+Rule: a copy holds its slot from before it is made until after it was closed, so no two live copies have the same slot. If a
+copy's constructor raises, it may already have started a process, so the slot becomes free only when this process and its
 children have ended.
 
 Rule: a copy that was only described is reused as the next copy that its thread makes, if the new copy would be the same.
 Otherwise, it is closed before the new one is made. A worker also closes it if the worker has made no copy in the first
-`UNUSED_S` seconds of a run, because the run may not need this worker. So no worker keeps an unneeded copy for long.
+`UNUSED_S` seconds of a run, because the run may not need this worker. Thus, no worker keeps an unneeded copy for long.
 """
 
 from __future__ import annotations
@@ -143,8 +143,9 @@ def close_copy(copy: Any) -> None:
 def env_copy() -> EnvCopy:
     """The env copy that is being made now. Call this in the constructor of an environment or a wrapper, and keep the result.
 
-    In a program that makes an environment itself, it is copy 0, with a slot that the process holds until it ends. In a
-    worker, raises `UsageError` if the calling thread isn't making a copy, for example because the constructor started it.
+    In a program that makes an environment itself, the environment is copy 0, with a slot that the process holds until it
+    ends. In a worker, raises `UsageError` if the calling thread isn't making a copy, for example because the constructor
+    started it.
 
     >>> import millrace
     >>> millrace.env_copy().number

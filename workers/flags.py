@@ -21,7 +21,7 @@ class WorkerFlags(msgspec.Struct, frozen=True, kw_only=True):
     address: Annotated[str, Flag(positional=True)]
     """address of the learner: ipc://PATH or tcp://HOST:PORT"""
     processes: Annotated[int, Flag("N"), Meta(ge=1)] = 1
-    """start N workers, one process each; failed ones are restarted. All together receive each version of the weights once"""
+    """start N workers, one process each; failed ones are restarted. Each version of the weights is sent once for all"""
     name: str = ""
     """name of this worker, unique in the run; if not given, host name and process id"""
     stay: bool = False

@@ -35,14 +35,14 @@ log = logging.getLogger("millrace.worker")
 FILE_VARIABLE = "MILLRACE_SLOTS"
 LIMIT_VARIABLE = "MILLRACE_COPIES_PER_MACHINE"
 FILE = "/tmp/millrace-slots-{user}"  # not in $TMPDIR, which may differ between the processes of a user
-FLAGS = os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC  # doesn't follow links, nor block on a FIFO
+FLAGS = os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC  # neither follows links nor blocks on a FIFO
 OWN = 0o600  # mode of a user's own file
 SHARED = 0o666  # mode of a file that users share
 MOST = 1 << 16  # number of slots in a file, as many as there are ports
 FLOCK = "hhqqi4x"  # struct flock on Linux: type, whence, start, length, process
 
 TOUCH_EVERY_S = 3600.0
-WAIT_S = 30.0  # how long to wait for a slot, because the copies of another worker may take long to close
+WAIT_S = 30.0  # how long to wait for a slot; another worker's copies may take long to close
 POLL_S = 0.2
 
 

@@ -1,8 +1,8 @@
 """The players of the other teams' seats: earlier weights of the policy, or a user-defined program.
 
 Rule: in each env copy, the policy plays one team, and one opponent plays all others, for whole episodes: the opponent
-changes only when the copy is reset. So a lane keeps its opponents from rollout to rollout, even if tickets no longer name
-their weights. Opponents sample their actions from a random stream of the lane that nothing else uses.
+changes only when the copy is reset. A lane therefore keeps its opponents from rollout to rollout, even if tickets no longer
+name their weights. Opponents sample their actions from a random stream of the lane that nothing else uses.
 """
 
 from __future__ import annotations

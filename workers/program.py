@@ -39,7 +39,7 @@ LEAVE_AT_ONCE = 2  # number of requests to leave after which the rollout in prog
 LOOK_FOR_PARENT_S = 0.5
 LEAVE_ORPHANED_WITHIN_S = 2.0  # time for leaving after the supervisor has died
 CLOSED_WITHIN_S = 1.0  # seconds within which the sockets of a killed process are closed
-AFTER_SUPERVISOR_S = 60.0  # how long after the supervisor should have ended a hung worker the watchdog ends it
+AFTER_SUPERVISOR_S = 60.0  # the watchdog ends a hung worker this long after the supervisor should have
 
 
 def work(flags: WorkerFlags, token: Token | None, signals: list[int]) -> int:
@@ -118,9 +118,9 @@ def _kill_own_session() -> None:
 def _remove_socket_of_killed_parent(address: str) -> None:
     """Remove the learner's socket and the folder that the learner made for it, because a killed learner could not.
 
-    If the parent was the supervisor of a `millrace worker`, the learner is alive, and the next worker needs the socket. So
-    the socket is removed only once nothing listens on it. That may take a moment: Linux reparents the children of a killed
-    process before the last thread of that process has freed its memory and closed its sockets.
+    If the parent was the supervisor of a `millrace worker`, the learner is alive, and the next worker needs the socket. The
+    socket is therefore removed only once nothing listens on it. That may take a moment: Linux reparents the children of a
+    killed process before the last thread of that process has freed its memory and closed its sockets.
     """
     scheme, _, path = address.partition("://")
     if scheme == "ipc" and Path(path).parent.name.startswith("millrace-"):

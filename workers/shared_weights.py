@@ -1,10 +1,10 @@
 """Weights that a supervisor receives once for all its workers, in an in-memory file that they inherit.
 
 Rule: the file has a few places, which the supervisor, its only writer, fills in turn. A table at the beginning of the file
-says which version each place contains, and from which learner (identified by the learner's first session). So no worker uses
-the weights of another run or of an earlier learner, although each learner counts versions from 0. An entry of the table is
-cleared before its place is filled, and written afterwards: if a reader finds the same entry before and after it reads the
-place, it has read consistent weights. If a worker doesn't find weights that it needs, the learner sends them to it directly.
+says which version each place contains, and from which learner (identified by the learner's first session). Thus, no worker
+uses weights from another run or an earlier learner, although each learner counts versions from 0. An entry of the table is
+cleared before its place is filled, and written afterwards, so a reader that finds the same entry before and after reading
+the place has read consistent weights. If a worker doesn't find weights that it needs, the learner sends them to it directly.
 
 This works only on Linux; elsewhere, the learner sends the weights to every worker. This file imports neither numpy nor
 gymnasium.

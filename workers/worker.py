@@ -185,8 +185,8 @@ class Worker:
             return [self._stepper.execute(work, lambda: self._pulse_from_env_code(work))]
 
     def _listen(self, timeout_s: float) -> None:
-        """Wait for a message, at most `timeout_s` seconds. Then handle requests to stop, and all messages that
-        have arrived.
+        """Wait for a message, for at most `timeout_s` seconds. Then handle requests to stop, and all messages that have
+        arrived.
         """
         began_s = self._clock()
         self._options.feed_watchdog(began_s)
@@ -214,7 +214,7 @@ class Worker:
                 self._do(self._session.handle(decode_to_worker(frames), self._clock()))
 
     def _connect_again_if_unheard(self) -> None:
-        """Make a new connection if the learner has not answered for too long while this worker joins.
+        """Make a new connection if the learner has not answered for too long while this worker is joining.
 
         A proxy or a tunnel may keep a connection open after its other end is gone. If there is no connection yet, a new one
         drops the queued Hellos. Only time spent listening counts, because no messages are read while a simulator starts or
@@ -360,8 +360,8 @@ class Worker:
             self._link.send(frames)
 
     def _begin(self, run: WaitSpec | RunSpec | StepSpec) -> None:
-        """Make the actors or the stepper for this run, unless the run has yet to begin. Those of the previous session
-        have been closed before.
+        """Make the actors or the stepper for this run, unless the run has yet to begin. Those of the previous session are
+        already closed.
         """
         activity().begin(WAITING)
         activity().limit(run.call_timeouts)
@@ -421,7 +421,7 @@ class Worker:
 
 
 def _resident_bytes() -> int:
-    """Resident memory of this process; 0 on a system without /proc. A call takes as long as five steps of CartPole."""
+    """Resident memory of this process; 0 on a system without /proc. A call takes as long as five CartPole steps."""
     try:
         return int(STATM.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
     except OSError:

@@ -87,7 +87,7 @@ class WorkerThread:
         self._stop_requests += 1
 
     def wait(self, timeout_s: float) -> None:
-        """Wait until the worker has ended, at most `timeout_s` seconds. A thread that still runs can't be killed."""
+        """Wait for at most `timeout_s` seconds until the worker has ended. A thread still running can't be killed."""
         self._thread.join(timeout_s)
 
     def kill(self) -> None:

@@ -1,7 +1,7 @@
 """Reads what `reset` and `step` of an environment return. Raises `WrongAnswer` for any form other than gymnasium's.
 
-Rule: None as the info means an empty info. If the info is neither None nor a dict, what the environment returned isn't
-gymnasium's tuple, but perhaps an observation with the same number of elements. Then none of it is used.
+Rule: None as the info means an empty info. If the info is neither None nor a dict, the environment didn't return gymnasium's
+tuple, but perhaps an observation with the same number of elements, so none of it is used.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ OF_STEP = f"expected ({STEP})"
 class WrongAnswer(Exception):
     """An environment returned something that its interface does not allow.
 
-    The text is the line for the error message; whoever catches this adds which env copy it was.
+    The text is the line for the error message; the code that catches this adds which env copy it was.
     """
 
 
@@ -45,7 +45,7 @@ def wrong_step(answer: Any) -> WrongAnswer:
 
 
 def in_words(answer: Any) -> str:
-    """The types and the number of the values that were returned, in words."""
+    """The types and number of the returned values, in words."""
     match answer:
         case tuple() | list():
             kinds = ", ".join(_kind(each) for each in answer[:6])

@@ -1,8 +1,8 @@
 """Names of user-defined functions and classes: whether another process can find them, and how a run records them.
 
 Rule: `module:qualname` can be imported in any process. `__main__:name` is an attribute of the program's own script or
-notebook, and only that program can find it. `<name>` can't be found anywhere: it stands for a lambda, a function that was
-defined in a function, or an object.
+notebook, and only that program can find it. `<name>` can't be found anywhere: it stands for a lambda, a function defined
+inside another function, or an object.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ def name_of(made: object) -> str:
         return f"<{qualname.rpartition('.')[2].strip('<>')}>"
     if module == MAIN:
         spec = getattr(sys.modules[MAIN], "__spec__", None)
-        # In a program started by `python -m mine`, others import the module as `mine`. They can't import a script.
+        # In a program started by `python -m mine`, other processes import the module as `mine`. They can't import a script.
         return f"{MAIN}:{qualname}" if spec is None or spec.name.endswith(MAIN) else f"{spec.name}:{qualname}"
     return f"{module}:{qualname}" if importable(module) else f"<{qualname}>"
 

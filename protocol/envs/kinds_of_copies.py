@@ -34,17 +34,17 @@ class CopiesKind(NamedTuple):
 
     open: Callable[[RunSpec, EnvCopy, Callable[[], None]], Any]
     """Makes the copies of a lane, and returns them as a `millrace.workers.copies.env_copies.EnvCopies`. The `EnvCopy`
-    identifies the first copy. The last argument is called between every two calls of the environment, and may raise. Raises
+    identifies the first copy. The last argument is called between any two calls to the environment, and may raise. Raises
     `UsageError` if the environment doesn't support such copies.
     """
     spaces: Callable[[EnvSpec], tuple[gymnasium.Space[Any], gymnasium.Space[Any]]] | None = None
     """Returns the observation and action space of one copy; a worker refuses the run if the spaces of the environment itself
-    differ from them. None means that copies have the spaces of the environment. Raises `UsageError`, like `open`.
+    differ from them. None means that the copies have the environment's own spaces. Raises `UsageError`, like `open`.
     """
     has_masks: bool = True
     """Whether these copies report masks of the allowed actions if the environment does."""
     has_attributes: bool = True
-    """Whether attributes of these copies can be set."""
+    """Whether attributes can be set on these copies."""
 
 
 def copies_kind(name: str) -> CopiesKind:
@@ -63,7 +63,7 @@ def has_masks(name: str) -> bool:
 
 
 def has_attributes(name: str) -> bool:
-    """Whether attributes of copies of this kind can be set. Doesn't import `loop`, for whose copies this is always so."""
+    """Whether attributes can be set on copies of this kind. Doesn't import `loop`, whose copies always allow it."""
     return name == DEFAULT or copies_kind(name).has_attributes
 
 

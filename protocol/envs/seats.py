@@ -6,7 +6,7 @@ has the move, leave before the others, or join later.
 Rule: a row of a seat spans the time from one of the seat's actions to its next observation: the one in which it has the move
 again, or its last one. `SeatStep.complete` marks the step that returns this observation. Until then the seat waits, and its
 entry repeats the observation in which it acted. Rewards belong to the row in which they occur; rewards outside of any row
-only count in the return. An agent whose part of the episode has ended is out until the reset, even if `agents` lists it.
+count only in the return. An agent whose part of the episode has ended is out until the reset, even if `agents` lists it.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ STATE = "state"
 MAX_AGENT_NAME = MAX_NAME - len("return_")  # characters; leaves room for the prefix in the name of the agent's return
 _NO_INFO: Mapping[str, Any] = {}
 RETURNED_WRONGLY = AttributeError, KeyError, TypeError, ValueError, OverflowError
-"""Exceptions of code that reads an environment's results if a dict lacks an agent, or values aren't dicts or numbers."""
+"""Exceptions that reading an environment's results raises if a dict lacks an agent, or values aren't dicts or numbers."""
 
 
 class SeatStep(NamedTuple):
@@ -182,7 +182,7 @@ class SeatedEnv(gymnasium.Env[SeatStep, Sequence[Any]]):
         """
         owner = self.env
         while name not in dir(owner) and not isinstance(owner, last):
-            inner = getattr(owner, "env", None) or getattr(owner, "aec_env", None)  # the latter of `parallel_wrapper_fn`
+            inner = getattr(owner, "env", None) or getattr(owner, "aec_env", None)  # the latter after `parallel_wrapper_fn`
             if inner is None:
                 break
             owner = inner
@@ -263,7 +263,7 @@ class ParallelSeats(SeatedEnv):
             told[seat] = info if type(info) is dict else _info(agent, info)
             terminates[seat] = bool(terminated[agent])
             truncates[seat] = bool(truncated[agent])
-            # If the agent is terminated, its last observation may be missing: nothing is learned from it.
+            # If the agent is terminated, its last observation may be missing, because nothing is learned from it.
             if not terminates[seat] or observations.get(agent) is not None:
                 seen[seat] = self._seen(seat, observations[agent], state=self._state_before(seen[seat], terminates[seat]))
             if terminates[seat] or truncates[seat]:
@@ -298,8 +298,8 @@ class ParallelSeats(SeatedEnv):
 
 
 class TurnSeats(SeatedEnv):
-    """One agent acts at a time (`pettingzoo.AECEnv`). A step is the action of one agent. After it, every agent whose part of
-    the episode is over leaves.
+    """One agent acts at a time (`pettingzoo.AECEnv`). A step is one agent's action. After it, every agent whose part of the
+    episode is over leaves.
     """
 
     takes_turns = True
@@ -418,7 +418,7 @@ def with_state(env: Any) -> Any:
 
 
 def _number(value: Any) -> float:
-    """A reward as a number. As in gymnasium, an array with one element counts as one."""
+    """A reward as a number. As in gymnasium, an array with one element counts as a number."""
     return float(value.item() if isinstance(value, np.ndarray) else value)
 
 

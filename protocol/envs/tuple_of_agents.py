@@ -1,7 +1,7 @@
 """`millrace:TupleOfAgents`, a wrapper for multi-agent gymnasium environments whose spaces are Tuples.
 
-Rule: element i of the observations, actions and rewards is agent i's. An episode ends for all agents at once: when each of
-them is terminated or truncated.
+Rule: element i of the observations, actions and rewards belongs to agent i. An episode ends for all agents at once: when
+each of them is terminated or truncated.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ class TupleOfAgents:
     """Wraps a gymnasium environment that takes and returns tuples with an element for each agent.
 
     Environments such as those of rware, lbforaging and vmas have this form. The wrapper gives them PettingZoo's parallel
-    interface, so that each element is trained as an agent: `--wrappers millrace:TupleOfAgents`. Without it, the Tuple is one
-    action of one agent, and the environment must return one reward.
+    interface, so that each element is trained as an agent: `--wrappers millrace:TupleOfAgents`. Without the wrapper, the
+    Tuple is one action of one agent, and the environment must return one reward.
 
     >>> import gymnasium, millrace
     >>> class Lights(gymnasium.Env):
@@ -111,7 +111,7 @@ class TupleOfAgents:
         )
 
     def _flags(self, given: Any) -> Bools:
-        """The flag of each agent, from one for each agent or from one for all."""
+        """The flag of each agent, given one flag for each agent or a single flag for all."""
         flags = np.ravel(given).astype(bool)
         return flags if len(flags) == len(self.possible_agents) else np.full(len(self.possible_agents), flags.all())
 

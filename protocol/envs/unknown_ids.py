@@ -1,7 +1,7 @@
 """Environment ids that gymnasium does not know: plugins that register them, and what to write if none does.
 
 Rule: a package is imported for an id only if it declares a plugin, an entry point `gymnasium.envs`. gymnasium 1 no longer
-loads these; each worker does, on its own machine. For other packages, the user names the module: `module:Id`. An id is
+loads plugins; each worker does so, on its own machine. For other packages, the user names the module: `module:Id`. An id is
 suggested only if its environment can be made, or could be once a package is installed.
 """
 

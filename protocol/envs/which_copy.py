@@ -40,13 +40,13 @@ class EnvCopy:
     """
 
     number: int = 0
-    """The copy's index among all copies of the run, from 0: `lane` times the copies per lane, plus `copy`. For a copy that
-    plays evaluations, its index among the `--eval-copies`; for a copy that is made only to be described, 0.
+    """The copy's index among all copies of the run, from 0: `lane` times the copies per lane, plus `copy`. For an evaluation
+    copy, its index among the `--eval-copies`; for a copy that is made only to be described, 0.
     """
     lane: int = 0
-    """The lane to which the copy belongs; 0 for a copy that plays evaluations."""
+    """The lane to which the copy belongs; 0 for an evaluation copy."""
     copy: int = 0
-    """The copy's index within the lane, from 0; for a copy that plays evaluations, its `number`."""
+    """The copy's index within the lane, from 0; for an evaluation copy, its `number`."""
     evaluation: bool = False
     """Whether the copy plays evaluations or recordings."""
     slot: int = 0

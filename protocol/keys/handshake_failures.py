@@ -86,8 +86,9 @@ NO_ZEROMQ = "it does not speak ZeroMQ, or left before it had said who it is"
 class PendingHandshakes:
     """Connections whose handshake is not finished. Finds out which client's handshake failed, for the log only.
 
-    libzmq reports a connection's descriptor when the connection is accepted and when it ends, but not in between. After a
-    failure, the same connection ends. Which handshake succeeded is guessed from the addresses that ZAP approved.
+    libzmq reports a connection's descriptor when the connection is accepted and when it ends, but not in between. The first
+    connection that ends after a failure is the one that failed. Which handshake succeeded is guessed from the addresses that
+    ZAP approved.
     """
 
     def __init__(self, keys: bool, host_of: Callable[[int], str] | None = None) -> None:

@@ -12,8 +12,8 @@ one array [N, *shape] for each name that was declared. If there is a method `act
 it in place of `act`. In a run with action masks, both are called with `mask=` [N, choices] bool, which is True where a
 choice is allowed.
 
-Rule: `act` is called once for each lane and step, with exactly the copies of that lane. So if the policy keeps nothing but
-`state` between calls, a rollout has the same bits whatever else the worker does.
+Rule: `act` is called once for each lane and step, with exactly the copies of that lane. Therefore, if the policy keeps
+nothing but `state` between calls, a rollout is the same, bit for bit, whatever else the worker does.
 """
 
 from __future__ import annotations
@@ -122,7 +122,7 @@ class CalledPolicy:
     def _array(self, value: Any, shape: tuple[int, ...], dtype: str, what: str) -> Array:
         """The value as an array of this shape and dtype.
 
-        Raises `PolicyFailed` if its shape or kind of number is another, or it contains an invalid number.
+        Raises `PolicyFailed` if the value has another shape or kind of number, or contains an invalid number.
         """
         array: npt.NDArray[Any] = self._guarded(what, lambda: np.asarray(value))
         if array.shape != shape or not np.can_cast(array.dtype, dtype, "same_kind"):
@@ -133,7 +133,7 @@ class CalledPolicy:
         return array
 
     def _guarded(self, what: str, call: Callable[[], Any]) -> Any:
-        """Call the user's code. Raises `PolicyFailed` in place of the exceptions that it raises."""
+        """Call the user's code. Raises `PolicyFailed` in place of any exception from it."""
         try:
             return call()
         except PolicyFailed:

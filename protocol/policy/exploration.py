@@ -1,8 +1,8 @@
 """How DQN, SAC and TD3 explore: ε-greedy actions, a squashed normal distribution, normal noise. Pure: noise is an argument.
 
 As in `distributions.py`, a distribution has parameters `params` [..., P]. Here the last parameters aren't outputs of the
-network: the learner sends them with the weights, and they are the same for every observation. So the learner controls how
-much workers explore, and workers know no schedule.
+network: the learner sends them with the weights, and they are the same for every observation. The learner therefore controls
+how much workers explore, and workers need no schedule.
 
     EpsilonGreedy       P = n + 1     action values, ε
                                       action = uniform at random where noise₀ < ε, else argmax

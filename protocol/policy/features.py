@@ -32,9 +32,9 @@ def _feature_count(leaf: Leaf) -> int:
 def features(spec: PolicySpec, leaves: Sequence[Array]) -> Array:
     """Features [..., D] of leaves [..., *leaf], not yet normalized. Images are left out.
 
-    Arrays are flattened and divided by `Leaf.divisor`; discrete values become one-hot vectors. The dtype is float32. But if
-    the policy normalizes and float32 would lose digits of an array (`Leaf.is_wide`), it is float64, and `normalize` converts
-    the result to float32. The result may be a view of a leaf.
+    Arrays are flattened and divided by `Leaf.divisor`; discrete values become one-hot vectors. The dtype is float32, unless
+    the policy normalizes and float32 would lose digits of an array (`Leaf.is_wide`). In that case, it is float64, and
+    `normalize` converts the result to float32. The result may be a view of a leaf.
     """
     plain = [(leaf, array) for leaf, array in zip(spec.observation, leaves, strict=True) if not leaf.is_image]
     parts = [_features_of_leaf(leaf, array, spec.normalize_observations) for leaf, array in plain]

@@ -1,7 +1,7 @@
 """The position of each parameter in the flat buffer. Pure; imports no torch.
 
-All parameters of a policy are in one flat float32 buffer. The parameters that are needed to act come first. So publishing
-weights copies the first part of the buffer, and loading them makes views of the received frame. Only `parameter_layout`
+All parameters of a policy are in one flat float32 buffer. The parameters that are needed to act come first, so publishing
+weights copies only the first part of the buffer. Loading weights makes views of the received frame. Only `parameter_layout`
 defines the positions. The parameters of the networks in `millrace.protocol.policy.networks` are views with the same layout.
 """
 
@@ -179,8 +179,9 @@ def named_views(flat: FlatT, fields: Sequence[Field]) -> dict[str, FlatT]:
 def buffer_layout(spec: PolicySpec) -> tuple[Field, ...]:
     """The fields of `Weights.buffers`: statistics of observations, if these are normalized, and parameters of exploration.
 
-    With Q-values, the only parameter of exploration is ε. With actions in [-1, 1], there are the scale of the noise (only if
-    actions are deterministic), and a number that is 1 during the warm-up, while actions are uniform, and then 0.
+    With Q-values, the only parameter of exploration is ε. With actions in [-1, 1], they are the scale of the noise (only if
+    actions are deterministic), and a number that is 1 during the warm-up, while actions are drawn uniformly, and 0
+    afterwards.
     """
     fields: list[Field] = []
     if spec.normalize_observations:

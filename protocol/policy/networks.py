@@ -1,9 +1,9 @@
 """The networks in torch. The learner trains them. Workers act with them if a policy has images or a user-defined encoder.
 
 All parameters are in one flat float32 tensor, in the layout of `millrace.protocol.policy.layout`, and all gradients in a
-second one. The named arrays are views of these two. So the gradient norm is the norm of one tensor, Adam is one kernel, and
-publishing copies the first part of one tensor. Features come from `millrace.protocol.policy.features` (numpy) and are
-already normalized.
+second one. The named arrays are views of these two tensors, so the gradient norm is the norm of one tensor, an Adam step is
+one kernel, and publishing copies the first part of one tensor. Features come from `millrace.protocol.policy.features`
+(numpy) and are already normalized.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def defaults_of_thread() -> Iterator[None]:
         stack.enter_context(torch.inference_mode(False))
         stack.enter_context(torch.enable_grad())
         if torch.get_default_device().type != "cpu":
-            stack.enter_context(torch.device("cpu"))  # entered only if needed, because it slows every call of torch
+            stack.enter_context(torch.device("cpu"))  # entered only if needed, because it slows every call to torch
         for device in ("cpu", "cuda"):
             if torch.is_autocast_enabled(device):
                 stack.enter_context(torch.autocast(device, enabled=False))
@@ -293,8 +293,8 @@ class ActorAndCritics(FlatNetwork):
     """An actor whose actions are in [-1, 1], and two critics, which map an observation and an action to a value.
 
     `actor` and `critics` are two parts of the flat tensor. Each has its part of the gradients, and its own optimizer. The
-    encoder, if there is one, is trained with the critics, and the actor uses its output (Yarats et al. 2022). So the methods
-    that compute losses take the encoder's outputs h [B, H], which are the features if there is no encoder.
+    encoder, if there is one, is trained with the critics, and the actor uses its output (Yarats et al. 2022). Therefore, the
+    methods that compute losses take the encoder's outputs h [B, H], which are the features if there is no encoder.
     """
 
     def __init__(self, spec: PolicySpec, device: str | torch.device = "cpu", *, seed: int = 0) -> None:
@@ -354,7 +354,7 @@ class ActorAndCritics(FlatNetwork):
     def values(self, h: Tensor, action: Tensor, *, constant: bool = False, critics: int = len(CRITICS)) -> Tensor:
         """The values [critics, B] that both critics, or only the first, give to actions [B, D′] in [-1, 1].
 
-        With `constant`, gradients flow to the actions but not to the critics. Use it for the loss of the actor.
+        With `constant`, gradients flow to the actions but not to the critics. Use it for the actor's loss.
         """
         flat = self._constant_critics if constant else self._critics
         layers = partial(self._stacked, critics)

@@ -3,7 +3,8 @@
 The core is between the features and the hidden layers. Each env copy has its own state [..., S]. The row format defines when
 the state is reset. If row t is valid, `obs[t+1]` is processed with the state after `obs[t]`. If row t is not valid, it only
 resets the copy, and `obs[t+1]` is processed with a state of zeros. (While a policy acts, `workers/lanes/runner.py` steps its
-lanes and sets the state to zeros.) So the final observation of an episode is still processed with its episode's state.
+lanes and sets the state to zeros.) The final observation of an episode is therefore still processed with that episode's
+state.
 
 A core is an LSTM (Hochreiter and Schmidhuber 1997) or a GRU (Cho et al. 2014). Both are computed as in torch, with torch's
 order of gates.

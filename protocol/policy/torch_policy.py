@@ -28,7 +28,7 @@ class TorchPolicy:
     def __init__(
         self, spec: PolicySpec, device: str = "cpu", *, together: bool = False, images: ActingDtype = "float32"
     ) -> None:
-        """With `together`, all lanes are computed at once: use it if every call passes the same lanes.
+        """With `together`, all lanes are computed at once. Use it if every call passes the same lanes.
 
         `images` is the precision in which images are processed.
         """

@@ -1,6 +1,6 @@
 """Checks arrays from elsewhere: their shapes and dtypes, and that values are finite and in their space. Pure.
 
-Each check returns an error of one line, or an empty string if nothing is wrong. The line names the first wrong value and its
+Each check returns a one-line error, or an empty string if nothing is wrong. The line names the first wrong value and its
 place. `axes` names the leading dimensions of an array: with ("step", "copy"), the place is "at step 3, copy 1". If each copy
 has a column for each of its seats, the names of the seats stand in place of "copy": with ("step", ("black", "white")), the
 place is "at step 3, copy 1, white".

@@ -1,7 +1,7 @@
 """Checks a rollout: its shapes and dtypes must be those of the run, its values in the run's spaces, and its rows must obey
 the row law. Pure.
 
-Rule: before it sends a rollout, a worker checks everything that its environment can get wrong:
+Rule: before sending a rollout, a worker checks everything that its environment can get wrong:
 `workers/copies/value_checks.py` checks values, and `protocol/envs/seats.py` checks the law of seats. The learner checks
 everything again, because a worker may be hostile.
 """

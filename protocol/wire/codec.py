@@ -58,8 +58,8 @@ TO_LEARNER: MessageTypes = (
 )
 TO_OBSERVER: MessageTypes = (Status, Status)
 
-# msgspec builds its type information for a record at the first conversion to it. It crashes the process if two threads do
-# that at the same time. So all of it is built here, at import, by one thread.
+# msgspec builds its type information for a record at the first conversion to it, and crashes the process if two threads do
+# so at the same time. All type information is therefore built here, at import, by one thread.
 for _kind in (*TO_WORKER, *TO_LEARNER, *TO_OBSERVER):
     with suppress(msgspec.ValidationError):
         msgspec.convert(None, _kind)
@@ -118,7 +118,7 @@ def check_can_be_sent(env: str, run: RunSpec | StepSpec) -> None:
 
 
 def decode_to_learner(frames: Sequence[Buffer], packed_bytes_limit: int = 0) -> ToLearner | Inquire:
-    """Decode a message of a worker or an observer. Raises `BadMessage` for anything else, and no other error.
+    """Decode a message from a worker or an observer. Raises `BadMessage` for anything else, and no other error.
 
     `packed_bytes_limit` is the largest total unpacked size of the message's packed arrays; 0 forbids packed arrays.
     """
@@ -127,7 +127,7 @@ def decode_to_learner(frames: Sequence[Buffer], packed_bytes_limit: int = 0) -> 
 
 
 def decode_to_worker(frames: Sequence[Buffer]) -> ToWorker:
-    """Decode a message of the learner to a worker. Raises `BadMessage` for anything else, and no other error."""
+    """Decode a message from the learner to a worker. Raises `BadMessage` for anything else, and no other error."""
     message: ToWorker = _decode(frames, TO_WORKER, max_items=MAX_HEAD_BYTES)
     return message
 
@@ -183,7 +183,7 @@ def _decode(frames: Sequence[Buffer], kinds: MessageTypes, packed_bytes_limit: i
         named = type(head) is dict and "type" in head  # if a map can be of one type only, msgspec accepts it without "type"
         message = msgspec.convert(head, by_name if named else by_position, dec_hook=hook)
     except BadMessage as error:
-        raise BadMessage(one_line(str(error), 500)) from error  # the error may quote text of the peer
+        raise BadMessage(one_line(str(error), 500)) from error  # the error may quote text from the peer
     except Exception as error:  # msgpack and msgspec raise a dozen types for invalid bytes
         reason = one_line(" ".join(_explain_validation_error(str(error), head, by_position).split()), 200)  # quotes the peer
         raise BadMessage(f"head is not a message of millrace: {type(error).__name__}: {reason}") from error

@@ -8,9 +8,9 @@ payload of a stack is
     bits     [N, T]        1: step t+1 of copy n is step t shifted by one frame; lowest bit first, zeros up to a whole byte
     frames   [M, H, W, …]  by copy, then by step: the newest frame of a shifted step, all k frames of any other step
 
-So each step consists of its own newest frame and the k - 1 frames before it. Sizes from a peer are checked before memory is
-allocated: a stack is at most k times as large as its payload, and a Zstandard frame must declare the size that the array
-needs.
+Each step therefore consists of its own newest frame and the k - 1 frames before it. Sizes from a peer are checked before
+memory is allocated: a stack is at most k times as large as its payload, and a Zstandard frame must declare the size that the
+array needs.
 """
 
 from __future__ import annotations

@@ -5,9 +5,9 @@ ROUTER_HANDOVER, a worker that returns is locked out until its half-open connect
 link.
 
 With keys, a peer is identified by its routing id *and* its key, which libzmq verifies for every message. A client that
-claims another's routing id with its own key is therefore another peer: it can neither speak in that worker's session nor end
-it. Nor can it cut that worker's connection by a handover, which would leave the worker's connection open but unread: the
-worker's routing id ends in a tag that only the holder of its key can compute.
+claims another's routing id with its own key is therefore a different peer, which can neither speak in that worker's session
+nor end it. Nor can it cause a handover, which would leave the worker's connection open but unread, because the worker's
+routing id ends in a tag that only the holder of the worker's key can compute.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ class LearnerLink:
         return self._authenticator.refused if self._authenticator is not None else 0
 
     def poll(self, timeout_s: float) -> bool:
-        """Wait until a message arrives, at most `timeout_s` seconds. Returns whether one has arrived.
+        """Wait until a message arrives, for at most `timeout_s` seconds. Returns whether one has arrived.
 
         Raises `RunError` if the authenticator's thread has ended.
         """
@@ -93,7 +93,7 @@ class LearnerLink:
         return bool(self._socket.poll(max(0, int(timeout_s * 1000))))
 
     def poll_beside(self, fds: Sequence[int], timeout_s: float) -> bool:
-        """Wait until a message arrives, or one of these file descriptors can be read, at most `timeout_s` seconds.
+        """Wait until a message arrives, or one of these file descriptors can be read, for at most `timeout_s` seconds.
 
         Returns whether a message has arrived.
         """
@@ -124,7 +124,7 @@ class LearnerLink:
                 yield peer, error
 
     def rejection_reason(self, peer: bytes) -> str:
-        """Why this peer is no longer allowed to connect; empty if it is."""
+        """Why this peer is no longer allowed to connect; empty if it still is."""
         return "" if self.keyring is None else self.keyring.allowed.rejection_reason(_key_of(peer))
 
     def name_for_log(self, peer: bytes) -> str:

@@ -19,7 +19,7 @@ def receive_frames(socket: zmq.Socket[bytes], sender_keys: list[str] | None = No
     """The frames of the next message, or None if no message has arrived.
 
     At most `MAX_FRAMES` + 2 frames are kept, so that the caller can see that there were too many. If `sender_keys` is given,
-    its content is replaced by one key: that of the message's sender, which libzmq proved in the handshake.
+    its content is replaced by one key: that of the message's sender, which libzmq verified in the handshake.
     """
     frames: list[Buffer] = []
     try:

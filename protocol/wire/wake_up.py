@@ -32,7 +32,7 @@ class WakeReason(IntEnum):
 class WakePipe:
     """A pipe by which one side wakes the other: one side writes a byte, and the other sleeps until it can read it.
 
-    It is a pipe because Linux assumes that a process that writes to a pipe is about to sleep: the woken process starts on
+    It is a pipe because Linux assumes that a process that writes to a pipe is about to sleep, so the woken process starts on
     the same core as soon as the writer sleeps. A process woken by an eventfd or a semaphore may have to wait for a core on
     which a third process spins.
     """
@@ -52,7 +52,7 @@ class WakePipe:
             os.write(self.write_fd, _BYTES[reason])
 
     def wait(self, timeout_s: float) -> WakeReason:
-        """Sleep until woken, at most `timeout_s` seconds. Returns the reason; `MESSAGE` takes precedence over `STEP`.
+        """Sleep until woken, for at most `timeout_s` seconds. Returns the reason; `MESSAGE` takes precedence over `STEP`.
 
         If the reader has noticed a step without sleeping, the step's byte is still in the pipe, and the next `wait` returns
         immediately.
@@ -79,8 +79,8 @@ class SpinWait:
     """Spins for a short time before it sleeps. Each time that spinning was in vain, it skips spinning in more of the waits
     that follow.
 
-    Linux may ignore `sched_yield` for a while; only a sleeping process is certain to free its core. So spinning stops after
-    the first turn that takes so long that another process must have run on this core.
+    Linux may ignore `sched_yield` for a while; only a sleeping process is certain to free its core. Spinning therefore stops
+    after the first turn that takes so long that another process must have run on this core.
     """
 
     def __init__(self) -> None:

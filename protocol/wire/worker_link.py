@@ -46,7 +46,7 @@ class WorkerLink:
         token: Token | None = None,
         limits: Limits | None = None,
     ) -> None:
-        """Connect to the address. With a token (only over tcp), the link connects only to the learner of that token.
+        """Connect to the address. With a token (only over tcp), the link connects only to that token's learner.
 
         Over inproc, `context` must be the learner's context; closing the link doesn't close the context. If `limits` is
         None, they are those of a worker. Raises `UsageError` for an address or a name that is not valid.
@@ -92,9 +92,9 @@ class WorkerLink:
         self._beside = fd
 
     def poll(self, timeout_s: float) -> bool:
-        """Wait until a message arrives, at most `timeout_s` seconds. Returns whether one has arrived.
+        """Wait until a message arrives, for at most `timeout_s` seconds. Returns whether one has arrived.
 
-        Returns early if the learner refuses our key, or the file descriptor of `watch` can be read.
+        Returns early if the learner refuses our key, or the file descriptor given to `watch` can be read.
         """
         deadline_s = time.monotonic() + timeout_s
         while True:

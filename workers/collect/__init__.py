@@ -1,1 +1,1 @@
-"""Collecting rollouts: the env copies of a lane are stepped with the actions of the policy."""
+"""Collecting rollouts: the env copies of a lane are stepped with the policy's actions."""

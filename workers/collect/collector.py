@@ -1,8 +1,8 @@
-"""Collects rollouts that keep the row format (`protocol/rollout.py`), from a policy and the env copies of lanes.
+"""Collects rollouts that follow the row format (`protocol/rollout.py`), from a policy and the env copies of lanes.
 
-Lanes that are collected together are stepped in lock-step, with one forward pass for all of them [L, N, ·]. The rollout of
-a lane depends on the run's seed, the lane, the round, the weights and what the lane did before, and on nothing else: not on
-the other lanes, and not on which worker collected the rollouts before it. The arrays of a rollout are new each time and are
+Lanes that are collected together are stepped in lock-step, with one forward pass for all of them [L, N, ·]. The rollout of a
+lane depends on the run's seed, the lane, the round, the weights and the lane's history, and on nothing else: neither on the
+other lanes, nor on which workers collected the lane's earlier rollouts. The arrays of a rollout are new each time and are
 never written again, so they can be sent without a copy.
 """
 

@@ -16,8 +16,8 @@ from millrace.protocol.keys.worker_token import TOKEN_VARIABLE
 REJOIN_TIMEOUT_S = 600.0
 """The minimum time for which a worker that has joined waits for its learner to come back."""
 LEARNER_STARTED_IT_S = math.inf
-"""How long a worker waits if its learner started it: without limit, because the learner may be stopped (Ctrl-Z) or busy, and
-the worker ends when the learner does.
+"""How long a worker waits if its learner started it: without limit, because the learner may be suspended (Ctrl-Z) or busy,
+and the worker ends when the learner does.
 """
 
 

@@ -1,11 +1,11 @@
 """What a worker holds: requests that it has not finished, and answers that the learner may not have received. Pure.
 
 Rule: each request has a ticket, and is executed once. Its answer is kept, and sent again if the learner repeats the request
-because the answer was lost. To limit the memory of a worker, answers are kept only for a time:
+because the answer was lost. To limit a worker's memory use, answers are kept only for a limited time:
 
-- A rollout is kept until the learner says that it has received it. So a worker holds at most the rollouts that the learner
+- A rollout is kept until the learner says that it has received it, so a worker holds at most the rollouts that the learner
   is waiting for.
-- The result of an evaluation is kept until there are `KEPT_RESULTS` later ones. It is not kept if its rows were sent too:
+- An evaluation's result is kept until there are `KEPT_RESULTS` later ones. It is not kept if its rows were sent too, because
   rows are large, and the evaluation can be executed again, with the same episodes.
 - The answer to an order (Reset, Step, Call) of a vector environment is kept until the next order for its lane.
 - A description of an environment is kept until the next one is requested, or the run begins.
@@ -173,7 +173,7 @@ class Assignment:
     opponent: int | None = None
     """The opponent that plays the other teams in the episodes that begin in this rollout."""
     past: LanePast | None = None
-    """The past from which the lane continues if it isn't open in this incarnation. If None, it begins its first episodes."""
+    """The history from which the lane continues if it isn't open in this incarnation. If None, first episodes begin."""
 
 
 class Permitted(NamedTuple):

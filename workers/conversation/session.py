@@ -253,7 +253,7 @@ class _SessionState:
     def release_unlisted(self, received: Sequence[Received]) -> list[WorkerEffect]:  # rule UNLISTED
         """Drop the lanes that the learner does not list, because their Release was lost.
 
-        Call this only for a new HeartbeatReply: a copy of an old one doesn't list lanes that were added later.
+        Call this only for a new HeartbeatReply, because a copy of an old one doesn't list lanes that were added later.
         """
         listed = {of_lane.lane for of_lane in received}
         return self.release([lane for lane in self.lanes() if lane.lane not in listed])
@@ -288,7 +288,7 @@ class Session:
     # ---------------------------------------------------------------- messages and time
 
     def handle(self, message: ToWorker, now: float) -> list[WorkerEffect]:
-        """Handle a message of the learner."""
+        """Handle a message from the learner."""
         if isinstance(message, Drain):  # a Drain also answers the heartbeats of a worker that is already draining
             self._unanswered_s = math.inf
         if type(message) not in TABLE[self.state]:

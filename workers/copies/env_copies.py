@@ -96,8 +96,8 @@ class StepResult(NamedTuple):
 
 
 class EnvCopies(Protocol):
-    """N env copies. Any exception of the environment is raised as `CopyFailed`; exceptions of `pulse` are
-    raised unchanged.
+    """N env copies. Any exception from the environment is raised as `CopyFailed`; exceptions from `pulse` are raised
+    unchanged.
     """
 
     observation_space: gymnasium.Space[Any]
@@ -160,7 +160,7 @@ def check_spaces(run: RunSpec, copies: EnvCopies) -> None:  # rule OTHER_AGENTS
 
 
 def copy_seed(seed: int, lane: int, start: int, copy: int) -> int:  # rule INDEPENDENT
-    """The seed with which a lane's copy is reset at its start with the number `start`."""
+    """The seed with which a copy of this lane is reset at its start number `start`."""
     return env_seed(seed, Purpose.COPIES, lane, start, copy)
 
 
@@ -181,8 +181,8 @@ class LoopedCopies:
         """Make the copies. If `masked`, read masks of the allowed actions. In an evaluation, no step resets a copy.
 
         `facts` are names of numbers in `info` that describe an episode. `critic_keys` are keys of a Dict observation whose
-        arrays come last. `first` identifies the first copy. After `restart_episodes` episodes, a copy is closed and created
-        again; 0 means never.
+        arrays come last. `first` identifies the first copy. After `restart_episodes` episodes, a copy is closed and
+        recreated; 0 means never.
         """
         self._facts = facts
         self._activity = activity()
@@ -196,7 +196,7 @@ class LoopedCopies:
         )
         self.envs = self._loop.envs
         self.count = len(self._loop.envs)
-        with self._activity.during(MAKING):  # reading an attribute may run code of the environment
+        with self._activity.during(MAKING):  # reading an attribute may run environment code
             self.observation_space = self.envs[0].observation_space
             self.action_space = self.envs[0].action_space
         self._masks = MaskReader(self.observation_space, self.action_space) if masked else None
@@ -250,7 +250,7 @@ class LoopedCopies:
         return env
 
     def _never_anew(self) -> str:
-        """Why copies are never recreated although the run asks for it; empty if they are, or if it doesn't ask."""
+        """Why copies are never recreated although the run asks for that; empty if they are, or if the run doesn't ask."""
         if not self._restart_episodes or self._loop.random_state(0) is not None:
             return ""
         return CANNOT_RESTART
@@ -353,7 +353,7 @@ class LoopedCopies:
 def without_order_check(env: gymnasium.Env[Any, Any], which: EnvCopy = FIRST_COPY) -> gymnasium.Env[Any, Any]:
     """The environment without `OrderEnforcing`, which only checks that the first step follows a reset.
 
-    The collector always resets first, and the wrapper adds a twentieth to the time of a CartPole step.
+    The collector always resets first, and the wrapper makes a CartPole step a twentieth slower.
     """
     while type(env) is OrderEnforcing:
         env = env.env

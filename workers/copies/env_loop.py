@@ -4,9 +4,9 @@ Autoreset is gymnasium's (`gymnasium.vector.AutoresetMode`). NextStep: the step 
 resets that copy. SameStep: the step that ends an episode resets the copy, and returns the last observation and info inside
 the new info, as `final_obs` and `final_info`. Disabled: the caller resets.
 
-Rule: a copy that is recreated after some episodes (`restart_episodes`) continues exactly as it would have otherwise: the new
-environment is reset with the seed with which the copy began, gets the random state of the old environment, and the state
-that it has saved if it can do so, and is reset again.
+Rule: a copy that is recreated after some episodes (`restart_episodes`) continues exactly as it would have otherwise. The new
+environment is reset with the seed with which the copy began. It then gets the old environment's random state, and its saved
+state if the environment can save its state, and is reset again.
 """
 
 from __future__ import annotations
@@ -69,10 +69,10 @@ class EnvLoop:
     ) -> None:
         """Make the copies, without resetting them.
 
-        If `ended`, they count as truncated, so that with NextStep the first step resets them. `first` identifies the first
-        copy; the others follow it. `stepping` is the worker's activity during a step. `dress` takes each copy, and returns
-        the environment to step in its place; see `make_copy`. After `restart_episodes` resets, each copy is closed and
-        created again before the next reset; 0 means never.
+        If `ended`, they count as truncated, so with NextStep the first step resets them. `first` identifies the first copy;
+        the others follow it. `stepping` is the worker's activity during a step. `dress` takes each copy, and returns the
+        environment to step in its place; see `make_copy`. After `restart_episodes` resets, each copy is closed and recreated
+        before the next reset; 0 means never.
         """
         self.envs: list[gymnasium.Env[Any, Any]] = []
         self._activity = activity()
@@ -90,7 +90,7 @@ class EnvLoop:
                 self.close()
                 raise CopyFailed(n, "make") from error
         self.steps = 0
-        """number of calls of `step`"""
+        """number of calls to `step`"""
         self.reward: list[Any] = [0.0] * len(self.envs)
         """[N] as returned by the last step"""
         self.terminated: list[Any] = [False] * len(self.envs)
@@ -157,7 +157,7 @@ class EnvLoop:
         next_step = self._next_step
         same_step = self._same_step
         infos: CopyInfos = []
-        # The worker's activity is written inline, because this loop must be fast: once per call of this method, at each
+        # The worker's activity is written inline, because this loop must be fast: once per call to this method, at each
         # reset of a copy, and every `PULSE_S` seconds.
         numbers = self._activity.numbers
         seconds = self._activity.seconds

@@ -96,7 +96,7 @@ class ResetAhead(gymnasium.Wrapper[Any, Any, Any, Any]):
     def instances(self) -> tuple[gymnasium.Env[Any, Any], gymnasium.Env[Any, Any]]:
         """The instance that plays, and the other one. Waits for a reset of the other one to end."""
         if self._prepared is not None:
-            with suppress(BaseException):  # the next call of `reset` raises it
+            with suppress(BaseException):  # the next call to `reset` raises it
                 self._prepared.result()
         if self._second is None:
             self._second = self._make()

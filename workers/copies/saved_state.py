@@ -1,9 +1,9 @@
 """Environments that can save their state, with methods `save_state() -> bytes` and `load_state(bytes)`.
 
 Rule: the environment or one of its wrappers may have these methods. Wrappers around the object with the methods must be
-stateless, or have a state that is known here: `TimeLimit` counts steps. With any other wrapper around it, the environment
-counts as unable to save. The state of `np_random` is kept in addition to the saved state. Nothing is unpickled here;
-what `load_state` does with its bytes is up to the environment.
+stateless, or have a state that is known here, such as the step count of `TimeLimit`. With any other wrapper around it, the
+environment counts as unable to save. The state of `np_random` is kept in addition to the saved state. Nothing is unpickled
+here; what `load_state` does with its bytes is up to the environment.
 """
 
 from __future__ import annotations

@@ -123,8 +123,8 @@ class SplitVectorEnv:
     def begin(self, lanes: Sequence[int], actions: Array, pulse: Pulse) -> None:
         """Order the copies of these lanes to step, with actions [L, N, *action]; see `TogetherSteps`.
 
-        Raises `ValueError` unless these are all the lanes of one part: the rounding of the policy's results may depend on
-        which lanes act together.
+        Raises `ValueError` unless these are all the lanes of one part, because the rounding of the policy's results may
+        depend on which lanes act together.
         """
         order = sorted(range(len(lanes)), key=lanes.__getitem__)
         in_order = actions[order].reshape(-1, *actions.shape[2:])  # [L · N, *action]
@@ -270,9 +270,9 @@ class SplitVectorEnv:
             return False
 
     def _assign_again(self, stepped: set[int], pulse: Pulse) -> None:
-        """Before these copies are stepped, set the attributes that they may lack. Copies that may be stepping must wait.
+        """Before these copies are stepped, set the attributes that they may lack. Other copies are left for later.
 
-        If a worker is lost meanwhile, the next step tries again.
+        Other copies may be in the middle of a step. If a worker is lost meanwhile, the next step tries again.
         """
         for key in sorted(self._missing):
             copies, packed = self._assigned[key]
@@ -338,7 +338,7 @@ class SplitLane:
     def close(self) -> None:
         """Stop waiting for a step. The copies belong to the vector environment, and are reset when the lane starts again.
 
-        A lane is closed when its rollout is dropped. Then no lane needs the result of a step in progress.
+        A lane is closed when its rollout is dropped. After that, no lane needs the result of a step in progress.
         """
         self._split.abandon()
 

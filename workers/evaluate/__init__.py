@@ -1,1 +1,1 @@
-"""Evaluating a policy: playing whole episodes on separate env copies, which don't belong to the lanes of training."""
+"""Evaluating a policy: playing whole episodes on separate env copies, which belong to no lane."""

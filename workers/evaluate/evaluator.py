@@ -1,9 +1,9 @@
-"""Plays the episodes of an Evaluate order. The result depends on the order and the weights, and on nothing else.
+"""Plays the episodes of an Evaluate order. The result depends only on the order and the weights.
 
 Rule: an order has k seeds, and is played on one lane of k env copies. The policy always gets a batch [1, k · A, ...], where
-A is the number of seats of a copy: a copy whose episode has ended stays in the batch, but is not stepped. Rows are played in
+A is the number of seats of a copy. A copy whose episode has ended stays in the batch, but is not stepped. Rows are played in
 small groups, each of which is then checked and sent; if the environment has to render, a group is a single row. The copies
-don't belong to the lanes of training. They are opened once, and reset with a seed before each episode.
+don't belong to any training lane. They are opened once, and reset with a seed before each episode.
 """
 
 from __future__ import annotations
@@ -176,7 +176,7 @@ class Evaluator:
         return copies
 
     def _show_frame(self, sender: RowSender, copies: EvaluationCopies) -> None:
-        """If the sender wants a frame, render its copy and pass the frame to the sender."""
+        """If the sender wants a frame, render the sender's copy and pass it the frame."""
         if not sender.wants_frame:
             return
         n = sender.episode

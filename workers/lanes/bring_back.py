@@ -1,10 +1,10 @@
-"""Brings a lane back: continues its episodes on new env copies, from the lane's past (`protocol/lane_past.py`).
+"""Brings a lane back: continues its episodes on new env copies, from the lane's history (`protocol/lane_past.py`).
 
 Rule: each episode begins as it did before, and its actions are replayed without the policy, row by row, in all copies
-together. Then the copies' observations, returns and lengths are compared with the past. If they differ, the environment is
-not deterministic, and the copy begins a new episode, with the next start number. Replayed steps are calls of the environment
-with its usual timeouts, but aren't counted as env steps. If an environment has saved its state, the state is loaded instead,
-and nothing is replayed.
+together. Then the copies' observations, returns and lengths are compared with the history. If they differ, the environment
+is not deterministic, and the copy begins a new episode, with the next start number. Replayed steps have the usual timeouts
+of calls to the environment, but aren't counted as env steps. If an environment has saved its state, the state is loaded
+instead, and nothing is replayed.
 """
 
 from __future__ import annotations
@@ -37,11 +37,12 @@ NOT_REPEATED = (
 def bring_back(
     run: RunSpec, lane: Lane, past: LanePast, attributes: bytes, pulse: Pulse, written: Sequence[Array] = ()
 ) -> str:
-    """Continue a lane from its past on a new `Lane`. The copies of the new lane must not have been reset yet.
+    """Continue a lane from its history (`past`) on a new `Lane`. The copies of the new lane must not have been reset yet.
 
     At the end, the copies have these `attributes` (packed). With seats, `written` has arrays [T, N · A, …] of the shapes and
-    dtypes that the policy writes. A past that doesn't fit the lane is not continued; new episodes begin instead. Returns a
-    line for the user, or an empty string if there is nothing to report. Raises `EnvironmentFailed` if a copy raises.
+    dtypes that the policy writes. If the history doesn't fit the lane, it is not continued, and new episodes begin instead.
+    Returns a line for the user, or an empty string if there is nothing to report. Raises `EnvironmentFailed` if a copy
+    raises.
     """
     copies = lane.copies
     continued: list[int] = []
@@ -74,9 +75,9 @@ class _Repeated:
         self, run: RunSpec, lane: Lane, copies: LoopedCopies, past: LanePast, continued: list[int], pulse: Pulse
     ) -> None:
         self.continued = continued
-        """the copies that can still be continued, because they have matched the past so far"""
+        """the copies that can still be continued, because they have matched the history so far"""
         self.why = ""
-        """how the first copy that didn't match the past differed from it; empty if all have matched"""
+        """how the first copy that didn't match the history differed from it; empty if all have matched"""
         self._run = run
         self._lane = lane
         lane.starts = [last.start for last in past.copies]
@@ -122,7 +123,7 @@ class _Repeated:
         self._copies.end([n for n in self.continued if self._past.copies[n].over])
 
     def compare(self) -> None:
-        """Compare the copies with the past, and stop continuing those that differ."""
+        """Compare the copies with the history, and stop continuing those that differ."""
         past = self._past
         returns = past.memory[0][:, :-2]
         for n in list(self.continued):

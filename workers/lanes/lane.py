@@ -49,8 +49,8 @@ class Lane:
     ) -> None:
         """Make a lane of the first `count` of these copies.
 
-        `number` is None if the lane plays an evaluation: then no step resets a copy, and a copy whose episode is over is not
-        stepped. An episode that reaches `most_steps` steps is cut.
+        `number` is None if the lane plays an evaluation. In that case, no step resets a copy, and a copy whose episode is
+        over is not stepped. An episode that reaches `most_steps` steps is cut.
         """
         self.number = number
         self.incarnation = incarnation
@@ -101,8 +101,8 @@ class Lane:
         self._attributes = packed
 
     def start(self, starts: list[int], pulse: Pulse) -> None:
-        """Begin the first episode of each copy, where `starts` [N] has the copies' start numbers. Raises
-        `EnvironmentFailed`.
+        """Begin the first episode of each copy, where `starts` [N] has the copies' start numbers. Raises `EnvironmentFailed`
+        if a copy raises.
         """
         assert self.number is not None
         self.starts = starts

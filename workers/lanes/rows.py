@@ -1,8 +1,8 @@
 """The rows of lanes that are stepped together, while they are being written.
 
-Rule: a step fills one row of every lane. When all rows are filled, they keep the row format (`protocol/rollout.py`), and the
-running episodes of each lane include all its rows. Rows stay empty only at the end of an evaluation, when all its episodes
-are over. If a copy was not stepped, its part of the row repeats the copy's last observation and has no reward.
+Rule: a step fills one row of every lane. When all rows are filled, they follow the row format (`protocol/rollout.py`), and
+the running episodes of each lane include all its rows. Rows stay empty only at the end of an evaluation, when all its
+episodes are over. If a copy was not stepped, its part of the row repeats the copy's last observation and has no reward.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ class Rows:
     def env_steps(self) -> int:
         """Env steps made, including those of an incomplete row.
 
-        The count never falls, and includes only calls of the environment that have returned.
+        The count never falls, and includes only calls to the environment that have returned.
         """
         before = self._of_rows(self.filled)
         if self.filled == self.steps:
@@ -98,7 +98,7 @@ class Rows:
         return min(after, before + max(0, calls - resets))
 
     def _of_rows(self, rows: int) -> int:
-        """Env steps in this many rows. Before a row is made, it is known which copies it only resets."""
+        """Env steps in this many rows. Even before a row is made, it is known which copies it only resets."""
         return sum(rows * each.lane.count - each.resets_in(rows) for each in self.of_lanes)
 
 
@@ -193,7 +193,7 @@ class RowsOfLane:
     def _show_playing(self, t: int) -> None:
         """Remove rewards and ends from row t for copies that were not stepped, because the row repeats their last step.
 
-        Nobody learns from these rows, so they also contain rewards that belong to no row of a seat.
+        Nothing is learned from these rows, so they also contain rewards that belong to no row of a seat.
         """
         playing = self.lane.playing
         if self.columns is not None:

@@ -1,7 +1,7 @@
 """Steps the env copies of lanes with a policy's actions, in rollouts and in evaluations.
 
 Rule: lanes that are run together are stepped in lock-step, with one forward pass for all of them [L, N · A, ·]. The result
-of a lane depends only on the lane and the weights, not on the other lanes. An evaluation differs in its lane
+of a lane depends only on the lane and the weights, not on the other lanes. An evaluation differs from a rollout in its lane
 (`Lane.autoresets`), in how its actions are chosen, and in how many rows are run at once.
 """
 
@@ -30,7 +30,7 @@ from millrace.workers.lanes.rows import Rows
 class TogetherSteps(Protocol):
     """Steps the copies of several lanes at once, because one vector environment holds them all.
 
-    `begin` orders them to step. `end` waits for them: then each lane's own step returns its part of the result.
+    `begin` orders them to step. `end` waits for them; after that, each lane's own step returns its part of the result.
     """
 
     def parts(self, lanes: int) -> Sequence[slice]:

@@ -87,7 +87,7 @@ class RunningEpisodes:
         This does the same as `add` and `ended` for each row, but is several times faster, because it sums the rewards of a
         copy's rows before it adds them to the return. `reward` [T, N] is 0 where a row only resets its copy. `resets`
         [T+1, N] says whether row t only resets the copy; its last row belongs to the next step. `step_end_s` [T] is when
-        each step ended. Episodes are not checked: if all these rewards are finite, a learner accepts the episodes.
+        each step ended. Episodes are not checked, because a learner accepts them if all these rewards are finite.
         """
         rewards = reward.T.tolist()  # [N][T]
         returns = self.returns[:, 0].tolist()

@@ -1,3 +1,1 @@
-"""The supervisor of the workers of one machine: it starts and watches them, and reports to the learner what
-they are doing.
-"""
+"""The supervisor of one machine's workers: it starts and watches them, and reports to the learner what they are doing."""

@@ -20,9 +20,9 @@ class Ending:
     had begun to run user code.
     """
     of_policy: bool = False
-    """Whether the worker failed in a call of the policy."""
+    """Whether the worker failed in a call to the policy."""
     hung: bool = False
-    """Whether the worker was ended because a call of the environment, or of the policy, took too long."""
+    """Whether the worker was ended because a call to the environment, or to the policy, took too long."""
     worked: bool = False
     """Whether any calls of the environment have returned."""
     last_lines: str | None = None

@@ -1,9 +1,9 @@
-"""Reports to the learner, over the supervisor's own connection, which workers are alive, what they do, and how others ended.
+"""Reports to the learner, over the supervisor's own connection, what running workers are doing, and how others ended.
 
-Rule: a report is sent about every second, and more often while a call of an environment takes long. It names an ended worker
-for a while, because a message may be lost. A worker that failed is named immediately; a worker that left on purpose is named
-a moment later, so that its own last messages arrive first. Nothing is sent before a worker has joined, because the worker
-itself reports a wrong address or key. This file imports neither numpy nor gymnasium.
+Rule: a report is sent about every second, and more often while a call to an environment is taking long. It names an ended
+worker for a while, because a message may be lost. A worker that failed is named immediately; a worker that left on purpose
+is named a moment later, so that its own last messages arrive first. Nothing is sent before a worker has joined, because the
+worker itself reports a wrong address or key. This file imports neither numpy nor gymnasium.
 
 If the workers share weights, the learner sends each version once, over this connection. It answers each report, so that both
 sides know what has arrived. Its answer also says to which learner the weights belong, as a Welcome does on a worker's
@@ -33,7 +33,7 @@ from millrace.workers.shared_weights import SharedWeights
 log = logging.getLogger("millrace.worker")
 
 EVERY_S = 1.0  # interval between two reports
-EVERY_S_WHILE_SLOW = 0.4  # the interval while a call of an environment takes longer than `SLOW_S`
+EVERY_S_WHILE_SLOW = 0.4  # the interval while a call to an environment takes longer than `SLOW_S`
 SLOW_S = 0.3  # during a longer call, the worker can't send heartbeats, and the learner relies on these reports
 ENDED_AFTER_S = 0.2  # a worker that left on purpose is named this long after its end
 ENDED_FOR_S = 5.0  # for how long after its end a worker is named
@@ -94,9 +94,7 @@ class AliveSender:
             self._socket.close(linger=200)
 
     def _take(self, frames: Sequence[zmq.Frame]) -> bool:
-        """Handle a message of the learner. Returns whether it says that the run is over. An unreadable message
-        is ignored.
-        """
+        """Handle a message from the learner; ignore an unreadable one. Returns whether it says that the run is over."""
         with suppress(*INVALID):
             match msgspec.msgpack.decode(frames[0].bytes):
                 case ["Drain", *_]:

@@ -1,4 +1,4 @@
-"""Keeps the log of a worker short while the worker, and processes that its environment starts, append to it.
+"""Keeps a worker's log short while the worker, and processes that its environment starts, append to it.
 
 Rule: if a log grows beyond `MOST` bytes, whole lines at its beginning and its end are kept, and a line says that the text
 between them was removed. This doesn't disturb programs that append, because the file stays the same one.

@@ -1,16 +1,16 @@
 """Starts, watches, restarts and stops the workers of this machine.
 
-The supervisor doesn't follow their conversation with the learner; it is only told when the run is over.
+The supervisor doesn't follow the workers' conversation with the learner; it is only told when the run is over.
 
 Rule: a worker that left on purpose with exit code 0, was refused (2), found no learner (EXIT_NO_LEARNER) or cannot take part
 in this run (EXIT_UNSUITABLE) is not started again. Any other worker is restarted with backoff: the pause doubles with each
-death, and is reset once calls of the environment have returned, or the worker has run for `HEALTHY_S` seconds. So a
-simulator that works and then dies is restarted quickly; the learner counts its failures. A worker counts as having left on
+death, and is reset once calls to the environment have returned, or the worker has run for `HEALTHY_S` seconds. A simulator
+that works and then dies is therefore restarted quickly; the learner counts its failures. A worker counts as having left on
 purpose only if it has announced this; if an environment makes the process exit, that is a failure, whatever the exit code.
 No worker outlives its supervisor.
 
-A worker that has never joined a run, and has ended early `MOST_FAILED_STARTS` times in a row, is not started again: its
-problem, such as a broken installation, won't go away by itself.
+A worker that has never joined a run, and has ended early `MOST_FAILED_STARTS` times in a row, is not started again, because
+its problem, such as a broken installation, won't go away by itself.
 
 With `stay`, only a refusal is final: each worker that has left a run is replaced by a new one, which waits for the next run.
 
@@ -71,7 +71,7 @@ class Running(Protocol):
         ...
 
     def activity(self, now: float) -> WorkerActivity | None:
-        """What the worker is doing. None if it has ended, or if its process is stopped."""
+        """What the worker is doing. None if it has ended, or if its process is paused."""
         ...
 
     def last_line(self) -> str:
@@ -79,7 +79,7 @@ class Running(Protocol):
         ...
 
     def end_if_hung(self, now: float) -> None:
-        """End the worker if a call of user code takes longer than its run allows."""
+        """End the worker if a call to user code takes longer than its run allows."""
         ...
 
     def lower_priority(self) -> None:
@@ -94,7 +94,7 @@ class Running(Protocol):
         ...
 
     def wait(self, timeout_s: float) -> None:
-        """Wait until the worker has ended, at most `timeout_s` seconds. A process that still runs after that is killed."""
+        """Wait for at most `timeout_s` seconds until the worker has ended. A process still running after that is killed."""
         ...
 
     def kill(self) -> None:
@@ -125,7 +125,7 @@ class _NamedWorker:
     restart_s: float | None = None
     exit_code: int = 0  # exit code of the last process that ended
     has_joined: bool = False  # whether a process with this name has joined a run
-    failed_starts: int = 0  # number of failed starts in a row
+    failed_starts: int = 0  # number of consecutive failed starts
 
 
 class Supervisor:
@@ -217,7 +217,7 @@ class Supervisor:
         worker.backoff_s = min(2 * worker.backoff_s, BACKOFF_MOST_S)
 
     def activities(self) -> list[WorkerActivity]:
-        """What each running worker is doing. Processes that are stopped are left out."""
+        """What each running worker is doing. Paused processes are left out."""
         now = self._clock()
         activities = (worker.running.activity(now) for worker in self._workers if worker.running is not None)
         return [activity for activity in activities if activity is not None]
@@ -276,7 +276,7 @@ class Supervisor:
         return bool(running)
 
     def stop(self, timeout_s: float = STOP_WITHIN_S) -> None:
-        """Ask all workers to leave, wait for them at most `timeout_s` seconds in all, and kill those that still run."""
+        """Ask all workers to leave, wait at most `timeout_s` seconds for all of them, and kill those still running."""
         self.ask_to_leave()
         deadline_s = self._clock() + timeout_s
         for worker in self._workers:

@@ -2,7 +2,7 @@
 
 Rule: the worker has its own session. When the worker has ended, every process that its environment started in that session
 is killed. The slots of its env copies become free only when all of these processes are gone, because the supervisor holds
-the slots too. If a call of user code takes longer than its run allows, the worker writes its stacks and is killed. A worker
+the slots too. If a call to user code takes longer than its run allows, the worker writes its stacks and is killed. A worker
 that leaves on purpose announces it; any other end is a failure, whatever the exit code.
 """
 
@@ -81,9 +81,10 @@ class WorkerProcess:
         command = [sys.executable, "-P", "-m", "millrace.workers", start.address, "--name", start.name]
         command += ["--parent", str(os.getpid()), "--activity", str(self._page.fd)]
         command += ["--slots", str(self._slots), *start.flags]
-        # The child must find the modules that its parent found: a user's environment may be in the folder of their script.
+        # The child must find the modules that its parent found, because a user's environment may be in their script's
+        # folder.
         path = os.pathsep.join(entry or os.getcwd() for entry in [*sys.path, str(Path(__file__).parents[3])])
-        # Remove the variable: a token in it is for another learner. A token for this learner is `start.token`.
+        # Remove the variable, because a token in it is for another learner. A token for this learner is `start.token`.
         environment = {name: value for name, value in os.environ.items() if name != TOKEN_VARIABLE}
         environment |= SINGLE_THREADED | {NONCE_VARIABLE: str(self.process_nonce), "PYTHONPATH": path}
         try:
@@ -134,8 +135,8 @@ class WorkerProcess:
     def activity(self, now: float) -> WorkerActivity | None:
         """What the worker is doing.
 
-        None if it has ended, or if its process is stopped, so that the learner considers the worker silent. While processes
-        that an ended worker started still run, the worker's last activity is reported: if the learner considered the worker
+        None if it has ended, or if its process is paused; the learner then considers the worker silent. While processes that
+        an ended worker started still run, the worker's last activity is reported: if the learner considered the worker
         silent during that time, it would not count the failure.
         """
         if self.ended() is not None or _is_stopped(self.pid):
@@ -148,7 +149,7 @@ class WorkerProcess:
         return one_line("".join(self._output().strip().splitlines()[-1:]))
 
     def end_if_hung(self, now: float) -> None:
-        """End the worker if a call of user code takes longer than its run allows, or if it has announced its exit but
+        """End the worker if a call to user code takes longer than its run allows, or if it has announced its exit but
         doesn't end.
         """
         if not self._runs():
@@ -172,7 +173,7 @@ class WorkerProcess:
         """Give the worker's main thread, which steps the environments, the lowest CPU priority.
 
         With Linux's autogroup, the niceness of a process matters only within its session, and a worker has its own session.
-        So the session gets the lowest priority too.
+        The session therefore gets the lowest priority too.
         """
         if self._runs():
             os.setpriority(os.PRIO_PROCESS, self.pid, LOWEST_PRIORITY)
@@ -185,7 +186,7 @@ class WorkerProcess:
             self._process.terminate()
 
     def wait(self, timeout_s: float) -> None:
-        """Wait until the worker has ended, at most `timeout_s` seconds; kill it if it still runs after that.
+        """Wait for at most `timeout_s` seconds until the worker has ended; kill it if it is still running after that.
 
         A process that survives even SIGKILL, because it waits for a device or a network file system, is left behind.
         """
@@ -335,5 +336,5 @@ def _opened(log: Path | None) -> BinaryIO:
 
 
 def _is_stopped(pid: int) -> bool:
-    """Whether a signal or a debugger has stopped the process. False on a system without /proc."""
+    """Whether a signal or a debugger has paused the process. False on a system without /proc."""
     return process_stat(pid)[:1] in (["T"], ["t"])

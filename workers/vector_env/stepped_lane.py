@@ -55,12 +55,12 @@ class SteppedLane:
         first = spec.first_copy(lane)
         self.count = spec.lanes[lane]
         makes = [EnvMaker(spec.envs[of], spec.render_mode) for of in spec.copies[first : first + self.count]]
-        # Copies of a later incarnation replace lost ones, whose episodes count as ended. So a step resets the new copies,
+        # Copies of a later incarnation replace lost ones, whose episodes count as ended, so a step resets the new copies,
         # unless `reset` has done so before.
         which = _first_copy(spec, lane)
         check = partial(_checked, spec)
         self._loop = EnvLoop(makes, pulse, spec.autoreset, ended=incarnation > 0, first=which, dress=check)
-        with activity().during(MAKING):  # reading an attribute may run code of the environment
+        with activity().during(MAKING):  # reading an attribute may run environment code
             observation = self._loop.envs[0].observation_space
             action = self._loop.envs[0].action_space
         self._nested_actions = _is_nested(action)

@@ -1,4 +1,4 @@
-"""Advice for ALE's ids of Atari games, which have no preprocessing: millrace's environment has the usual wrappers. Pure."""
+"""Advice for ALE's ids of Atari games, which lack preprocessing; millrace's environment has the usual wrappers. Pure."""
 
 from __future__ import annotations
 

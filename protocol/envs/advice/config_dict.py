@@ -1,6 +1,6 @@
 """Advice for environments whose constructor takes one dict, the way RLlib passes it. Pure.
 
-Rule: this only inspects the exception that such a constructor raised when it was called without the dict.
+Rule: this module inspects only the exception that such a constructor raised when it was called without the dict.
 """
 
 from __future__ import annotations

@@ -62,7 +62,7 @@ def _class_of(spec: object) -> object:
 
 
 def _about_seed(of: object, version: str) -> str:
-    """What to do if shimmy can't seed an environment, given it or its class, as the end of a line; empty if shimmy can."""
+    """What to do if shimmy can't seed `of`, an environment or its class, as the end of a line; empty if shimmy can."""
     if version != "V21" or attribute(of, "seed") is not None:
         return ""
     return "; it also needs a method seed(seed), as under 'Old gym environments' in docs/how-to/third_party_environments.md"
