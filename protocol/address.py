@@ -62,7 +62,7 @@ def is_local(address: str) -> bool:
 
 
 def needs_ipv6(address: str) -> bool:
-    """True for an IPv6 address, and for a name with only IPv6 addresses: with IPv6 on, ZeroMQ tries no IPv4 address."""
+    """True for an IPv6 address, and for a name with only IPv6 addresses. With IPv6 on, ZeroMQ tries no IPv4 address."""
     host = host_of(address)
     if host.startswith("["):
         return True

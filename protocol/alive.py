@@ -1,4 +1,4 @@
-"""A supervisor's reports about its workers. This file imports neither numpy nor gymnasium: a supervisor needs neither."""
+"""A supervisor's reports about its workers. Imports neither numpy nor gymnasium, because a supervisor needs neither."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Bounds of the texts, numbers and lists in a message, as types for its fields. `millrace.protocol.wire.message_sizes`
+"""Bounds on the texts, numbers and lists in a message, as types for its fields. `millrace.protocol.wire.message_sizes`
 bounds the size of the message itself. Pure.
 
 Rule: every text, number and list in a message has a bound, and decoding refuses what exceeds it, so a peer can't fill the
@@ -27,7 +27,7 @@ MAX_TICKETS = 1 << 16  # tickets in one message
 MAX_WORKERS = 1_024  # workers that one supervisor speaks for
 MAX_COPIES = 1 << 16  # env copies in one lane
 MAX_SAVED_BYTES = 1 << 22  # bytes of one env copy's state, as its environment saved it
-MAX_SEEDS = 1_024  # seeds in one order to evaluate
+MAX_SEEDS = 1_024  # seeds in one Evaluate order
 MAX_FACTS = 32  # facts about one episode
 MOST_FRAMES = 1_500  # frames of one episode that are sent: a minute of video at 25 frames per second
 
@@ -36,7 +36,7 @@ _NO_CONTROL = r"^[^\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]*\Z"
 Name = Annotated[str, Meta(max_length=MAX_NAME, pattern=_NO_CONTROL)]
 Line = Annotated[str, Meta(max_length=MAX_LINE, pattern=_NO_CONTROL)]
 Text = Annotated[str, Meta(max_length=MAX_TEXT)]
-"""Several lines, such as a traceback. It may contain control characters: `escaped` makes it safe to show."""
+"""Several lines, such as a traceback. It may contain control characters; `escaped` makes it safe to show."""
 Natural = Annotated[int, Meta(ge=0, le=LARGEST)]
 Count = Annotated[int, Meta(ge=1, le=LARGEST)]
 Whole = Annotated[int, Meta(ge=-LARGEST, le=LARGEST)]
@@ -84,7 +84,7 @@ def indented(text: str) -> str:
 
 
 def last_text(text: str) -> str:
-    """The text, with its beginning cut off if it is too long for a `Text`: a traceback names the exception at its end."""
+    """The text, with its beginning cut off if it is too long for a `Text`, because a traceback ends with the exception."""
     return escaped(text)[-MAX_TEXT:]
 
 

@@ -1,6 +1,6 @@
 """A run's environment as plain data, how to make it, and how much code a learner may make a worker run.
 
-Only this file may unpickle, and only in `PickledCallable.load`: a callable that the *learner* sent to a worker which allows
+Only this file may unpickle, and only in `PickledCallable.load`: a callable that the *learner* sent to a worker that allows
 `AllowedCode.CALLABLES`. Nothing that a worker sends is ever unpickled.
 
 Rule: things that other processes can find by name are sent by name. Things that only this process has (a function, class or

@@ -48,7 +48,7 @@ def first_line(error: BaseException, otherwise: str = "no message") -> str:
 
 
 def safe_repr(value: object) -> str:
-    """The `repr` of a value, or another text if that raises: an error may quote a user-defined object."""
+    """The `repr` of a value, or another text if that raises, because an error may quote a user-defined object."""
     try:
         return repr(value)
     except Exception as error:

@@ -103,7 +103,7 @@ class LanePast(msgspec.Struct, frozen=True, array_like=True):
     action: Array
     """[K, N · A, *action], as in rollouts: the actions of the K rows since the earliest episode in `copies` began"""
     attributes: AttributeChanges
-    """no attributes were set before the first of its rows"""
+    """no attributes were set before the first row that it lists"""
     obs: tuple[Array, ...]
     """the observations after the last row: one array [N · A, *leaf] for each leaf, then the mask if there are masks"""
     memory: tuple[Array, ...]

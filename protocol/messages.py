@@ -1,6 +1,6 @@
 """The messages, as small frozen records. `README.md` says who may send which message, and when.
 
-A session lasts from a worker's `Welcome` until the worker leaves, or the learner gives up on it. A message of another
+A session lasts from a worker's `Welcome` until the worker leaves, or the learner gives up on it. A message from another
 session is counted, but not used. Every field has a bound (`protocol/bounds.py`), which decoding checks.
 """
 
@@ -39,7 +39,9 @@ from millrace.protocol.specs import RunSpec, StepSpec, WaitSpec
 
 PROTOCOL_VERSION = 14
 TOLD_TO_STOP = "told to stop"
-"""The reason in the Goodbye of a worker that got a signal. Any other reason declines what the worker was asked to do."""
+"""The reason in the Goodbye of a worker that got a signal. Any other reason says why the worker declines what it was asked
+to do.
+"""
 
 
 class Hello(Message, frozen=True, array_like=False):  # a map in every version, so that any two versions can decode it
@@ -122,7 +124,7 @@ class Permit(msgspec.Struct, frozen=True, array_like=True):
     lane: Natural
     incarnation: Natural
     sequence: Natural
-    """number of the rollout: rollouts are collected in this order, from 0 in every incarnation"""
+    """number of the rollout; rollouts are collected in this order, starting from 0 in every incarnation"""
     round: Natural
     """which update the rollout is for, counted since the run began; it determines the random numbers of the actions"""
     opponent: Whole | None = None
@@ -192,18 +194,19 @@ class Heartbeat(Message, frozen=True):
 
     session: Natural
     replies: Natural
-    """number of the last HeartbeatReply received; what the learner sent before that has arrived or is lost
-    (rule HEARTBEAT_REPLIES)"""
+    """number of the last HeartbeatReply received; everything that the learner sent before it has arrived or is lost
+    (rule HEARTBEAT_REPLIES)
+    """
     versions: Versions
-    """the versions of the weights held, ascending (rule HEARTBEAT_VERSIONS)"""
+    """of the weights held, ascending (rule HEARTBEAT_VERSIONS)"""
     tickets: Tickets
-    """tickets that the worker holds and has not finished: those that are waiting, and those of the work in progress (rule
-    HEARTBEAT_TICKETS)
+    """tickets that the worker holds and has not finished: those that are waiting, and those of the work in progress
+    (rule HEARTBEAT_TICKETS)
     """
     steps: Natural
     """env steps since the worker started, in all sessions, including those of evaluations, and preferably counted as they
-    are made. With `StepSpec`, each copy that a Step steps counts as one; a copy that a Step only resets may count too (rule
-    HEARTBEAT_STEPS)
+    are made. With `StepSpec`, each copy that a Step steps counts as one; a copy that a Step only resets may count too
+    (rule HEARTBEAT_STEPS)
     """
     stages: Stages
     """seconds spent in each stage since the worker started"""
@@ -275,8 +278,7 @@ class Described(Message, frozen=True):
 
 
 class Evaluate(Message, frozen=True):
-    """Play one episode for each seed, on env copies outside all lanes, under weights of this version. Answered by
-    `Evaluated`.
+    """Play one episode per seed, on env copies outside all lanes, under weights of this version. Answered by `Evaluated`.
 
     (rule EVALUATE)
     """
@@ -385,8 +387,8 @@ class Call(Message, frozen=True):
     copies: tuple[Natural, ...]
     """which of the lane's copies, from 0"""
     name: Line
-    """name of the attribute, which any of the wrappers may have; an attribute that is not callable is read. With
-    `<description>`, the result for each copy is a list of the frames of a `Described`
+    """name of the attribute, which the environment or any of its wrappers may have; an attribute that is not callable is
+    read. With `<description>`, the result for each copy is a list of the frames of a `Described`
     """
     assign: bool
     """true: set the attribute"""

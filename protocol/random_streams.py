@@ -16,7 +16,7 @@ import numpy as np
 class Purpose(IntEnum):
     """The purpose of a stream. The text below each purpose says what is drawn from it and, after a semicolon, its indices.
 
-    The numbers determine the bits of every run: a new purpose gets a new number.
+    The numbers determine the bits of every run, so a new purpose gets a new number.
     """
 
     WEIGHTS = 1

@@ -186,8 +186,8 @@ def _by_column(flags: bool | Bools, columns: int) -> Bools:
 def stack_rollouts(rollouts: Sequence[Rollout], fresh: Sequence[bool | Bools] | None = None) -> Batch:
     """Copy rollouts into one writable batch [T, ΣN], in lane order; rollouts of one lane stay in the given order.
 
-    `fresh` says for each rollout whether it doesn't continue an earlier one: as one flag, or as flags [copies] for each env
-    copy. If it is None, only the first rollout of a lane is fresh.
+    `fresh` says which rollouts don't continue an earlier one. It has an entry for each rollout: one flag, or flags [copies],
+    one for each env copy. If it is None, only the first rollout of a lane is fresh.
     """
     if fresh is None:
         fresh = [rollout.sequence == 0 for rollout in rollouts]

@@ -49,7 +49,7 @@ class Leaf(msgspec.Struct, frozen=True):
     def is_image(self) -> bool:
         """Whether this is an image, which goes through convolutions: a three-dimensional array of bytes (uint8).
 
-        If one of its sides is smaller than the convolutions need, it is not an image: it is flattened like any other array.
+        If one of its sides is smaller than the convolutions need, it is not an image, and is flattened like any other array.
         """
         if self.kind != "box" or self.dtype != "uint8" or len(self.shape) != 3:
             return False
@@ -123,7 +123,7 @@ class ActionSpec(msgspec.Struct, frozen=True):
 
     @property
     def unbounded(self) -> tuple[float, float] | None:
-        """The first bounds (box) of which one is so large that it means "no bound"; None if there are no such bounds."""
+        """The first pair of bounds (box) with one so large that it means "no bound"; None if there is no such pair."""
         if self.kind != "box":
             return None
         largest = min(float(np.finfo(kind).max) for kind in (self.dtype, "float32"))

@@ -112,8 +112,7 @@ class Slots:
 
 
 _of_processes: dict[int, Slots] = {}
-"""The keys are process ids: a fork needs its own `Slots`, because it shares the open file of its parent, and
-with it the locks.
+"""The keys are process ids, because a fork needs its own `Slots`: it shares its parent's open file, and with it the locks.
 """
 
 

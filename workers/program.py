@@ -119,8 +119,8 @@ def _remove_socket_of_killed_parent(address: str) -> None:
     """Remove the learner's socket and the folder that the learner made for it, because a killed learner could not.
 
     If the parent was the supervisor of a `millrace worker`, the learner is alive, and the next worker needs the socket. The
-    socket is therefore removed only once nothing listens on it. That may take a moment: Linux reparents the children of a
-    killed process before the last thread of that process has freed its memory and closed its sockets.
+    socket is therefore removed only once nothing listens on it. That may take a moment, because Linux reparents the children
+    of a killed process before the last thread of that process has freed its memory and closed its sockets.
     """
     scheme, _, path = address.partition("://")
     if scheme == "ipc" and Path(path).parent.name.startswith("millrace-"):

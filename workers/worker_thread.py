@@ -77,10 +77,10 @@ class WorkerThread:
         return ""
 
     def end_if_hung(self, now: float) -> None:
-        """Do nothing: a thread cannot be ended from outside."""
+        """Do nothing, because a thread cannot be ended from outside."""
 
     def lower_priority(self) -> None:
-        """Do nothing: a thread keeps its priority."""
+        """Do nothing, because a thread keeps its priority."""
 
     def stop(self) -> None:
         """Ask the worker to leave after the rollout in progress."""

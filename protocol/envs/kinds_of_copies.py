@@ -38,8 +38,8 @@ class CopiesKind(NamedTuple):
     `UsageError` if the environment doesn't support such copies.
     """
     spaces: Callable[[EnvSpec], tuple[gymnasium.Space[Any], gymnasium.Space[Any]]] | None = None
-    """Returns the observation and action space of one copy; a worker refuses the run if the spaces of the environment itself
-    differ from them. None means that the copies have the environment's own spaces. Raises `UsageError`, like `open`.
+    """Returns the observation and action space of one copy; a worker refuses the run if the environment's own spaces differ
+    from them. None means that the copies have the environment's own spaces. Raises `UsageError`, like `open`.
     """
     has_masks: bool = True
     """Whether these copies report masks of the allowed actions if the environment does."""

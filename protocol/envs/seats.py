@@ -126,7 +126,8 @@ class SeatedEnv(gymnasium.Env[SeatStep, Sequence[Any]]):
         return named
 
     def _state_before(self, seen: Any, terminated: bool) -> Any:
-        """The environment's state in a seat's last observation if the seat is terminated; None if it has to be asked for.
+        """The environment's state in a seat's last observation if the seat is terminated; None if the environment has to be
+        asked for it.
 
         Nothing is learned from the state after the end, and some environments have none, because they have removed the
         agent's parts.
@@ -164,7 +165,7 @@ class SeatedEnv(gymnasium.Env[SeatStep, Sequence[Any]]):
                 raise WrongAnswer(f"{what}: expected some of possible_agents, got {unknown[0]}")
 
     def pending(self) -> list[float]:
-        """[A] rewards that seats have earned while they wait for the move, and that no step has returned yet."""
+        """[A] rewards that seats have earned while waiting for the move, and that no step has returned yet."""
         return [0.0] * len(self.seats)
 
     @abstractmethod

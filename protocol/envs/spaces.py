@@ -21,7 +21,7 @@ from millrace.protocol.specs import ActionSpec, Leaf
 
 OBSERVATIONS = "Box, Discrete, MultiBinary, MultiDiscrete, and Dict and Tuple of these"
 ACTIONS = "Discrete, MultiDiscrete, MultiBinary and Box (of floats), and Dict and Tuple of these"
-MOST_CHOICES = 2**24  # choices of one part of a mixed action: a float32 can't represent larger whole numbers exactly
+MOST_CHOICES = 2**24  # choices of one part of a mixed action; a float32 can't represent larger whole numbers exactly
 STORED_KINDS = "biuf"  # bool, integers, floats: the dtypes that a message can carry
 
 

@@ -134,7 +134,7 @@ class AuthenticatorThread(threading.Thread):
                 self._zap.close()
 
     def close(self) -> None:
-        """Stop the thread. Disable the socket's monitor first: libzmq blocks while nobody reads its events."""
+        """Stop the thread. Disable the socket's monitor first, because libzmq blocks while nobody reads its events."""
         with suppress(zmq.ZMQError):  # it is closed already, or the thread has ended
             self._end_sender.send(b"", zmq.NOBLOCK)
         self.join(5.0)

@@ -146,7 +146,7 @@ class KeyFolder:
 
     @contextmanager
     def _locked(self) -> Iterator[None]:
-        """Hold the folder's lock, so that two commands that run at the same time don't overwrite each other's entries."""
+        """Hold the folder's lock, so that two commands running at the same time don't overwrite each other's entries."""
         folder = os.open(self.path, os.O_RDONLY)
         try:
             fcntl.flock(folder, fcntl.LOCK_EX)

@@ -169,7 +169,7 @@ class ClientList:
 
     @staticmethod
     def from_toml(text: str, where: str) -> ClientList:
-        """Parse a list. Raises a `UsageError` that names `where` if any part is invalid: then nobody may connect."""
+        """Parse a list. If any part is invalid, raises a `UsageError` that names `where`; then nobody may connect."""
         try:
             table: dict[str, Any] = tomllib.loads(text)
             clients = msgspec.convert(table.pop("client", []), tuple[Client, ...])

@@ -1,4 +1,4 @@
-"""Leaves of autograd's graph in the memory of flat tensors, so that one operation changes all parameters of a network."""
+"""Leaves of autograd's graph that share the memory of flat tensors, so one operation changes a network's parameters."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """How DQN, SAC and TD3 explore: ε-greedy actions, a squashed normal distribution, normal noise. Pure: noise is an argument.
 
-As in `distributions.py`, a distribution has parameters `params` [..., P]. Here the last parameters aren't outputs of the
-network: the learner sends them with the weights, and they are the same for every observation. The learner therefore controls
+As in `distributions.py`, a distribution has parameters `params` [..., P]. Here, the last parameters aren't outputs of the
+network. The learner sends them with the weights, and they are the same for every observation. The learner therefore controls
 how much workers explore, and workers need no schedule.
 
     EpsilonGreedy       P = n + 1     action values, ε
@@ -180,7 +180,7 @@ class NoisyDeterministic(_Bounded):
         return self._uniform_in_warm_up(warm_up, uniform, np.clip(np.tanh(output) + scale * normal, -1, 1))
 
     def log_prob(self, params: Floats, action: Array, noise: Floats | None = None) -> Floats:
-        """Zeros [...]: clipped noise has no density."""
+        """Zeros [...], because clipped noise has no density."""
         return np.zeros(params.shape[:-1], np.float32)
 
 

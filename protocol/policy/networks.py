@@ -57,7 +57,7 @@ def defaults_of_thread() -> Iterator[None]:
 
 
 def refuse_second_derivatives() -> None:
-    """Raise `RuntimeError` in a backward pass with `create_graph`: its result would lack the terms of hidden layers."""
+    """Raise `RuntimeError` in a backward pass with `create_graph`, whose result would lack the terms of hidden layers."""
     if torch.is_grad_enabled():
         raise RuntimeError("millrace's networks have no second derivatives; call backward without create_graph")
 

@@ -196,7 +196,7 @@ def _dtype(name: object) -> np.dtype[Any]:
 
 
 def _check_characters(raw: bytes, kind: np.dtype[Any]) -> None:
-    """Raise `BadMessage` for text with invalid characters: numpy accepts any four bytes, and fails when the text is used."""
+    """Raise `BadMessage` for invalid characters, because numpy accepts any four bytes, and fails when the text is used."""
     if kind.kind == "U" and raw and (last := int(np.frombuffer(raw, f"{kind.str[0]}u4").max())) > sys.maxunicode:
         raise BadMessage(f"text of {kind.str}: expected characters up to {sys.maxunicode}, got {last}")
 

@@ -2,7 +2,7 @@
 
 Rule: each counter of a lane has one writer. The learner writes the actions and then increments `ordered`; the worker writes
 the results of the step and then sets `answered` to the same number. The other side reads them only after its counter has
-changed. The memory is an unlinked file and the wake-up pipes have no names: child processes inherit the descriptors, so
+changed. The memory is an unlinked file and the wake-up pipes have no names; child processes inherit the descriptors, so
 nothing is left behind when a process dies. This works only on Linux; elsewhere, everything is sent as messages.
 """
 

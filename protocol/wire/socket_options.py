@@ -1,9 +1,9 @@
 """Options of the sockets of both sides, and the routing id of a worker. Imports no numpy.
 
 Each option was found by experiment. MAXMSGSIZE bounds the size of a frame before any of it is read. TCP_MAXRT and keepalive
-close a connection whose other end has vanished; the worker makes a new one within seconds. ZMTP heartbeats are off: while a
-reader is stopped by its high-water mark, they lose and reorder messages. Our own heartbeats detect silence, and tickets keep
-queues short.
+close a connection whose other end has vanished; the worker makes a new one within seconds. ZMTP heartbeats are off, because
+they lose and reorder messages while a reader is stopped by its high-water mark. Our own heartbeats detect silence, and
+tickets keep queues short.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from millrace.protocol.keys.keys import Token
 from millrace.protocol.wire.message_sizes import MAX_FRAME_BYTES
 
 LINGER_MS = 2000
-UNACKNOWLEDGED_MS = 5000  # short, because TCP doubles its retry interval: recovery may take as long as the outage
+UNACKNOWLEDGED_MS = 5000  # short, because TCP doubles its retry interval, so recovery may take as long as the outage
 QUEUE = 1000  # messages that may wait for a peer that does not read
 RECONNECT_MS = 100
 RECONNECT_MOST_MS = 2000

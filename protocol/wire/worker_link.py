@@ -166,8 +166,8 @@ class WorkerLink:
     def close(self, linger_s: float = LINGER_MS / 1000) -> None:
         """Send queued messages, for at most `linger_s` seconds, and close the socket.
 
-        Call this before the process ends: if its context were still sending, the process would abort, because Python frees
-        the frames that libzmq sends.
+        Call this before the process ends. If its context were still sending at that time, the process would abort, because
+        Python frees the frames that libzmq sends.
         """
         if self._monitor is not None and not self._socket.closed:
             self._socket.disable_monitor()  # before the monitor's reader is closed: libzmq blocks without a reader

@@ -75,7 +75,7 @@ class StepResult(NamedTuple):
     terminated: Any
     truncated: Any
     lost: Array | None = None
-    """[N] bool, True for copies that were lost with their worker: they did not make this step, and the next step begins
+    """[N] bool, True for copies that were lost with their worker. They did not make this step, and the next step begins
     episodes on new copies in their place
     """
     facts: Facts = {}

@@ -35,7 +35,7 @@ class OpenLanes(dict[int, L]):
 
     @contextmanager
     def in_use(self) -> Iterator[None]:
-        """A context in which environment code runs. Lanes that are closed within it stay open until its end."""
+        """A context in which environment code runs. Lanes that are to be closed within it stay open until its end."""
         self._in_use = True
         try:
             yield

@@ -29,7 +29,7 @@ class ResetAhead(gymnasium.Wrapper[Any, Any, Any, Any]):
     reset overlaps with steps if either of them waits or releases Python's global interpreter lock, as most simulators do.
 
     Both instances are made with the same arguments. If the constructor needs a port or a folder, let it call
-    `millrace.env_copy()`: the second instance has its own slot.
+    `millrace.env_copy()`, because the second instance has its own slot.
 
     Attributes that a run sets on its environment are set on both instances, but by then the next episode's reset may already
     be done.

@@ -44,8 +44,8 @@ class RunningEpisodes:
         self.lengths = np.zeros(copies, np.int64)
         """[N] number of steps so far"""
         self.began_s = [0.0] * copies
-        """[N] when each running episode began, in seconds of `perf_counter`: at the end of the copy's last episode, or when
-        its first reset began
+        """[N] when each running episode began, in seconds of `perf_counter`: at the end of the copy's previous episode, or
+        when its first reset began
         """
         self.most_steps = most_steps
         self._run = run

@@ -24,6 +24,6 @@ class Ending:
     hung: bool = False
     """Whether the worker was ended because a call to the environment, or to the policy, took too long."""
     worked: bool = False
-    """Whether any calls of the environment have returned."""
+    """Whether any calls to the environment have returned."""
     last_lines: str | None = None
     """The last lines of the worker's output, if it failed before it had joined a run; else None."""

@@ -31,7 +31,7 @@ def live_members(leader: int) -> list[int]:
 
 
 class SessionUse(NamedTuple):
-    """What a process group or session uses of this machine at one moment."""
+    """The resources of this machine that a process group or session uses at one moment."""
 
     computes: bool = False
     """whether a thread runs, or is ready to run"""

@@ -12,7 +12,7 @@ No worker outlives its supervisor.
 A worker that has never joined a run, and has ended early `MOST_FAILED_STARTS` times in a row, is not started again, because
 its problem, such as a broken installation, won't go away by itself.
 
-With `stay`, only a refusal is final: each worker that has left a run is replaced by a new one, which waits for the next run.
+With `stay`, only a refusal is final. Each worker that has left a run is replaced by a new one, which waits for the next run.
 
 All time limits for leaving, including those of the learner, are in docs/explanation/faults.md, "How long a worker may take
 to leave".
@@ -45,7 +45,7 @@ POLL_S = 0.1
 ENFORCE_EVERY_S = 0.2
 STOP_WITHIN_S = 3.0  # how long local workers may take to end after SIGTERM at the end of a run, before they are killed
 FINISH_ROLLOUT_WITHIN_S = 30.0  # time to finish a rollout after a request to leave, while environment calls return
-HANGS_AFTER_S = 8.0  # once workers were asked to leave or the run is over, a longer call counts as hung
+HANGS_AFTER_S = 8.0  # after a request to leave or the end of the run, a longer call counts as hung
 
 
 class Running(Protocol):
@@ -223,7 +223,7 @@ class Supervisor:
         return [activity for activity in activities if activity is not None]
 
     def used(self) -> dict[str, SessionUse]:
-        """What each worker uses of this machine, together with the processes of its environment. Threads are left out."""
+        """The resources that each worker and its environment's processes use on this machine. Threads are left out."""
         sessions = {
             each.name: each.running.session
             for each in self._workers

@@ -136,8 +136,8 @@ class WorkerProcess:
         """What the worker is doing.
 
         None if it has ended, or if its process is paused; the learner then considers the worker silent. While processes that
-        an ended worker started still run, the worker's last activity is reported: if the learner considered the worker
-        silent during that time, it would not count the failure.
+        an ended worker started still run, the worker's last activity is reported, because a learner that considered the
+        worker silent during that time would not count the failure.
         """
         if self.ended() is not None or _is_stopped(self.pid):
             return None
