@@ -8,8 +8,8 @@ before its last reset, reset it, and replay the actions. A worker reports with e
 lane. If an environment can save its state, its episodes are not replayed, because the state after the last row is in
 `LanePast.memory`.
 
-Each copy counts its starts. A start's number determines its seed; the number rises when a copy is replaced by a new one
-because it failed or could not be continued.
+Each copy counts its starts. A start's number determines its seed; the number rises when a new copy replaces one that failed
+or could not be continued.
 """
 
 from __future__ import annotations

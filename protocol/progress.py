@@ -1,6 +1,6 @@
 """The progress of a run: one record that the learner sends, writes into the run folder, and shows. Pure.
 
-Rule: it is plain data of bounded size, so that it can be sent, and read from a folder that may come from a stranger.
+Rule: the record is plain data of bounded size, so that it can be sent, and read from a folder that may come from a stranger.
 Everything that shows the progress of a run renders this record, and counts nothing itself.
 """
 

@@ -8,13 +8,13 @@ not valid. Hence, for every copy:
 
 If both flags are set, terminated wins. All code that uses rows (returns, losses, counts, replay buffer) masks with `valid`.
 
-With several agents, a column is one seat of a copy (`millrace.protocol.envs.seats`), and more rows are not valid: those of a
-seat that waits for others, or isn't present. A valid row of a seat is the one in which the outcome of its action arrives.
-Until then, `obs` repeats the observation in which the seat acted, and `action` and `log_prob` repeat its action; the row
-after the valid one has the seat's next observation. So the sentence above holds for every valid row, and one rule is added:
-*a row that is not valid passes through*. Rows between two valid rows of a seat don't change what is carried from one to the
-other, such as a return or a recurrent state. Both are still cut where an episode has ended (terminated or truncated).
-`resets` says which steps only reset the copy:
+With several agents, a column is one seat of a copy (`millrace.protocol.envs.seats`), and further rows are not valid: those
+of a seat that is waiting for others, or isn't present. A valid row of a seat is the one in which the outcome of its action
+arrives. Until then, `obs` repeats the observation in which the seat acted, and `action` and `log_prob` repeat its action;
+the row after the valid one has the seat's next observation. The sentence above therefore holds for every valid row, and one
+rule is added: *a row that is not valid passes through*. Rows between two valid rows of a seat don't change what is carried
+from one to the other, such as a return or a recurrent state. Both are still cut where an episode has ended (terminated or
+truncated). `resets` says which steps only reset the copy:
 
     a row that is terminated or truncated is valid, and no later row of that seat is valid until its copy is reset
     a step that resets a copy has no valid row of that copy
@@ -158,8 +158,9 @@ class Batch(msgspec.Struct, frozen=True):
     lane: npt.NDArray[np.int64]
     """[ΣN] the lane of each column"""
     fresh: Bools
-    """[ΣN] True where the rows don't continue an earlier rollout of the lane: the lane, or its copy, has just been started,
-    or a rollout in between was not used"""
+    """[ΣN] True where the rows don't continue an earlier rollout of the lane, because the lane, or its copy, has just been
+    started, or a rollout in between was not used
+    """
     columns_per_rollout: int
     """number of columns of each rollout: N, or N · A with seats. The columns of a lane are adjacent, even if the batch has
     several of its rollouts
@@ -186,8 +187,8 @@ def _by_column(flags: bool | Bools, columns: int) -> Bools:
 def stack_rollouts(rollouts: Sequence[Rollout], fresh: Sequence[bool | Bools] | None = None) -> Batch:
     """Copy rollouts into one writable batch [T, ΣN], in lane order; rollouts of one lane stay in the given order.
 
-    `fresh` says which rollouts don't continue an earlier one. It has an entry for each rollout: one flag, or flags [copies],
-    one for each env copy. If it is None, only the first rollout of a lane is fresh.
+    `fresh` says which rollouts don't continue an earlier one. It has an entry for each rollout: a single flag, or an array
+    [copies] with a flag for each env copy. If it is None, only the first rollout of a lane is fresh.
     """
     if fresh is None:
         fresh = [rollout.sequence == 0 for rollout in rollouts]

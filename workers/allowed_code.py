@@ -1,7 +1,7 @@
 """Which code a worker runs for its learner. Pure.
 
 Rule: a worker runs pickled callables only for a learner that is authenticated by a token, or reached over ipc or inproc.
-Over TCP without a token, it imports modules for a learner on this machine. For a learner on another machine it runs only
+Over TCP without a token, it imports modules for a learner on this machine. For a learner on another machine, it runs only
 environments that are registered here.
 """
 

@@ -5,8 +5,9 @@ copy's constructor raises, it may already have started a process, so the slot be
 children have ended.
 
 Rule: a copy that was only described is reused as the next copy that its thread makes, if the new copy would be the same.
-Otherwise, it is closed before the new one is made. A worker also closes it if the worker has made no copy in the first
-`UNUSED_S` seconds of a run, because the run may not need this worker. Thus, no worker keeps an unneeded copy for long.
+Otherwise, the described copy is closed before the new one is made. A worker also closes it if the worker has made no copy in
+the first `UNUSED_S` seconds of a run, because the run may not need this worker. Thus, no worker keeps an unneeded copy for
+long.
 """
 
 from __future__ import annotations

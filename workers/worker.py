@@ -216,9 +216,9 @@ class Worker:
     def _connect_again_if_unheard(self) -> None:
         """Make a new connection if the learner has not answered for too long while this worker is joining.
 
-        A proxy or a tunnel may keep a connection open after its other end is gone. If there is no connection yet, a new one
-        drops the queued Hellos. Only time spent listening counts, because no messages are read while a simulator starts or
-        is closed.
+        A proxy or a tunnel may keep a connection open after its other end is gone. If there is no connection yet, making a
+        new one drops the queued Hellos. Only time spent listening counts, because no messages are read while a simulator
+        starts or is closed.
         """
         if self._session.state is not WorkerState.JOINING:
             self._unheard_from_s = self._waited_s

@@ -75,7 +75,7 @@ def make_action_converter(spec: ActionSpec) -> Callable[[Array], Array]:
     """Return a function that converts stored actions [..., *action] to actions for the environment.
 
     It shifts actions by `start`, or clips them if the space is a Box. It clips in the dtype of the space, in which the
-    bounds are exact: the float32 closest to a float64 bound may lie outside.
+    bounds are exact. The float32 closest to a float64 bound may lie outside it.
     """
     if spec.parts:
         return _make_structures(spec)

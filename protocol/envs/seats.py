@@ -4,7 +4,7 @@ A seat is an agent's place in an env copy, in the order of `possible_agents`. It
 has the move, leave before the others, or join later.
 
 Rule: a row of a seat spans the time from one of the seat's actions to its next observation: the one in which it has the move
-again, or its last one. `SeatStep.complete` marks the step that returns this observation. Until then the seat waits, and its
+again, or its last one. `SeatStep.complete` marks the step that returns this observation. Until then, the seat waits, and its
 entry repeats the observation in which it acted. Rewards belong to the row in which they occur; rewards outside of any row
 count only in the return. An agent whose part of the episode has ended is out until the reset, even if `agents` lists it.
 """

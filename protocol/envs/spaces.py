@@ -98,8 +98,8 @@ def _leaf(path: str, space: gymnasium.Space[Any]) -> Leaf:
 
 
 def _has_all_bytes(space: spaces.Box) -> bool:
-    """Whether the values are bytes with bounds 0 and 255: these are divided by 255 before a network gets them. With other
-    bounds, such as those of flags, a byte is an ordinary number.
+    """Whether the values are bytes with bounds 0 and 255. Such values are divided by 255 before a network gets them. With
+    other bounds, such as those of flags, a byte is an ordinary number.
     """
     return space.dtype == np.uint8 and bool((space.low == 0).all() and (space.high == 255).all())
 

@@ -1,6 +1,6 @@
 """`millrace:TupleOfAgents`, a wrapper for multi-agent gymnasium environments whose spaces are Tuples.
 
-Rule: element i of the observations, actions and rewards belongs to agent i. An episode ends for all agents at once: when
+Rule: element i of the observations, actions and rewards belongs to agent i. An episode ends for all agents at once, when
 each of them is terminated or truncated.
 """
 

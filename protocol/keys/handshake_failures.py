@@ -1,8 +1,8 @@
 """Explains failed handshakes, from the events of libzmq's monitor. Pure, except for `peer_host`.
 
 Rule: the learner finds out what was wrong with a client. libzmq tells a worker only whether its key was refused, which is
-the one problem that a retry cannot solve. Every other problem looks to the worker like a closed connection, so it logs the
-likely causes, and tries again.
+the one problem that a retry cannot solve. Every other problem looks to the worker like a closed connection, so the worker
+logs the likely causes, and tries again.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Makes PyTorch's threads sleep while they wait for one another. Import this module before PyTorch.
 
-By default they spin, and thus occupy the core that the slowest thread needs. If other processes are busy, a pass then takes
+By default, they spin, and thus occupy the core that the slowest thread needs. If other processes are busy, a pass then takes
 up to sixty times as long. OpenMP reads the environment variable only when it is loaded, together with PyTorch.
 """
 

@@ -5,12 +5,12 @@ The callable `factory(**kwargs)` returns an object with two methods. The second 
     load(arrays)             {name: float32 array} as declared; called for each version of the weights
     act(obs, state, rng)     -> action, state, extras
 
-Both may change the arrays that they get. `obs` is an array [N, *shape]; for a Dict or Tuple observation, it is a dict of
-such arrays, by path. `state` [N, S] float32 is zeros when an episode begins. `rng` is the numpy `Generator` of these copies.
-`action` [N, *action] is stored as it is returned: whole numbers that count from 0, or float32 before clipping. `extras` has
-one array [N, *shape] for each name that was declared. If there is a method `act_greedy(obs, state, rng)`, evaluations call
-it in place of `act`. In a run with action masks, both are called with `mask=` [N, choices] bool, which is True where a
-choice is allowed.
+Both methods may change the arrays that they get. `obs` is an array [N, *shape]; for a Dict or Tuple observation, it is a
+dict of such arrays, by path. `state` [N, S] float32 is zeros when an episode begins. `rng` is the numpy `Generator` of these
+copies. `action` [N, *action] is stored as it is returned: whole numbers that count from 0, or float32 before clipping.
+`extras` has one array [N, *shape] for each name that was declared. If there is a method `act_greedy(obs, state, rng)`,
+evaluations call it in place of `act`. In a run with action masks, `act` and `act_greedy` are called with `mask=`
+[N, choices] bool, which is True where a choice is allowed.
 
 Rule: `act` is called once for each lane and step, with exactly the copies of that lane. Therefore, if the policy keeps
 nothing but `state` between calls, a rollout is the same, bit for bit, whatever else the worker does.

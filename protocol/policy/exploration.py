@@ -153,8 +153,8 @@ class SquashedGaussian(_Bounded):
         """Log-density [...] of the action in [-1, 1]^D.
 
         This is the log-density of the normal distribution minus log(1 − tanh²), summed over dimensions; during the warm-up,
-        it is −D log 2. It is computed from the noise, because an action near ±1 doesn't determine the normal sample from
-        which it was computed. Raises `ValueError` if there is no noise.
+        it is −D log 2. It is computed from the noise, because an action near ±1 doesn't determine the normal sample that
+        produced it. Raises `ValueError` if there is no noise.
         """
         if noise is None:
             raise ValueError("log_prob of a squashed action: expected the noise that it was sampled with, got none")

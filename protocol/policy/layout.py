@@ -179,9 +179,9 @@ def named_views(flat: FlatT, fields: Sequence[Field]) -> dict[str, FlatT]:
 def buffer_layout(spec: PolicySpec) -> tuple[Field, ...]:
     """The fields of `Weights.buffers`: statistics of observations, if these are normalized, and parameters of exploration.
 
-    With Q-values, the only parameter of exploration is ε. With actions in [-1, 1], they are the scale of the noise (only if
-    actions are deterministic), and a number that is 1 during the warm-up, while actions are drawn uniformly, and 0
-    afterwards.
+    With Q-values, the only exploration parameter is ε. With actions in [-1, 1], the exploration parameters are the scale of
+    the noise (only if actions are deterministic), and a number that is 1 during the warm-up, while actions are drawn
+    uniformly, and 0 afterwards.
     """
     fields: list[Field] = []
     if spec.normalize_observations:

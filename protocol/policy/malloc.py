@@ -1,7 +1,8 @@
 """Keeps freed memory in the process, for networks that need the same megabytes in every pass.
 
 By default, glibc returns the end of its heap to the system after each pass. In the next pass, the system provides the memory
-again page by page, and fills each page with zeros. This takes a third of the time of a forward pass on a batch of 64 images.
+again page by page, and fills each page with zeros. This takes up a third of the time of a forward pass on a batch of 64
+images.
 """
 
 from __future__ import annotations

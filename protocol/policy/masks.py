@@ -1,7 +1,7 @@
 """Action masks say which choices of Discrete and MultiDiscrete actions, or of such parts of an action, are allowed. Pure.
 
 Rule: the logit, or the value, of a choice that is not allowed is replaced by FORBIDDEN. This is a finite number, so nothing
-becomes NaN. The probability exp(FORBIDDEN − max) of such a choice is exactly 0, so it adds nothing to an entropy, and its
+becomes NaN. The probability exp(FORBIDDEN − max) of such a choice is exactly 0, so it adds nothing to the entropy, and its
 gradient is exactly 0.
 
 A mask is [..., choices] bool: the choices of all entries of an action, one entry after another. The logits of the choices

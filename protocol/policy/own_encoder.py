@@ -6,9 +6,9 @@ arrays of an observation that are not images; `images` has the shapes of the ima
 [B, K] float32. The recurrent core, the hidden layers and the heads follow, just as without an encoder. Actor and critic
 share one encoder.
 
-The encoder's parameters are in the flat buffer with all others. It must have no other state, because buffers (such as the
-running mean of BatchNorm) are not sent with the weights. It must not use dropout, because the learner could not reproduce
-the worker's probabilities.
+The encoder's parameters are in the flat buffer with all others. The module must have no other state, because buffers (such
+as the running mean of BatchNorm) are not sent with the weights. It must not use dropout, because the learner could not
+reproduce the worker's probabilities.
 """
 
 from __future__ import annotations

@@ -1,9 +1,10 @@
 """Memory that a learner shares with worker processes of the same machine, for the steps of a vector environment.
 
 Rule: each counter of a lane has one writer. The learner writes the actions and then increments `ordered`; the worker writes
-the results of the step and then sets `answered` to the same number. The other side reads them only after its counter has
-changed. The memory is an unlinked file and the wake-up pipes have no names; child processes inherit the descriptors, so
-nothing is left behind when a process dies. This works only on Linux; elsewhere, everything is sent as messages.
+the results of the step and then sets `answered` to the same number. Each side reads what the other has written only after
+the other's counter has changed. The memory is an unlinked file and the wake-up pipes have no names; child processes inherit
+the descriptors, so nothing is left behind when a process dies. This works only on Linux; elsewhere, everything is sent as
+messages.
 """
 
 from __future__ import annotations
@@ -145,7 +146,7 @@ class SharedMemory:
         """The number of lanes with an unfinished order. A worker calls this after it has finished an order.
 
         If the last workers finish at the same moment, at least one of them gets 0, because taking the lock makes the
-        worker's own answer visible before it reads those of the others. This does not hold on every processor: see
+        worker's own answer visible before the worker reads those of the others. This does not hold on every processor: see
         `CAN_SPIN`.
         """
         with self._fence:

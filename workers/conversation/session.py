@@ -1,8 +1,8 @@
 """The worker's side of the conversation. Pure: messages and `now` in, effects out; no socket, clock, thread or environment.
 
 Rule: a rollout or an evaluation starts only when the worker has the weights that its ticket names. A lost message does no
-harm, because the next Heartbeat lists all tickets and versions that this worker holds, and the learner sends what is missing
-again. `held.py` stores what a worker holds. A worker that is welcomed before there is a run waits in its session: it
+harm, because the next Heartbeat lists all tickets and versions that this worker holds, and the learner resends what is
+missing. `held.py` stores what a worker holds. A worker that is welcomed before there is a run waits in its session: it
 describes environments on order, until a second Welcome contains the run. Each order lists the weights to keep; the worker
 drops all others, except those that unfinished tickets name.
 """

@@ -313,7 +313,7 @@ class LoopedCopies:
     def begun(self, over: Sequence[int]) -> dict[int, bytes | None]:
         """The random states from which episodes begin, by copy.
 
-        For each copy that a step has reset since `begun` was last called, it is the state from which the copy's newest
+        For each copy that a step has reset since `begun` was last called, this is the state from which the copy's newest
         episode began. For copies that are `over`, it is the state from which the next episode will begin. It is None if the
         copy has no readable generator.
         """

@@ -18,9 +18,9 @@ from millrace.protocol.errors import EnvironmentFailed, first_line
 class CopyFailed(Exception):
     """An env copy raised (the environment's own exception is the `__cause__`), or returned something invalid.
 
-    `copy` is its number within the lane, or None if a vector environment doesn't say which copy it was. `doing` is the call
-    that failed, such as "make", "reset" or a step. If the copy did not raise, `line` says what was expected and what it
-    returned.
+    `copy` is the copy's number within the lane, or None if a vector environment doesn't say which copy it was. `doing` is
+    the call that failed, such as "make", "reset" or a step. If the copy did not raise, `line` says what was expected and
+    what it returned.
     """
 
     def __init__(self, copy: int | None, doing: str = "reset", line: str = "") -> None:

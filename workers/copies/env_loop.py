@@ -5,8 +5,8 @@ resets that copy. SameStep: the step that ends an episode resets the copy, and r
 the new info, as `final_obs` and `final_info`. Disabled: the caller resets.
 
 Rule: a copy that is recreated after some episodes (`restart_episodes`) continues exactly as it would have otherwise. The new
-environment is reset with the seed with which the copy began. It then gets the old environment's random state, and its saved
-state if the environment can save its state, and is reset again.
+environment is reset with the seed with which the copy began. It then gets the old environment's random state and, if the
+environment can save its state, the saved state. Finally, it is reset again.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Reads the masks of allowed actions that env copies report, in their observations or in `info`.
 
-Rule: wherever an action will be chosen, there must be a mask. It has a bit for each choice, and allows at least one choice
-of each entry of the action; otherwise, the environment is at fault (`CopyFailed`). After an episode's end, no action is
-chosen. If the episode was truncated, its last mask is kept nevertheless, because learning uses the value of the last
+Rule: wherever an action will be chosen, there must be a mask. It must have a bit for each choice, and allow at least one
+choice for each entry of the action; otherwise, the environment is at fault (`CopyFailed`). After an episode's end, no action
+is chosen. If the episode was truncated, its last mask is kept nevertheless, because learning uses the value of the last
 observation; if there is none, all actions are allowed.
 """
 

@@ -1,7 +1,7 @@
 """The lanes whose env copies are open in this process.
 
-Rule: a lane that is closed while environment code runs, or while its own copies are made, is closed only after that code has
-returned, because its copies may be in the middle of a step.
+Rule: if a lane is to be closed while environment code runs, or while its own copies are being made, it is closed only after
+that code has returned, because its copies may be in the middle of a step.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The state of an environment's own random generator. In deterministic environments, it determines a reset without a seed.
 
-Rule: it is read only from gymnasium's `np_random`, which `super().reset(seed=...)` creates. If an environment draws from
-another generator, or has none, the state cannot be read.
+Rule: the state is read only from gymnasium's `np_random`, which `super().reset(seed=...)` creates. If an environment draws
+from another generator, or has none, the state cannot be read.
 """
 
 from __future__ import annotations

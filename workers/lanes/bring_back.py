@@ -2,8 +2,8 @@
 
 Rule: each episode begins as it did before, and its actions are replayed without the policy, row by row, in all copies
 together. Then the copies' observations, returns and lengths are compared with the history. If they differ, the environment
-is not deterministic, and the copy begins a new episode, with the next start number. Replayed steps have the usual timeouts
-of calls to the environment, but aren't counted as env steps. If an environment has saved its state, the state is loaded
+is not deterministic, and the copy begins a new episode, with the next start number. Replayed steps are subject to the
+environment's usual timeouts, but don't count as env steps. If an environment has saved its state, the state is loaded
 instead, and nothing is replayed.
 """
 

@@ -127,7 +127,7 @@ class RunningEpisodes:
         """End the episode of copy n, and return it.
 
         `of_info` are the facts that the environment reports, if any. `others` are the players of the other teams. Raises
-        `EnvironmentFailed` if no learner would accept the episode: its return includes rewards that are in no row, and so
+        `EnvironmentFailed` if no learner would accept the episode. Its return includes rewards that are in no row, and so
         haven't been checked.
         """
         returns: list[float] = self.returns[n].tolist()

@@ -2,7 +2,7 @@
 
 Rule: a seat's valid row is the one in which the outcome of its action arrives (`millrace.protocol.envs.seats`). Until then,
 each row repeats what was written when the seat acted: the action, its log-probability, and the state of the policy before
-it. The valid row is therefore complete, wherever one rollout ends and the next begins. A rollout may therefore contain an
+it. The valid row is therefore complete, wherever one rollout ends and the next begins. As a result, a rollout may contain an
 action that older weights chose, with its log-probability under those weights.
 """
 

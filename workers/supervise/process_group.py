@@ -1,8 +1,8 @@
 """Finds, measures and ends the processes of a worker's session: the worker, and what its environment has started.
 
 Rule: a process counts as gone when it no longer holds any port or file, so a zombie counts as gone, even if it is never
-reaped. Processes are found by session too, because the ranks of an MPI program have their own process groups but stay in the
-session.
+reaped. Processes are also found by session, because the ranks of an MPI program have their own process groups but stay in
+the session.
 """
 
 from __future__ import annotations

@@ -290,7 +290,7 @@ class Supervisor:
 
         Each request to stop is passed on to all workers. After the first one, or once the run is over, no worker is
         restarted, and a worker whose environment hangs is killed. With `stay`, workers are restarted after the end of a run,
-        but one that hangs then is killed too. `report` gets a line about each worker that ends.
+        but one that hangs at that time is killed too. `report` gets a line about each worker that ends.
         """
         handled = 0
         leave_by_s = float("inf")
