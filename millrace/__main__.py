@@ -1,7 +1,7 @@
 """`python -m millrace` and the command `millrace`: run the command line and end the process.
 
-Rule: from the first line of `command` on, a signal that ends the process gives exit code 130 and no traceback. This is why
-the slow imports are inside `command`. It blocks signals while it imports, because an extension module may crash if its
+Rule: once `command` has begun, a signal that ends the process results in exit code 130 and no traceback. This is why the
+slow imports are inside `command`. It blocks signals during these imports, because an extension module may crash if its
 import is interrupted.
 """
 

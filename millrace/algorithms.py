@@ -17,8 +17,8 @@ There are two levels. On the first, you write only the loss; millrace does every
 >>> run = millrace.train("CartPole-v1", algo=Mine, penalty=0.2, steps=500, workers=1, eval_episodes=2, progress=False)
 
 On the second, you derive a class from `Algorithm` and write the whole update. `millrace.testing.check_algorithm` finds
-mistakes in a class of either level. Use the class with `millrace train CartPole-v1 --algo my_module:Mine --penalty 0.2`, or
-with `millrace.train("CartPole-v1", algo=Mine, penalty=0.2)`.
+mistakes in a class written at either level. Use the class with `millrace train CartPole-v1 --algo my_module:Mine --penalty
+0.2`, or with `millrace.train("CartPole-v1", algo=Mine, penalty=0.2)`.
 
 The algorithm itself:
 
@@ -46,15 +46,15 @@ Tools:
 
 - `gae` and `vtrace`: compute advantages and value targets from arrays [T, N] and their `EpisodeEnds`.
 - `ActorCriticNetwork`, `QNetwork` and `ActorAndCritics`: the networks that workers act with. `log_prob_and_entropy`,
-  `policy_log_prob` and `squashed_sample` take the outputs of these networks. `trainable`: makes a flat tensor a leaf of
-  autograd's graph.
+  `policy_log_prob` and `squashed_sample` take the outputs of these networks. `trainable`: makes a flat tensor a leaf of the
+  autograd graph.
 - `ReplayBuffer`: returns a `Sample` of transitions. `MixedReplay` also samples prior data; `Hindsight` replaces the goals of
   transitions; `SequenceReplay` returns a `SequenceSample`, for a policy with memory. `Transitions`: the tensors of either
   kind of sample, with their `Sequences`. `CriticLoss`: the loss of the critics, or of the Q-network, on a minibatch.
 - `Encoder`: the layers before the hidden layers of a network. `RecurrentInput`: the input of its recurrent core.
 - `ObservationNormalizer` and `RewardScaler`: running statistics of observations and of returns.
-- `features` and `normalize`: turn observations into the input of the networks. `random_shift`: shifts images at random.
-- `UsageError`: raise it, with a message of one line, for settings or spaces that cannot be used.
+- `features` and `normalize`: turn observations into network input. `random_shift`: shifts images at random.
+- `UsageError`: raise it, with a one-line message, for settings or spaces that cannot be used.
 - `torch_seed`: the seed of the random stream for a `Purpose`, which is independent of all other streams of the run.
 - `check_finite`: the check before a gradient step. `scheduled`: the current value of a setting that decreases over the run.
 """

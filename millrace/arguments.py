@@ -1,10 +1,9 @@
 """Converts the arguments of public functions to plain values, and checks those that aren't settings.
 
-Rule: numpy scalars and enum members become plain Python numbers and text. A whole number must fit into 64 bits, and it must
-be possible to write a text to a file. A parameter in the signature must have the type of its annotation. Settings, which a
-function takes as `**settings: Unpack[ATypedDict]`, are checked later, when msgspec makes a record of them. Arguments
-annotated as `object` are the user's own objects, and stay unchanged. Errors are one line that begins with the function's
-name.
+Rule: numpy scalars and enum members become plain Python numbers and strings. An integer must fit into 64 bits, and a string
+must be encodable as UTF-8. An argument must match its parameter's annotation. Settings, which a function takes as
+`**settings: Unpack[ATypedDict]`, are checked later, when msgspec builds a record from them. Arguments annotated as `object`
+are the user's own objects and are left unchanged. An error is one line that begins with the function's name.
 
 For `help` and notebooks, the signature shows each key of such a `TypedDict` as a keyword of its own.
 """
@@ -33,13 +32,13 @@ WORDS: dict[Any, str] = {
     dict: "a dict",
 }
 UNSET = type("Unset", (), {"__repr__": lambda unset: "..."})()
-"""Shown by `help` as the default of a setting, because the real default may depend on other settings"""
+"""Shown by `help` as a setting's default, because the real default may depend on other settings"""
 _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
 
 
 def checked(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
-    """Wrap a function, so that it raises `UsageError` for arguments that its annotations do not allow."""
+    """Wrap a function so that it raises `UsageError` for arguments that its annotations do not allow."""
     signature = inspect.signature(function)
     who = function.__qualname__.removesuffix(".__init__").rpartition(".")[2]
 
@@ -82,7 +81,7 @@ def checked(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Re
 
 
 def _by_name(function: Callable[..., Any], signature: inspect.Signature) -> Iterator[inspect.Parameter]:
-    """The parameters of a function, with one for each key of a TypedDict in place of `**settings`."""
+    """A function's parameters, in which `**settings` is replaced by one parameter for each key of its TypedDict."""
     for parameter in signature.parameters.values():
         if _names_keys(parameter.annotation):
             keys = get_args(eval(parameter.annotation, function.__globals__))[0].__annotations__
@@ -116,7 +115,7 @@ def plain(value: Any) -> Any:
 
 
 def unusable(value: Any) -> str:
-    """Why text or a number can't be written to messages and files, as `expected …`; empty if it can."""
+    """Why a value can't be written to messages and files, worded as `expected …`; empty if it can."""
     try:
         match value:
             case os.PathLike():
@@ -149,7 +148,7 @@ def fits(value: Any, hint: Any) -> bool:
 
 
 def words(hint: Any) -> str:
-    """An annotation in the words of an error line, such as `a list of text`."""
+    """An annotation as error messages phrase it, such as `a list of text`."""
     origin = get_origin(hint)
     parts = get_args(hint)
     if origin in (Union, UnionType):

@@ -1,6 +1,6 @@
 """Everything that an extra in your own package may import, to add callbacks, commands or kinds of env copies.
 
-Rule: an extra imports only names of `millrace`, `millrace.algorithms` and this file, so that the rest of millrace may
+Rule: an extra imports only names from `millrace`, `millrace.algorithms` and this file, so that the rest of millrace may
 change. This file exports at most forty names: functions and classes, but no modules.
 
     commands            `Flag`, `parse_flags`, `one_line`; a command is an entry point of the group `millrace.commands`

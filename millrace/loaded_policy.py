@@ -83,7 +83,7 @@ class LoadedPolicy:
     def reset(self, copies: int = 1, *, seed: int | None = None) -> None:
         """Begin new episodes in this number of env copies. Only a policy with a recurrent core needs this call.
 
-        `seed` restarts the random numbers of a policy that samples its actions. Raises `UsageError` if `copies` is below 1,
+        `seed` reseeds the random numbers of a policy that samples its actions. Raises `UsageError` if `copies` is below 1,
         or so large that the recurrent states don't fit into memory.
 
         >>> import millrace, numpy
@@ -116,8 +116,8 @@ class LoadedPolicy:
                 policy that was trained with masks in its Dict observations reads them there; otherwise all actions are
                 allowed.
 
-        Raises `UsageError` if the observation isn't in the space, isn't finite, or has another number of copies than the
-        `reset` before it; or if the mask has a wrong shape or allows no action.
+        Raises `UsageError` if the observation isn't in the space, isn't finite, or has a different number of copies than the
+        preceding `reset`, or if the mask has a wrong shape or allows no action.
 
         >>> import millrace
         >>> policy = millrace.load(run)
@@ -215,7 +215,7 @@ def load(run: str | os.PathLike[str], *, best: bool = False, deterministic: bool
         seed: Seed of sampled actions.
 
     It reads policy.safetensors and policy.json; neither the environment nor the algorithm needs to be installed. A policy
-    with images or an encoder imports torch. Raises `UsageError`, with a message of one line, if there is no such policy.
+    with images or an encoder imports torch. Raises `UsageError`, with a one-line message, if there is no such policy.
 
     >>> import millrace, numpy
     >>> policy = millrace.load(run)
@@ -230,8 +230,8 @@ def load(run: str | os.PathLike[str], *, best: bool = False, deterministic: bool
 def _parts_of_mask(mask: npt.ArrayLike, n: int) -> list[Array]:
     """The arrays of a mask for n observations: one array for each entry of the action, or a single array for all entries.
 
-    A sequence is one for each entry if its arrays have different shapes, or if it is a tuple of arrays [n, …], which is how
-    a vector environment returns a Tuple.
+    A sequence has one array for each entry if its arrays have different shapes, or if it is a tuple of arrays [n, …], which
+    is how a vector environment returns a Tuple.
     """
     try:
         parts = [np.asarray(part) for part in mask] if isinstance(mask, tuple | list) else []

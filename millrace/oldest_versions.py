@@ -14,9 +14,9 @@ class Oldest(NamedTuple):
 
     version: tuple[int, int]
     file: str
-    """the file of the package that contains its version"""
+    """the package's file that contains the version"""
     asked_by: str
-    """what may have required an older version, for the error"""
+    """what may have required an older version, for the error message"""
 
 
 OLDEST = {
@@ -31,7 +31,7 @@ class PackageTooOld(ImportError):
 
 
 def check_versions() -> None:
-    """Check the versions in `OLDEST`. Raises `PackageTooOld`.
+    """Check the versions in `OLDEST`. Raises `PackageTooOld` if an older one is installed.
 
     On the command line, no caller could handle the error, so the process ends with one line and exit code 2.
     """

@@ -41,12 +41,13 @@ class OwnPolicy:
     (8, 2, 2)
 
     Each worker calls `factory(**kwargs)`, which returns such an object. `act` is called once for each step of a lane, with
-    the observations of all its copies; if copies have several agents, of all the agents, including those that wait or have
-    left. `state` [N, state_size] float32 is the policy's memory, which is zero when an episode begins. If the object stores
-    nothing else between calls, results do not depend on the number of workers. An action consists of whole numbers that
-    count from 0, or of float32 numbers, which are clipped to the space after they were stored. If the environment has action
-    masks, `act` also gets `mask=` [N, choices] bool, and must choose an allowed action. `service.evaluate` calls the
-    object's `act_greedy` if it has one, and `act` otherwise. See also docs/how-to/own_learner.md.
+    the observations of all its copies. If copies have several agents, these are the observations of all agents, including
+    those that wait or have left. `state` [N, state_size] float32 is the policy's memory, which is zero when an episode
+    begins. If the object stores nothing else between calls, results do not depend on the number of workers. An action
+    consists of whole numbers that count from 0, or of float32 numbers, which are clipped to the space after they were
+    stored. If the environment has action masks, `act` also gets `mask=` [N, choices] bool, and must choose an allowed
+    action. `service.evaluate` calls the object's `act_greedy` if it has one, and `act` otherwise. See also
+    docs/how-to/own_learner.md.
     """
 
     factory: str | Callable[..., object]

@@ -18,7 +18,7 @@ class PlayFlags(msgspec.Struct, frozen=True, kw_only=True):
     run: Annotated[Path, Flag(positional=True)]
     """run folder"""
     best: bool = False
-    """use the policy with the best evaluation during the run (--eval-every), instead of the newest"""
+    """use the policy with the best evaluation during the run (--eval-every) instead of the newest policy"""
     env: str = ""
     """the environment, if the run can't find it itself, such as my_module:make_env or my_module:MyEnv-v0"""
     wrappers: Annotated[tuple[str, ...], Flag("MODULE:CLASS ...")] = ()
@@ -30,9 +30,9 @@ class PlayFlags(msgspec.Struct, frozen=True, kw_only=True):
     bind: str = ""
     """address at which workers from elsewhere can join, such as tcp://0.0.0.0:5555; no workers are then started here"""
     inference: Literal["workers", "learner"] = "workers"
-    """where the policy acts: in each worker, or in this process; workers that only step the environment need learner"""
+    """where the policy acts: in each worker, or in this process; workers that only step the environment require learner"""
     max_env_failures: Natural = 3
-    """give up after more failures than this: an exception of the environment, or a worker process that was killed"""
+    """give up after more failures than this; an exception in the environment or a killed worker process is a failure"""
 
 
 class EvaluateFlags(PlayFlags, frozen=True, kw_only=True):
@@ -47,9 +47,9 @@ class EvaluateFlags(PlayFlags, frozen=True, kw_only=True):
     copies: Annotated[int, Meta(ge=1, le=MAX_SEEDS)] = 4
     """number of episodes that a worker plays at the same time"""
     max_steps: Count = 1_000_000
-    """largest number of env steps of all episodes together; each episode gets an equal share, and is cut at that step"""
+    """limit on the env steps of all episodes together; each episode gets an equal share, and is cut when it is used up"""
     video: bool = False
-    """film the episodes: an mp4 of each in the folder videos of the run (pip install moviepy pygame-ce)"""
+    """record each episode as an mp4 file in the run's folder videos (pip install moviepy pygame-ce)"""
 
 
 class RecordFlags(PlayFlags, frozen=True, kw_only=True):

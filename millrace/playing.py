@@ -28,7 +28,7 @@ from millrace.protocol.envs.wrappers import WrapperLike
 from millrace.protocol.errors import UsageError, did_you_mean
 from millrace.terminal import count_line
 
-NOT_KEYWORDS = ("wrappers",)  # Python code may pass objects for these flags, so functions declare them as parameters
+NOT_KEYWORDS = ("wrappers",)  # Python code may pass objects for these flags, so functions declare parameters for them
 ShowPlayed = Callable[[str], None]
 """Takes the progress as text, and shows it."""
 _Flags = TypeVar("_Flags", bound=PlayFlags)
@@ -80,17 +80,17 @@ def evaluate(
         run: A `Run`, or a run folder.
         episodes: Number of episodes; by default 100, or 3 with `video`.
         env: The environment that the run was started with, if it can't be found by its name because it was made in another
-            script or notebook. (You don't need it for `Run.evaluate` of the `Run` that `train` returned.)
+            script or notebook. (You don't need it if you call `evaluate` on the `Run` that `train` returned.)
         wrappers: The wrappers that the run was started with, if they can't be found by their names either.
         progress: Show the progress.
-        **keywords: The flags of `millrace evaluate`: `seed` of the episodes; `best`, to use the policy with the best
+        **keywords: The flags of `millrace evaluate`: `seed`, the episodes' seed; `best`, to use the policy with the best
             evaluation during the run instead of the newest; `against`, the run folder of a policy that plays the other teams
             of a game; `workers`, the number of worker processes, and `copies`, the number of episodes that each plays at the
-            same time; `max_steps`, the env steps of all episodes together; `video`, to film the episodes; `transport`,
-            `bind`, `inference` and `max_env_failures`.
+            same time; `max_steps`, the limit on the env steps of all episodes together; `video`, to record the episodes as
+            videos; `transport`, `bind`, `inference` and `max_env_failures`.
 
     Returns an `Evaluation`: `return_mean`, `return_std`, `length_mean`, `episodes` and `cut`. The result does not depend on
-    the number of workers. Raises `UserFacingError` with a message of one line.
+    the number of workers. If this fails, raises `UserFacingError` with a one-line message.
 
     >>> import millrace
     >>> result = millrace.evaluate(run, episodes=2, workers=1)
@@ -121,7 +121,7 @@ def record(
             ~/.minari/datasets.
         steps: Number of env steps. The last episode is finished, unless that would take more than twice this number.
         env: The environment that the run was started with, if it can't be found by its name because it was made in another
-            script or notebook. (You don't need it for `Run.record` of the `Run` that `train` returned.)
+            script or notebook. (You don't need it if you call `record` on the `Run` that `train` returned.)
         wrappers: The wrappers that the run was started with, if they can't be found by their names either.
         progress: Show the progress.
         **keywords: The flags of `millrace record`: `stochastic`, to sample actions; `npy`, a file to which each step is also
@@ -129,7 +129,8 @@ def record(
             `max_env_failures`.
 
     Returns a `RecordedDataset`: `dataset_id`, `episodes`, `steps`, `return_mean`, `return_std` and `cut`. The dataset does
-    not depend on the number of workers. Raises `UserFacingError` with a message of one line; then no files are left behind.
+    not depend on the number of workers. If this fails, raises `UserFacingError` with a one-line message, and leaves no files
+    behind.
 
     >>> import millrace
     >>> millrace.record(run, "cartpole/example-v0", steps=20, workers=1).dataset_id
@@ -157,7 +158,7 @@ def flags_of(kind: type[_Flags], name: str, **keywords: Any) -> _Flags:
 def play(flags: EvaluateFlags, watch: ShowPlayed, given: Given | None = None) -> tuple[Evaluation, list[Path]]:
     """Play greedy episodes. Returns their evaluation and the paths of the videos, if any.
 
-    Raises `UserFacingError`, or `KeyboardInterrupt` if the user interrupts it.
+    Raises `UserFacingError` if this fails, or `KeyboardInterrupt` if the user interrupts it.
     """
     episodes = flags.episodes if flags.episodes is not None else 3 if flags.video else 100
     record_videos: RecordVideos | None = None

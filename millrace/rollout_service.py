@@ -205,7 +205,7 @@ class RolloutService:
                 if state.normalizer is not None:
                     try:
                         self.normalizer.restore(state.normalizer)
-                    except Exception as error:  # dicts, numpy and torch raise many types for an invalid state
+                    except Exception as error:  # dicts, numpy and torch raise many exception types for an invalid state
                         raise unreadable(str(restore), error) from error
         except BaseException:
             self._resources.close()
@@ -313,8 +313,8 @@ class RolloutService:
     def evaluate(self, episodes: int = 100, *, seed: int = 1_000_000, max_steps: int = 1_000_000) -> Evaluation:
         """Let the workers play greedy episodes with the newest weights, on env copies that aren't used for rollouts.
 
-        The result does not depend on the number of workers. `seed`: seed of the episodes. `max_steps`: the largest number of
-        env steps of all episodes together; each episode gets an equal share, and is cut at that step.
+        The result does not depend on the number of workers. `seed`: seed of the episodes. `max_steps`: the limit on the env
+        steps of all episodes together; each episode gets an equal share, and is cut when it is used up.
 
         >>> import millrace
         >>> with millrace.RolloutService("CartPole-v1", workers=1, envs=2, lanes=1, rollout_steps=8) as service:
@@ -482,7 +482,7 @@ class RolloutService:
 
 
 def _config(env: EnvLike, wrappers: Sequence[WrapperLike], settings: dict[str, Any]) -> RolloutConfig:
-    """The settings as a checked record. Raises `UsageError`."""
+    """The settings as a checked record. Raises `UsageError` if one is wrong."""
     known = RolloutConfig.__struct_fields__
     if unknown := [name for name in settings if name not in known]:
         known = (*known, "rollout_steps")

@@ -1,6 +1,6 @@
 """Runs in Python: `millrace.train` makes a run, and `millrace.Run` reads the run folder at each access.
 
-Rule: parts that a run folder lacks are None or empty, and an unreadable file is an error of one line. The repr never raises.
+Rule: parts that a run folder lacks are None or empty, and an unreadable file is a one-line error. The repr never raises.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ class Metrics(dict[str, Array]):
 
 
 class Picture(Protocol):
-    """Learning curves as a picture, which notebooks show."""
+    """Learning curves as a picture that notebooks display."""
 
     svg: str
     """the picture as SVG text"""
@@ -98,7 +98,7 @@ class Run(os.PathLike[str]):
     """A run folder: its results, and methods that use its policy. `millrace.train` returns one.
 
     Everything is read from the folder at each access, so you can follow a run that is still training. `os.fspath(run)` is
-    the folder: you can pass a `Run` wherever a path is expected. Raises `UsageError`, with a message of one line, if `path`
+    the folder: you can pass a `Run` wherever a path is expected. Raises `UsageError`, with a one-line message, if `path`
     isn't a run folder.
 
     >>> import millrace
@@ -159,7 +159,7 @@ class Run(os.PathLike[str]):
 
     @checked
     def evaluate(self, episodes: int | None = None, **keywords: Unpack[RunEvaluateKeywords]) -> Evaluation:
-        """Play greedy episodes of the newest policy: `millrace.evaluate(run, …)`, with the same keywords.
+        """Play greedy episodes with the newest policy: `millrace.evaluate(run, …)`, with the same keywords.
 
         >>> import millrace
         >>> result = millrace.Run(run).evaluate(episodes=2, workers=1)
@@ -170,7 +170,7 @@ class Run(os.PathLike[str]):
 
     @checked
     def record(self, out: str, steps: int = 50_000, **keywords: Unpack[RunRecordKeywords]) -> RecordedDataset:
-        """Write episodes of the newest policy as a Minari dataset: `millrace.record(run, …)`, with the same keywords.
+        """Write episodes played by the newest policy as a Minari dataset: `millrace.record(run, …)`, with the same keywords.
 
         >>> import millrace
         >>> millrace.Run(run).record("cartpole/of-a-run-v0", steps=20).dataset_id
@@ -193,7 +193,7 @@ class Run(os.PathLike[str]):
 
     @checked
     def plot(self, out: str | os.PathLike[str] | None = None) -> Picture:
-        """Plot the learning curve, as `millrace plot` does. Returns a picture, which a notebook shows.
+        """Plot the learning curve, as `millrace plot` does. Returns a picture that notebooks display.
 
         `out`: also write the picture to this file, whose name ends in .svg, or in .png (pip install pillow resvg_py). Raises
         `UsageError` if no episode has ended yet.
@@ -270,7 +270,7 @@ def train(
         env: An id that `gymnasium.make` accepts, a `gymnasium.envs.registration.EnvSpec`, or a callable that returns an
             environment. The environment may be defined in your script or notebook. A resumed run finds the environment by
             its name; if it has no importable name, pass it again.
-        wrappers: Applied to every env copy, including those of evaluations, the first one innermost: classes, functions, or
+        wrappers: Applied to every env copy, including evaluation copies, the first one innermost: classes, functions, or
             names such as "gymnasium.wrappers:FlattenObservation".
         config: A TOML file of settings.
         resume: A `Run` or run folder, to continue from its newest checkpoint; or "auto", to continue the newest run of this
@@ -285,10 +285,10 @@ def train(
             less often.
         **settings: The flags of `millrace train`, with the same names, such as `learning_rate=1e-3`. `algo` may be your own
             class (`millrace.algorithms`). If the class is defined in a script or a notebook, pass it again on resume. Type
-            checkers don't know settings that only your class has: pass them as `**own`, a `dict[str, Any]`. `start_from`
+            checkers don't know settings that only your class has, so pass these as `**own`, a `dict[str, Any]`. `start_from`
             may be a `Run`: the new run begins with the policy of that run (`--from`).
 
-    Returns the `Run`. Raises `UserFacingError` with a message of one line.
+    Returns the `Run`. If training fails, raises `UserFacingError` with a one-line message.
 
     >>> import millrace
     >>> run = millrace.train("CartPole-v1", seed=1, steps=64, envs=2, lanes=1, rollout_steps=16, workers=1, progress=False)

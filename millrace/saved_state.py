@@ -43,7 +43,7 @@ class ServiceState(msgspec.Struct, frozen=True, kw_only=True):
     """number of the next incarnation of each lane"""
     rounds: RoundsState
     lanes: bytes
-    """the past of each lane (`LanePast`), packed"""
+    """the history of each lane (`LanePast`), packed"""
     acting: bytes
     """the weights with which open rounds are collected, except the newest weights, packed"""
     normalizer: dict[str, Any] | None = None
@@ -98,8 +98,8 @@ def read(path: Path) -> tuple[ServiceState, dict[str, Array]]:
             arrays = {name: file[name] for name in file.files}
         state = msgspec.json.decode(arrays.pop(OURS).tobytes(), type=ServiceState)
         state.ledger.end_outstanding()
-        _ = state.past  # raises for an invalid state
-    except Exception as error:  # zipfile, numpy and msgspec raise a dozen types for damaged files
+        _ = state.past  # raises an error for an invalid state
+    except Exception as error:  # zipfile, numpy and msgspec raise a dozen exception types for damaged files
         raise unreadable(path, error) from error
     if state.format != FORMAT:
         raise CheckpointError(f"{path}: expected format {FORMAT}, got {state.format}; use the millrace that wrote it")

@@ -49,7 +49,7 @@ def make_vec_env(
         env_id: `env` of `millrace.make_vec`. If the environment has several agents, each agent is a row of the `VecEnv`, and
             all of them must act at every step.
         n_envs: number of env copies; by default 1, or the length of the list.
-        seed: seed of the first reset, in which copy n gets `seed + n`, and of samples of `action_space`.
+        seed: seed for the first reset, in which copy n gets `seed + n`, and for sampling from `action_space`.
         monitor: record the return and length of each episode, for `rollout/ep_rew_mean`. As in SB3, these are recorded
             inside `wrapper_class`, so the wrapper doesn't affect them.
         wrapper_class: called in the workers with each env copy: a wrapper, or a function that applies several. Because it is
@@ -90,7 +90,7 @@ class Sb3VecEnv(VecEnv):
         """`monitored`: the workers record episodes as `Monitor` does. Raises `UsageError` for another autoreset mode."""
         if env.autoreset_mode is not AutoresetMode.SAME_STEP:
             raise UsageError(f"Sb3VecEnv: expected autoreset_mode SameStep, got {env.autoreset_mode.value}")
-        env.merge_infos = False  # in merged infos, all copies would have the same dtype and shape
+        env.merge_infos = False  # in merged infos, the values of all copies would have the same dtype and shape
         self.env = env
         self._monitored = monitored
         self._rows_of_copy = max(1, len(env.seats))
@@ -101,7 +101,7 @@ class Sb3VecEnv(VecEnv):
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
-        """Set the seeds of the next reset: copy n gets `seed + n`, whatever the number of agents.
+        """Set the seeds for the next reset: copy n gets `seed + n`, whatever the number of agents.
 
         Returns the seed of each row [num_envs].
         """

@@ -96,10 +96,10 @@ def progress_view(
 def count_line(
     doing: str, clock: Callable[[], float] = time.monotonic, *, show: bool = True
 ) -> Iterator[Callable[[str], None]]:
-    """A context manager that yields a function. Call the function with a text, to show `doing` and the text.
+    """A context manager that yields a function. To show `doing` followed by a text, call the function with the text.
 
-    The text is updated in place on a terminal or in a notebook; elsewhere a line is printed now and then. Outside a notebook
-    it goes to stderr. `show`: whether to show anything at all.
+    On a terminal or in a notebook, the text is updated in place; elsewhere, a line is printed now and then. Outside a
+    notebook, the text goes to stderr. `show`: whether to show anything at all.
     """
     notebook = NotebookCell() if show and in_notebook() else None
     live = notebook is None and _is_terminal(sys.stderr)
@@ -147,7 +147,7 @@ def _write_to_stderr(text: str) -> None:
 
 
 def _view(log_json: bool) -> tuple[ProgressView, float]:
-    """The view for this program's output, and the least number of seconds between two updates of it."""
+    """The view for this program's output, and the minimum number of seconds between two of its updates."""
     if log_json:
         return JsonEvents(), LINE_EVERY_S
     if in_notebook():
@@ -182,7 +182,7 @@ class DroppingView(ProgressView):
 class RateLimitedView:
     """Shows the first progress, then at most one every `every_s` seconds, and always the last one.
 
-    A new note is printed at once. A view that prints lines prints them less and less often while the run makes no update.
+    A new note is printed at once. A view that prints lines prints them at growing intervals while the run makes no update.
     """
 
     def __init__(self, view: ProgressView, every_s: float, clock: Callable[[], float]) -> None:
@@ -223,7 +223,7 @@ class PlainLines(ProgressView):
     """Plain lines, for logs, pipes and batch systems."""
 
     def show(self, progress: Progress) -> None:
-        """Print one line. When the run has ended, it also names the slowest part and what went wrong."""
+        """Print one line. When the run has ended, the line also names the slowest part and what went wrong."""
         ended = bool(progress.stop_reason)
         said = slowest_part(progress.stages) if ended else who_waits(progress)
         parts = [main_figures(progress), said, went_wrong(progress.ledger) if ended else ""]

@@ -24,7 +24,7 @@ class AlgorithmMistakes(MillraceError, AssertionError):
 
 
 def check_algorithm(algorithm: type, *, learns: bool = True, **settings: Any) -> None:
-    """Check that a class keeps the rules of `millrace.algorithms.Algorithm`. This takes a few seconds, in this process.
+    """Check that a class follows the rules of `millrace.algorithms.Algorithm`. This takes a few seconds, in this process.
 
     The class learns from batches of a toy environment, with 2 lanes of 4 env copies and rollouts of `rollout_steps` steps
     (at most 64). The checks are that

@@ -1,4 +1,4 @@
-"""The commands of `millrace`, in groups, with the function that runs each. They include the commands of millrace's extras.
+"""All commands of `millrace` and of its extras, in groups, with the function that runs each command.
 
 Rule: a command's module is imported only when the command runs, so that `--help` is fast, and so that a machine with only a
 worker's packages can run the commands that need no other packages. Other packages install commands as entry points of the

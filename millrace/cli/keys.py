@@ -1,4 +1,4 @@
-"""`millrace keys`: manages the keys with which workers may join the learners of this machine.
+"""`millrace keys`: manages the keys with which workers may join this machine's learners.
 
 Rule: a secret is printed only if the user asks for it with a flag.
 """
@@ -18,7 +18,7 @@ from millrace.protocol.keys.keys import public_key
 
 
 class KeysFlags(msgspec.Struct, frozen=True, kw_only=True):
-    """Flags of every subcommand."""
+    """Flags that every subcommand has."""
 
     keys: Annotated[str, Flag("FOLDER")] = ""
     """key folder; if not given, the one that MILLRACE_KEYS names, or ~/.config/millrace/keys"""
@@ -30,7 +30,7 @@ class NewFlags(KeysFlags, frozen=True, kw_only=True):
     name: Annotated[str, Flag(positional=True)]
     """name of the client; `millrace keys revoke NAME` blocks its workers"""
     server: Annotated[str, Flag("PUBLIC")] = ""
-    """public key of a learner elsewhere: the token is for that learner, which must allow the key that is printed"""
+    """public key of a learner on another machine; the token is for that learner, which must allow the printed key"""
     print_token: bool = False
     """print only the token, for example for a secret store; anyone who sees it can join"""
 
@@ -70,7 +70,7 @@ def run(argv: list[str]) -> int:
 
 
 def keys(argv: list[str]) -> list[str]:
-    """Run a subcommand. Returns the lines to print. Raises `UsageError`."""
+    """Run a subcommand. Returns the lines to print. Raises `UsageError` if the flags or the key folder can't be used."""
     about = "Choose which workers of other machines may join the learners of this machine."
     name, rest = chosen_subcommand("keys", about, SUBCOMMANDS, argv)
     flags = parse_flags(SUBCOMMANDS[name], rest, f"keys {name}")

@@ -1,8 +1,8 @@
 """The command line: finds the command, runs it, and turns an error into one line and an exit code.
 
-Rule: wrong usage gives one line on stderr and exit code 2. A failed run gives one line (with the worker's traceback below
-it, if there is one) and exit code 1. Ctrl-C gives exit code 130. A traceback of millrace itself is shown only with --debug.
-If standard error or standard output can't be written, the text is dropped and the run continues.
+Rule: wrong usage results in one line on stderr and exit code 2. A failed run results in one line, followed by the worker's
+traceback if there is one, and exit code 1. Ctrl-C results in exit code 130. millrace's own traceback is shown only with
+--debug. If standard error or standard output can't be written, the text is dropped and the run continues.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def main(argv: list[str] | None = None) -> int:
         if any(map(is_run_folder, (here, *here.parents))):
             sys.path[:] = [entry for entry in sys.path if entry not in ("", str(here))]  # never import from a run folder
         elif str(here) not in sys.path:
-            sys.path.insert(_end_of_installed(), str(here))  # so that a user's module is found but hides no installed module
+            sys.path.insert(_end_of_installed(), str(here))  # so that a user's module is found but hides no installed one
     prepare_streams()
     with unfailing("stderr"):
         return _exit_code(argv)
@@ -76,7 +76,7 @@ def _exit_code(argv: list[str]) -> int:
     except KeyboardInterrupt as interrupt:
         _print_error(last_line("millrace", interrupt, elsewhere=_elsewhere(argv)))
         return _failed(argv, 130)
-    except BrokenPipeError:  # nothing reads the output any longer (`| head`), so print no message
+    except BrokenPipeError:  # whatever reads the output, such as `head`, has ended, so print no message
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except OSError as error:
@@ -85,7 +85,7 @@ def _exit_code(argv: list[str]) -> int:
             return _failed(argv, ours.exit_code)
         if error.filename is not None or error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EIO):
             return _internal_error(argv, error)
-        _print_error(f"millrace: standard output: {error.strerror}")  # an error about a file would contain its name
+        _print_error(f"millrace: standard output: {error.strerror}")  # not about a file: such an error would have a filename
         return _failed(argv, 1)
     except ModuleNotFoundError as error:
         if error.name not in NOT_IN_WORKERS:

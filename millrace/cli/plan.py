@@ -18,7 +18,7 @@ from millrace.protocol.env_spec import Scalar
 
 
 class PlanFlags(msgspec.Struct, frozen=True, kw_only=True):
-    """Step an environment on this machine for half a minute, and say what to choose and what to expect, with the reasons."""
+    """Step an environment on this machine for half a minute, then say what to choose and what to expect, with reasons."""
 
     env: Annotated[str, Flag(positional=True)]
     """Environment id for gymnasium.make, or a name, as for train"""
@@ -27,11 +27,11 @@ class PlanFlags(msgspec.Struct, frozen=True, kw_only=True):
     wrappers: Annotated[tuple[str, ...], Flag("MODULE:CLASS ...")] = ()
     """wrappers of every env copy, as for train"""
     max_env_copies: Natural = 0
-    """most env copies that may run at the same time, as for floating licences. 0: any number"""
+    """maximum number of env copies that may run at the same time, for example because of floating licences. 0: no limit"""
     seconds: Annotated[float, Meta(ge=LEAST_S)] = SECONDS
-    """about how long it may take; more if a step or a start of the environment takes seconds"""
+    """about how long it may take; longer if a step or a start of the environment takes seconds"""
     json: bool = False
-    """print one line of JSON with all that was measured"""
+    """print all measurements as one line of JSON"""
 
 
 def run(argv: list[str]) -> int:

@@ -47,24 +47,24 @@ from millrace.protocol.wire.worker_link import OF_OBSERVER, WorkerLink
 from millrace.workers.conversation.connection_rules import checked_token
 
 ASK_AGAIN_S = WATCH_EVERY_S = 1.0
-LEFT_ALIGNED = ("worker", "host", "lanes", "doing")  # columns of words; columns of numbers are aligned to the right
+LEFT_ALIGNED = ("worker", "host", "lanes", "doing")  # text; the other columns contain numbers and are right-aligned
 
 
 class StatusFlags(msgspec.Struct, frozen=True, kw_only=True):
-    """Show the workers of a run (speed, memory, seconds since the last message), and what was dropped; or how it ended."""
+    """Show a run's workers (speed, memory, seconds since the last message) and what was dropped, or how the run ended."""
 
     address: Annotated[str, Flag("ADDRESS|RUN", positional=True)]
     """where the learner listens, as in tcp://HOST:5555, or a run folder"""
     watch: bool = False
-    """ask again every second, until Ctrl-C or the end of the learner"""
+    """ask again every second, until Ctrl-C or until the learner ends"""
     json: bool = False
     """print one line of JSON instead of a table"""
     timeout_s: Annotated[float, Meta(gt=0)] = 5.0
     """seconds to wait for the learner's answer"""
     token: Annotated[str, Flag("FILE")] = ""
-    """file of a join token, if workers need one; if not given, MILLRACE_TOKEN, or the key folder of RUN"""
+    """file with a join token, if workers need one; default: from MILLRACE_TOKEN or RUN's key folder"""
     insecure: bool = False
-    """ask on another machine without a token, and trust the answer"""
+    """ask a learner on another machine without a token, and trust the answer"""
 
 
 def run(argv: list[str]) -> int:
@@ -74,7 +74,7 @@ def run(argv: list[str]) -> int:
 
 
 def status(argv: list[str], out: TextIO) -> None:
-    """Run the command, and write to `out`. Raises `UsageError`, or `RunError` if the learner doesn't answer."""
+    """Run the command, and write to `out`. Raises `UsageError` for wrong flags, `RunError` if the learner doesn't answer."""
     values = parse_flags(StatusFlags, argv, "status")
     if "://" not in values.address and (last := last_state(Path(values.address))) is not None:
         out.write(f"{last_in_json(last) if values.json else in_sentences(last)}\n")
@@ -107,7 +107,8 @@ def last_state(run: Path) -> RunLine | None:
 def whom_to_ask(where: str, token: Token | None, *, insecure: bool) -> tuple[str, Token | None]:
     """The address of a learner, and the token with which to connect. `where`: its address, or the folder of its run.
 
-    A run folder names the learner's key folder. If `token` is None, a token from that folder is used. Raises `UsageError`.
+    A run folder names the learner's key folder. If `token` is None, a token from that folder is used. Raises `UsageError` if
+    the folder or the token can't be used.
     """
     if "://" in where:
         return where, checked_token(where, token, insecure=insecure)
@@ -122,7 +123,7 @@ def whom_to_ask(where: str, token: Token | None, *, insecure: bool) -> tuple[str
 def token_of_learner(run: str, folder: Path) -> Token:
     """A token from the learner's key folder. Raises `UsageError` if this machine has none.
 
-    The run names the folder, and may come from a stranger. So the folder must be outside the run, and is read with limits.
+    The run, which names the folder, may come from a stranger, so the folder must be outside the run and is read with limits.
     """
     keys = KeyFolder(folder)
     path = None
@@ -130,7 +131,7 @@ def token_of_learner(run: str, folder: Path) -> Token:
         if Path(os.path.realpath(folder)).is_relative_to(os.path.realpath(run)):
             raise UsageError(f"run {run}: its lock names a key folder inside the run folder; expected --token FILE")
         text = read(keys.list_path, MOST_CONFIG_BYTES).decode()
-        parse_toml(text, f"list {keys.list_path}")  # raises if the next line would take long
+        parse_toml(text, f"list {keys.list_path}")  # raises an error if the next line would take long
         path = keys.first_token(ClientList.from_toml(text, f"list {keys.list_path}"))
     except FileNotFoundError:
         pass
@@ -147,7 +148,7 @@ def token_of_learner(run: str, folder: Path) -> Token:
 
 
 def observer_name() -> str:
-    """A name for the connection that differs from the names of all workers."""
+    """A name for the connection that no worker has."""
     return f"status-{socket.gethostname()}-{os.getpid()}-{os.urandom(3).hex()}"
 
 
@@ -231,7 +232,7 @@ def _cells(worker: WorkerStatus, version: int, late: bool) -> dict[str, str]:
 
 
 def table(rows: Sequence[dict[str, str]], left_aligned: Sequence[str], empty: str) -> list[str]:
-    """The lines of a table: the names of the columns, followed by the rows; `empty` if there are no rows."""
+    """The lines of a table: the column names, followed by the rows; `empty` if there are no rows."""
     if not rows:
         return [empty]
     widths = {name: max(len(name), *(len(row[name]) for row in rows)) for name in rows[0]}
@@ -244,5 +245,5 @@ def table(rows: Sequence[dict[str, str]], left_aligned: Sequence[str], empty: st
 
 
 def _printable(text: str) -> str:
-    """A text from a peer, with control characters escaped."""
+    """Text from a peer, with control characters escaped."""
     return "".join(each if each.isprintable() else each.encode("unicode_escape").decode() for each in text)

@@ -1,4 +1,4 @@
-"""Shows the progress of a run that a command trains; at its end, prints how it ended and what to do next.
+"""Shows the progress of a run that a command trains, and finally prints how the run ended and what to do next.
 
 Rule: output that can't be written is dropped, and the run continues.
 """
@@ -38,7 +38,7 @@ class ShownRun:
     """Shows the progress of a run, and prints how it ended."""
 
     def __init__(self, argv: list[str], new: Config | None = None, command: str = "train") -> None:
-        """`new`: the settings of a new run, whose origin is shown before the first report; None if a run is resumed.
+        """`new`: the settings of a new run; where they come from is shown before the first report. None if a run is resumed.
 
         `command`: the millrace command that trains the run, and can resume it.
         """
@@ -48,7 +48,7 @@ class ShownRun:
 
     @contextmanager
     def progress(self) -> Iterator[Watch]:
-        """A context manager that yields a function. Call the function with each `Progress`, to show it."""
+        """A context manager that yields a function. To show a `Progress`, call the function with it."""
         with unfailing("stdout"), progress_view(self._log_json) as watch:
             yield watch if self._new is None else _after_origin(self._new, self._command, watch)
 
@@ -63,7 +63,7 @@ class ShownRun:
 
 
 def _after_origin(config: Config, command: str, watch: Callable[[Progress], None]) -> Callable[[Progress], None]:
-    """Wrap `watch`, so that its first call also logs where the settings come from, and how many workers `train` chose."""
+    """Wrap `watch` so that its first call also logs where the settings come from and how many workers `train` chose."""
     workers = chosen_workers(config, usable_cores()) if command == "train" else ""
     lines = iter([joined(origin(config), workers)])
 
@@ -76,7 +76,7 @@ def _after_origin(config: Config, command: str, watch: Callable[[Progress], None
 
 
 def result(summary: Summary) -> list[str]:
-    """Lines about how a run ended and the evaluations of its policies."""
+    """Lines that say how a run ended and how its policies were evaluated."""
     lines = [f"{summary.stop_reason}: {summary.env_steps:,} env steps in {summary.wall_s:.1f} s"]
     if summary.evaluation is not None:
         ended_by_final = summary.ended_by is not None and BY_THE_POLICY_OF not in summary.stop_reason
