@@ -65,7 +65,7 @@ TIMED_ROLLOUTS = 3
 LONG_S = 1.0  # duration of a long rollout
 LONGEST_STEPS = 50_000  # largest T of a long rollout
 NET = (16, 16)
-LONG_NET = (256, 256)  # net of long rollouts: with a small one, a compiled client would make 50,000 steps in milliseconds
+LONG_NET = (256, 256)  # net for long rollouts: with a small one, a compiled client would take 50,000 steps in milliseconds
 EVALUATED_STEPS = 40
 APART_ROLLOUTS = 3  # after this many rollouts of each lane, env copies must differ
 
@@ -232,7 +232,7 @@ def _rollout_or_declined(learner: Learner, permit: Permit) -> Script[None]:
 
 
 def sets_attributes(learner: Learner) -> Script[None]:
-    """Send attributes with weights: with version 1, the cart isn't pushed; 2 sets none; with 3, the cart is pushed again."""
+    """Send attributes with weights: version 1 turns the cart's force off, 2 sets none, and 3 turns the force on again."""
     env = yield from described(learner)
     if not is_gymnasium_pole(env):
         raise Skipped("the environment is not gymnasium's CartPole")
@@ -359,7 +359,7 @@ def waits_for_weights(learner: Learner) -> Script[None]:
 
 
 def acts_under_the_named_version(learner: Learner) -> Script[None]:
-    """Send newer weights first, as if the weights that a permit names had been lost. The watch compares versions."""
+    """Send newer weights first, as if the weights named in a permit had been lost. The watch compares versions."""
     session = yield from collecting(learner)
     older = session.permit()
     newer = session.permit()
@@ -411,7 +411,7 @@ def lists_what_it_holds(learner: Learner) -> Script[None]:
 
 
 def keeps_listed_weights(learner: Learner) -> Script[None]:
-    """Collect under three versions. The second order also lists the first version as one to keep; the third doesn't."""
+    """Collect under three versions. The second order lists the first version as one to keep; the third doesn't."""
     session = yield from collecting(learner)
     yield from session.collect(version=1)
     for version, kept in ((2, (1, 2)), (3, (3,))):
@@ -470,7 +470,7 @@ def forgets_what_arrived(learner: Learner) -> Script[None]:
 
 
 def says_no_rollout_twice(learner: Learner) -> Script[None]:
-    """After a rollout, ask for nothing more, and don't confirm that the rollout has arrived."""
+    """After a rollout, request nothing more, and don't confirm that the rollout has arrived."""
     session = yield from collecting(learner)
     learner.watch.confirms = False
     permit = session.permit()
@@ -543,7 +543,7 @@ def starts_a_lane_again(learner: Learner) -> Script[None]:
 
 
 def _past_of(rollouts: Sequence[Rollout]) -> LanePast:
-    """The past of lane 0 after these rollouts, which must be all rollouts of the lane."""
+    """The history of lane 0 after these rollouts, which must be all of the lane's rollouts."""
     last = rollouts[-1]
     resets = np.concatenate([*(resets_of(each)[:-1] for each in rollouts), resets_of(last)[-1:]])
     K = len(resets) - 1
@@ -564,8 +564,8 @@ def _past_of(rollouts: Sequence[Rollout]) -> LanePast:
 
 
 def continues_a_lane(learner: Learner) -> Script[None]:
-    """Send the client the past of a lane, as if another worker had collected it. The client must continue the lane, in the
-    next incarnation, bit for bit as that worker would have continued it.
+    """Send the client a lane's history, as if another worker had collected it. In the next incarnation, the client must
+    continue the lane bit for bit as that worker would have.
     """
     rounds = 3
     undisturbed = yield from collecting(learner, steps=7)
@@ -698,7 +698,8 @@ def beats_while_it_collects(learner: Learner) -> Script[None]:
 
 
 def evaluates(learner: Learner) -> Script[None]:
-    """Evaluate two greedy episodes, then again with a low step limit. Repeat the second order, as if its answer were lost.
+    """Evaluate two greedy episodes, then again with a low step limit. Repeat the second order, as if its answer had been
+    lost.
 
     The watch compares the two answers.
     """
@@ -727,8 +728,8 @@ def evaluates_one_version(learner: Learner) -> Script[None]:
 def evaluates_with_rows(learner: Learner) -> Script[None]:
     """Evaluate episodes and ask for their rows. A client may decline.
 
-    The orders vary: sampled and greedy actions, the same seeds in another order, episodes that are cut and that aren't. The
-    watch recomputes what it can of each answer.
+    The orders vary: sampled or greedy actions, the same seeds in another order, episodes that are cut or run to their end.
+    The watch recomputes what it can of each answer.
     """
     session = yield from collecting(learner)
     order = _evaluation(learner, greedy=False, send_rows=True, seeds=(1, 2, 3, 4))
@@ -754,7 +755,7 @@ def evaluates_with_rows(learner: Learner) -> Script[None]:
 
 
 def evaluates_under_no_other_version(learner: Learner) -> Script[None]:
-    """Send newer weights before those of an evaluation. The rows show the watch which weights the evaluation used."""
+    """Send newer weights before those of an evaluation. From the rows, the watch sees which weights the evaluation used."""
     session = yield from collecting(learner)
     session.give(session.weights(2, -session.random_parameters(1)))
     order = _evaluation(learner, send_rows=True)

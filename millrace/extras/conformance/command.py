@@ -25,13 +25,14 @@ class ConformFlags(msgspec.Struct, frozen=True, kw_only=True):
     """Check a client, which is a worker in any language, with `millrace conform [flags] -- COMMAND`.
 
     Plays the learner on a port of this machine, starts COMMAND, and walks it through the messages, states and faults of the
-    wire document. In COMMAND, {address} is where to connect and {token} a file with the join token; the environment has
-    them as MILLRACE_ADDRESS and MILLRACE_TOKEN. Exit code 0: the client conforms; 1: it does not.
+    wire document. In COMMAND, {address} stands for the address to connect to, and {token} for a file with the join token;
+    the environment variables MILLRACE_ADDRESS and MILLRACE_TOKEN have the same values. Exit code 0: the client conforms; 1:
+    it does not.
     """
 
     profile: Literal["collector", "environment"] = "environment"
-    """environment: the learner acts, the client resets and steps its copies; collector: the client acts, by the weights that
-    it is sent
+    """environment: the learner acts, the client resets and steps its copies; collector: the client acts, with the weights
+    that it is sent
     """
     env: Annotated[str, Flag("ID")] = "CartPole-v1"
     """the environment that the client is asked for"""
@@ -42,7 +43,7 @@ class ConformFlags(msgspec.Struct, frozen=True, kw_only=True):
     json: Annotated[str, Flag("FILE")] = ""
     """also write the report to FILE, as JSON"""
     with_keys: bool = False
-    """encrypt the connection; {token} in COMMAND does so too"""
+    """encrypt the connection; {token} in COMMAND has the same effect"""
     patience_s: Positive = 5.0
     """seconds that an answer of the client may take"""
     start_s: Positive = 20.0

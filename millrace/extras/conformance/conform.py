@@ -47,7 +47,7 @@ ADDRESS_WORD = "{address}"
 TOKEN_WORD = "{token}"
 POLL_S = 0.05
 STOP_CLIENT_WITHIN_S = 4.0  # time from SIGTERM until the client is killed
-LISTEN_WITHIN_S = 3.0  # after a socket was closed, its port may still be in use for a moment
+LISTEN_WITHIN_S = 3.0  # a closed socket's port may stay in use for a moment
 KEPT_LINES = 40  # number of lines of the client's output to keep
 MOST_PACKED_BYTES = 1 << 26  # largest size of one message
 
@@ -95,7 +95,7 @@ def conform(
             for event in port.heard(min(POLL_S, examiner.next_due_s() - time.monotonic())):
                 perform(examiner.handle(event, time.monotonic()))
             if (ended := process.ended()) is not None:
-                for event in port.heard(POLL_S):  # the last messages of the process that ended
+                for event in port.heard(POLL_S):  # the ended process's last messages
                     perform(examiner.handle(event, time.monotonic()))
                 perform(examiner.handle(ended, time.monotonic()))
             for result in examiner.results[told:]:

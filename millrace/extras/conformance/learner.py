@@ -88,12 +88,12 @@ class Learner:
         """the newest Hello of the running process; until its first Hello, messages come from the previous process"""
         self.answers_heartbeats = True
         self.may_leave = False
-        """whether the client may leave its session, or a new process may take its name; then no Heartbeat is due"""
+        """whether the client may leave its session, or a new process take its name; if so, no Heartbeat is due"""
         self.tickets = count(101)
         self.env: DescribedEnv | None = None
         """the environment that the client has described, at any time during the test"""
         self.step_s = 0.0
-        """time of an env step in a long rollout; 0 if it hasn't been measured yet"""
+        """time per env step in a long rollout; 0 if it hasn't been measured yet"""
         self._sessions = count(0x5EED_0001)
         self._had_a_session = False  # whether the running process has had a session
         self._steps = 0  # number of env steps that the running process has reported
@@ -169,7 +169,7 @@ class Learner:
                 self.is_mute = False
                 return wanted(event)
             case Heard(_, Hello() | Alive() | Inquire() | BadMessage()):
-                return False  # its sender is a supervisor, a process that was ended, or a second worker of this command
+                return False  # from a supervisor, a process that was ended, or a second worker started by this command
             case Heard(peer, message) if peer == self.peer and self.hello is not None:
                 return self._take_message(message, event, wanted)
         return False

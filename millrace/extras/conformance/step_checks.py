@@ -201,7 +201,7 @@ def ends_episodes(learner: Learner) -> Script[None]:
 def resets_otherwise(learner: Learner, mode: Mode) -> Script[None]:
     """Use the same seeds and actions with autoreset mode NextStep and then with `mode`, until an episode has ended.
 
-    NextStep shows both the last observation of that episode and the first one of the next, to compare with.
+    For comparison, NextStep shows both the last observation of that episode and the first one of the next.
     """
     steps = yield from stepping(learner)
     row = yield from steps.do(steps.reset())

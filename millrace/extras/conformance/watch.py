@@ -1,4 +1,4 @@
-"""Rules that apply to every message of a session, whatever is being checked. Pure: messages and `now` in, `Broken` out.
+"""Rules that apply to every message in a session, whichever check is running. Pure: messages and `now` in, `Broken` out.
 
 The watch records what the learner has sent in this session, and sees each message of the client before the check does.
 """
@@ -222,7 +222,7 @@ class WatchedSession:
                 if not isinstance(order, Evaluate):
                     raise Broken(Rule.EVALUATE, "the ticket of an Evaluate of this session", brief(message))
                 self._see_played(message, order)
-            case Goodbye() | Failure() if self._refused and not self._drains:  # after a Drain, it may answer that
+            case Goodbye() | Failure() if self._refused and not self._drains:  # after a Drain, this may answer the Drain
                 raise Broken(Rule.AFTER_REFUSE, "no last words after Refuse", brief(message))
             case Goodbye():
                 self._see_tickets(message.tickets)
@@ -287,7 +287,8 @@ class WatchedSession:
     def rule_of_missing(self, ticket: int, otherwise: Rule) -> Rule:
         """The rule that is probably broken if the client does nothing about a ticket.
 
-        In a later session, a client that didn't forget the previous one may mistake a lane's first permit for an old permit.
+        In a later session, a client that didn't forget the previous session may mistake a lane's first permit for an old
+        one.
         """
         is_old = not self._is_first_session and ticket in self.permits and not self.permits[ticket].permit.sequence
         return Rule.FORGETS if is_old else otherwise
@@ -431,7 +432,7 @@ class WatchedSession:
         rows.see(message, self.versions[message.version])
 
     def _continued(self, permit: Permit) -> LaneRows:
-        """The rows that this permit continues: those of its lane in the newest incarnation so far."""
+        """The rows of the lane's newest incarnation so far, which this permit continues."""
         newest = max(incarnation for lane, incarnation in self._rows if lane == permit.lane)
         return self._rows[permit.lane, newest]
 

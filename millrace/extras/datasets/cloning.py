@@ -3,8 +3,8 @@
     L = −E[log π(a|o)] + vf_coef · E[(V(o) − G)²]     (SAC and TD3: without the critic)
     G = Σ γⁱ r over the rest of the episode, + γᵏ V(its last observation) if it was truncated
 
-Rule: a gradient step depends only on the demonstrations and the algorithm's saved state, which counts the steps that were
-    made, so that interrupted cloning continues with the same bits. This is why the order of rows in an epoch is sampled from
+Rule: a gradient step depends only on the demonstrations and on the algorithm's saved state, which counts the steps made so
+    far. Interrupted cloning therefore continues bit for bit. For the same reason, an epoch's order of rows is sampled from
     the seed and the epoch's number.
 """
 
@@ -30,16 +30,16 @@ from millrace.protocol.random_streams import Purpose, generator
 from millrace.protocol.rollout import Batch
 
 BATCH_SIZE = 64  # rows in a minibatch; with a larger size, which updates often use, cloning would need more epochs
-LEARNING_RATE = 1e-3  # updates often use a lower rate, to change little; with such a rate, cloning would need more epochs
+LEARNING_RATE = 1e-3  # updates often use a lower rate, to change little; with that rate, cloning would need more epochs
 
 
 def clone(algorithm: Algorithm, episodes: Iterable[Batch], pulse: Callable[[], None]) -> dict[str, float]:
-    """Clone these episodes for `clone_epochs`. Gradient steps that were made before, in a resumed run, aren't repeated.
+    """Clone these episodes for `clone_epochs`. A resumed run doesn't repeat the gradient steps that were already made.
 
     `episodes`: each one is a batch of one column. `pulse`, which may save the state, is called after each gradient step.
-    Returns metrics over all steps of the episodes: `clone/loss`, and how close the policy's most probable actions are to
-    the demonstrated ones, as `clone/accuracy` (choices and bits), `clone/mean_absolute_error` (numbers), or both. Does
-    nothing and returns no metrics if `prior_steps` have already changed the cloned policy, in a resumed run.
+    Returns metrics over all steps of the episodes: `clone/loss`, and how close the policy's most probable actions are to the
+    demonstrated ones, as `clone/accuracy` (choices and bits), `clone/mean_absolute_error` (numbers), or both. In a resumed
+    run whose `prior_steps` have already changed the cloned policy, this does nothing and returns no metrics.
 
     Raises `UsageError` if the algorithm derives from neither `ActorCritic` nor `Continuous`, and `RunError`, before the
     gradient step, if a loss or a gradient isn't finite.

@@ -94,7 +94,7 @@ class DatasetFiles:
                 yield self._episode(file, number)
 
     def _check_counts(self) -> None:
-        """Raise `UsageError` unless the numbers of episodes and steps are those in the metadata, and a file of this size can
+        """Raise `UsageError` unless the numbers of episodes and steps match the metadata, and a file of this size can
         contain them.
         """
         with self._as_usage_error(ARRAYS), SelfContainedHDF5.open(self._folder / ARRAYS) as file:
@@ -147,7 +147,7 @@ class DatasetFiles:
             yield
         except UsageError:
             raise
-        except Exception as error:  # json, msgspec, numpy, HDF5 and Pillow raise a dozen types for damaged files
+        except Exception as error:  # json, msgspec, numpy, HDF5 and Pillow raise a dozen exception types for damaged files
             why = one_line(reason(error), 500)
             raise UsageError(f"{self._name}: {file}: {why}; get the dataset again, or record another") from error
 

@@ -1,8 +1,8 @@
 """Appends episodes to the HDF5 file of a Minari dataset, in Minari's layout.
 
-Rule: HDF5 never sees that a write failed. If it did, for example because the disk is full, it couldn't close the file, and
-    the process would end with a segmentation fault. So HDF5 writes through a file object that stores the first error, and
-    keeps unwritten data in memory until HDF5 has closed the file. Only then is the error raised.
+Rule: HDF5 never sees that a write failed. If it saw a failure, for example because the disk is full, it couldn't close the
+    file, and the process would end with a segmentation fault. Therefore, HDF5 writes through a file object that stores the
+    first error, and keeps unwritten data in memory until HDF5 has closed the file. Only then is the error raised.
 """
 
 from __future__ import annotations

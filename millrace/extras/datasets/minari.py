@@ -1,6 +1,6 @@
 """Writes a Minari dataset. Minari is an optional dependency and is imported only when it is needed.
 
-Rule: the dataset is complete, or doesn't exist: if writing fails, everything that was made for it is removed. Episodes in
+Rule: the dataset is complete, or doesn't exist. If writing fails, everything that was made for it is removed. Episodes in
     memory take at most about `CHUNK_BYTES`. Images are stored losslessly, not as JPEG.
 """
 
@@ -34,7 +34,7 @@ class MinariDataset:
     def __init__(self, dataset_id: str, env: gymnasium.Env[Any, Any], about: str, *, free_version: bool = False) -> None:
         """`env`: the environment that is stored with the dataset. `about`: the dataset's description.
 
-        If a dataset with this id exists, `free_version` takes the next version that is free; otherwise that is an error.
+        If a dataset with this id exists, the next free version is used with `free_version`; without it, this is an error.
         Raises `UsageError` if such a dataset can't be made or Minari isn't installed.
         """
         try:

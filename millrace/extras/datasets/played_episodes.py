@@ -17,7 +17,7 @@ from millrace.protocol.messages import EpisodeRows
 from millrace.protocol.random_streams import Purpose, env_seed
 
 FIRST_EPISODES = 2  # number of episodes in the first plan, when their size isn't known yet
-CHUNK_BYTES = 256 * 2**20  # approximate limit of the memory for the episodes of one plan
+CHUNK_BYTES = 256 * 2**20  # approximate memory limit for the episodes of one plan
 MOST_EPISODES = 256  # largest number of episodes in one plan
 
 
@@ -47,7 +47,7 @@ class PlayedEpisodes:
         self._seeds = iter(seeds)
         self._stochastic = stochastic
         self._to_env_action = action_leaves_of(player.policy.spec)
-        self._episodes = self._steps = self._bytes = 0  # episodes, their steps, and bytes of observations, so far
+        self._episodes = self._steps = self._bytes = 0  # so far: episodes, their steps, and bytes of their observations
 
     def until(self, steps: int) -> Iterator[tuple[RecordedEpisode, bool]]:
         """Yield each episode, and whether it was cut, until the episodes have this number of steps in total.

@@ -26,7 +26,7 @@ NO_LANE = -1  # `Batch.lane` of prior data
 
 
 class PriorDataset(PriorData):
-    """A Minari dataset from the folder that MINARI_DATASETS_PATH names, checked against the policy of a run."""
+    """A Minari dataset from the folder that MINARI_DATASETS_PATH names, checked against a run's policy."""
 
     def __init__(self, dataset_id: str, policy: PolicySpec) -> None:
         """Raises `UsageError` if there is no such dataset, if it does not fit the policy, or if Minari is not installed."""

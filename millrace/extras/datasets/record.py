@@ -1,4 +1,4 @@
-"""`millrace.record` and the command `record`: let workers play episodes of a run's policy, and write them as a dataset."""
+"""`millrace.record` and the command `record`: workers play episodes with a run's policy, which are written as a dataset."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from millrace.protocol.errors import UsageError
 def write_dataset(flags: RecordFlags, watch: ShowPlayed, given: Given | None = None) -> RecordedDataset:
     """Write the dataset.
 
-    Raises `UserFacingError`, or `KeyboardInterrupt` if the user interrupts it; in both cases no files are left behind.
+    Raises `UserFacingError` if this fails, or `KeyboardInterrupt` if the user interrupts it. In both cases, no files are
+    left behind.
     """
     saved = policy_to_play(flags, given)
     for found, why in ((saved.seats, f"{saved.env.id} has several agents"), (saved.spec.critic, "the run has critic_keys")):

@@ -31,10 +31,10 @@ def record_episodes(
     stochastic: bool = False,
     npy: Path | None = None,
 ) -> RecordedDataset:
-    """Let the workers of `player` play the policy of this run folder, and write a dataset of at least `steps` env steps.
+    """Let the workers of `player` play this run folder's policy, and write a dataset of at least `steps` env steps.
 
-    `stochastic`: sample actions from the policy; otherwise take the most probable ones. `npy`: also write this file. Raises
-    `UserFacingError`, and then leaves no files behind.
+    `stochastic`: sample actions from the policy; otherwise take the most probable ones. `npy`: also write this file. If this
+    fails, it raises `UserFacingError` and leaves no files behind.
     """
     if npy is not None and not npy.parent.is_dir():
         raise UsageError(f"{npy} cannot be written: no such folder {npy.parent}")

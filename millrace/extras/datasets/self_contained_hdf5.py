@@ -1,7 +1,7 @@
-"""Reads groups and arrays of an HDF5 file from an untrusted source, and never reads another file.
+"""Reads groups and arrays of an HDF5 file from an untrusted source, and never reads any other file.
 
-Rule: no link is followed, and all data of an array must be in the file, compressed only with h5py's own filters. So memory
-is bounded by the size of the file: an array has at most `MOST_EXPANSION` times as many bytes.
+Rule: no link is followed, and all data of an array must be in the file, compressed only with h5py's own filters. Memory is
+therefore bounded by the file's size, because an array has at most `MOST_EXPANSION` times as many bytes.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class UnfitFile(Exception):
 
 
 class SelfContainedHDF5:
-    """An open file. Its methods raise `UnfitFile`, or, if the file is damaged, one of several errors of h5py."""
+    """An open file. Its methods raise `UnfitFile` or, if the file is damaged, one of several h5py errors."""
 
     def __init__(self, file: Any, most_bytes: int) -> None:
         """`most_bytes`: the largest allowed size of an array."""

@@ -2,7 +2,7 @@
 
 Rule: the dataset contains the rollouts that updates have used. The rollouts of an update that is undone are not recorded,
     because a resumed run uses them, or collects them again. A resumed run makes another dataset. If the dataset can't be
-    written, training doesn't stop. The dataset is removed, and the run fails when it has ended.
+    written, training continues. The dataset is then removed, and the run ends with an error.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class TrainingRecorder(Callback):
         self._record(progress.updates)
 
     def _record(self, updates: int) -> None:
-        """Add the kept rollouts, if the run has made the update that uses them. `updates` is the number of its updates."""
+        """Add the kept rollouts if the run has made the update that uses them. `updates` is the run's number of updates."""
         gathered = self._gathered
         self._gathered = None
         if gathered is None or gathered.updates == updates or self._refused is not None:

@@ -1,7 +1,8 @@
 """`millrace evaluate --video`: greedy episodes as mp4 files. Workers play and render; this file only encodes.
 
 Rule: the episodes are the first ones that `millrace evaluate` plays with the same seed. A video has every frame, and is
-    written atomically. Its name has the seed and the number of the episode, so the same episode overwrites its old video.
+    written atomically. Its name contains the seed and the episode's number, so an episode's new video overwrites its old
+    one.
 """
 
 from __future__ import annotations
@@ -21,10 +22,10 @@ from millrace.playing import RecordVideos
 from millrace.protocol.arrays import Array
 from millrace.protocol.errors import EnvironmentFailed, RunError, UsageError, first_line
 
-AT_ONCE = 2  # number of episodes that are in memory, with their frames, at the same time
+AT_ONCE = 2  # number of episodes that are in memory at the same time, with their frames
 LONGEST_EPISODE = 20_000  # env steps; the worker sends frames of the first 1,500
 FRAMES_PER_S = 30  # used if the environment's metadata has no render_fps
-# Bounds of the frame rate that a worker reports for its environment. moviepy writes two decimals.
+# Bounds on the frame rate that a worker reports for its environment. moviepy writes two decimals.
 LEAST_FRAMES_PER_S = 0.01
 MOST_FRAMES_PER_S = 1_000
 FOLDER = "videos"
@@ -49,9 +50,9 @@ def record_videos(
 ) -> tuple[Evaluation, list[Path]]:
     """Let the workers of `player` play episodes, and write a video of each. Names of videos begin with `prefix`.
 
-    `seed`: seed of the episodes; see `EvaluationPlan.of`. `max_steps`: largest number of env steps of all episodes together;
-    each episode gets an equal share, but at most `LONGEST_EPISODE`. Returns the evaluation and the paths of the videos.
-    Raises `UserFacingError`, with a one-line message, if videos can't be made.
+    `seed`: seed of the episodes; see `EvaluationPlan.of`. `max_steps`: limit on the env steps of all episodes together; each
+    episode gets an equal share, but at most `LONGEST_EPISODE`. Returns the evaluation and the paths of the videos. Raises
+    `UserFacingError`, with a one-line message, if videos can't be made.
     """
     env_id = player.policy.env.id
     env = player.describe("rgb_array")
