@@ -4,9 +4,9 @@ Rule: an observation is a stack of screens [4, 84, 84], whichever program steps 
 vectorized form and envpool differ only in their random numbers, and in the frames before an episode's first screen: these
 are zeros, except that envpool repeats the first screen.
 
-Keyword arguments of the environment are the fields of `GameSettings`, and further arguments of the emulator. Scores with
-different settings can't be compared. Ending episodes at lost lives and clipping rewards are meant for training: undo them
-for evaluations with `eval_env_kwargs`.
+The environment's keyword arguments are the fields of `GameSettings` and further arguments for the emulator. Scores with
+different settings can't be compared. Ending episodes at lost lives and clipping rewards are meant for training; turn them
+off for evaluations with `eval_env_kwargs`.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from millrace.protocol.errors import UsageError
 FRAMES = 4
 SKIP = 4
 SIDE = 84
-MAX_FRAMES = 108_000  # time limit of a game in emulator frames: half an hour of play
+MAX_FRAMES = 108_000  # time limit of a game, in emulator frames: half an hour of play
 NOOP = 0  # the action that does nothing
 FIRE = 1  # the action that presses the button, in games that have it
 JOYSTICK_FIRE = np.array([0, 0, 1], np.float32)  # FIRE in a game with continuous actions: radius, angle, fire
@@ -65,7 +65,7 @@ class GameSettings:
 
 
 def make_game(**kwargs: Any) -> gymnasium.Env[Any, Any]:
-    """Make one env copy. `kwargs`: the fields of `GameSettings`, and further arguments of `gymnasium.make`.
+    """Make one env copy. `kwargs`: the fields of `GameSettings`, and further arguments for `gymnasium.make`.
 
     Needs ale-py and OpenCV.
     """
@@ -90,7 +90,7 @@ def make_game(**kwargs: Any) -> gymnasium.Env[Any, Any]:
 
 
 def make_games(num_envs: int, **kwargs: Any) -> VectorEnv[Any, Any, Any]:
-    """Make `num_envs` copies that the emulator steps together, in one thread, because each core already has a worker."""
+    """Make `num_envs` copies that the emulator steps together, in a single thread, as each core already has a worker."""
     _silence_emulator()
     settings, options = GameSettings.split(kwargs)
     made = gymnasium.make_vec(
@@ -214,8 +214,8 @@ class _EndsWithLives(gymnasium.Wrapper[Any, Any, Any, Any]):
 class _StepAfterLives(VectorWrapper):
     """Makes the step after a lost life look like a reset, without reward or end, just as in a loop over env copies.
 
-    In this step, the emulator continues the game with the policy's action. If this very step ends the game or loses a life,
-    the end is reported one step later, so that the episode has one step.
+    In this step, the emulator continues the game with the policy's action. If this step itself ends the game or loses a
+    life, the end is reported one step later, so the episode has one step.
     """
 
     def __init__(self, env: VectorEnv[Any, Any, Any]) -> None:

@@ -132,7 +132,7 @@ def linear_model(physics: Physics) -> tuple[Doubles, Doubles]:
 
 
 def linear_accelerations(physics: Physics) -> Accelerations:
-    """A function like that of `accelerations`, but for the linear model."""
+    """A function like the one that `accelerations` returns, but for the linear model."""
     a, b = linear_model(physics)
     (x1, x2, x3, x4), (t1, t2, t3, t4), (p1, p2, p3, p4) = np.column_stack([a[3:, 1:4], b[3:]]).tolist()
 
@@ -192,7 +192,7 @@ class CartDoublePendulum(gymnasium.Env[Floats, Floats]):
     Terminated: if |x| is above `track_m`, |θ| or |φ| above `angle_limit_rad`, or a speed above `SPEED_LIMIT`. Truncated:
     never, but `gymnasium.make` adds a time limit of 500 steps (10 s).
 
-    `linearised`: move by the linear model. Other keyword arguments are the fields of `Physics`.
+    `linearised`: simulate the linear model. Other keyword arguments are the fields of `Physics`.
     """
 
     metadata = {"render_modes": ["human", "rgb_array"], "render_fps": round(1 / DT_S)}
@@ -227,7 +227,7 @@ class CartDoublePendulum(gymnasium.Env[Floats, Floats]):
         self.track_m = track_m
         self.angle_limit_rad = angle_limit_rad
         self.start_spread = start_spread
-        # Twice the limits of x and the angles, so that even the last observation of an episode is inside the space.
+        # Twice the limits of x and the angles, so that even an episode's last observation is inside the space.
         self._high = np.array([2 * track_m, *[2 * angle_limit_rad] * 2, *[SPEED_LIMIT] * 3], np.float32)
         self.observation_space = spaces.Box(-self._high, self._high, dtype=np.float32)
         self.action_space = spaces.Box(-1, 1, (1,), np.float32)

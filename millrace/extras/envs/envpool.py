@@ -1,8 +1,8 @@
 """envpool's compiled environments under gymnasium's ids.
 
-Rule: an id means the same environment as in gymnasium. Spaces that differ from gymnasium's are an error, and gymnasium's
-time limit applies. This file maps ids to envpool tasks and makes the env copies; `envpool_copies.py` makes their rows follow
-the row format.
+Rule: an id stands for the same environment as in gymnasium. Spaces that differ from gymnasium's are an error, and
+gymnasium's time limit applies. This file maps ids to envpool tasks and makes the env copies; `envpool_copies.py` makes their
+rows follow the row format.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ _WARNINGS_LOCK = threading.Lock()
 
 
 class EnvpoolSpec(NamedTuple):
-    """The way in which envpool makes copies of an environment."""
+    """How envpool makes copies of an environment."""
 
     task: str
-    """envpool's name of the environment"""
+    """envpool's name for the environment"""
     options: dict[str, Any]
-    """keyword arguments of `envpool.make`"""
+    """keyword arguments for `envpool.make`"""
     limit: int
     """number of steps after which `EnvpoolCopies` truncates an episode; envpool itself doesn't"""
     observation_space: gymnasium.Space[Any]

@@ -1,8 +1,8 @@
 """The env copies of one lane in envpool, with time limits that are applied here.
 
-Rule: autoreset is NextStep, as in envpool. Flags are exact, unlike envpool's: envpool reports an episode that terminates in
-the last step before its time limit only as truncated. So envpool gets a limit that is one step longer, and never reaches it:
-this file truncates an episode at its time limit, and resets the copy explicitly in the next step.
+Rule: autoreset is NextStep, as in envpool. Flags are exact, unlike envpool's: if an episode terminates in the last step that
+its time limit allows, envpool reports it only as truncated. Therefore, envpool gets a limit that is one step longer, which
+it never reaches, because this file truncates an episode at its time limit and resets the copy explicitly in the next step.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from millrace.workers.copy_slots import close_copy, give_back
 
 
 class EnvpoolCopies:
-    """N copies in one pool. The pool is made by `reset`, because envpool accepts seeds only at that moment."""
+    """N copies in one pool. `reset` makes the pool, because envpool accepts seeds only when a pool is made."""
 
     def __init__(self, pool: EnvpoolSpec, copies: int, facts: Sequence[str] = ()) -> None:
         """`facts`: names of the numbers in `info` that are reported for each episode."""

@@ -28,12 +28,12 @@ def open_native(run: RunSpec, first: EnvCopy, pulse: Pulse) -> VectorCopies:
 
 def open_envpool(run: RunSpec, first: EnvCopy, pulse: Pulse) -> EnvpoolCopies:
     """Make the copies of a lane with envpool."""
-    with activity().during(MAKING):  # importing the module that registers the environment may take long
+    with activity().during(MAKING):  # importing the module that registers the environment may take a long time
         return make_copy(first, lambda: EnvpoolCopies(envpool_spec(run.env), run.copies, run.facts))
 
 
 def native_spaces(env: EnvSpec) -> tuple[gymnasium.Space[Any], gymnasium.Space[Any]]:
-    """Observation and action space of one copy. To find them, this makes a vector environment and closes it."""
+    """Observation and action space of one copy. To find them, this function makes a vector environment and closes it."""
     made = make_copy(FIRST_COPY, lambda: make_native(env, 1))
     spaces = made.single_observation_space, made.single_action_space
     close_copy(made)

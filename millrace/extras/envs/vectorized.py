@@ -1,7 +1,7 @@
 """An environment's own vectorized form: gymnasium's `vector_entry_point`.
 
-Rule: its autoreset mode must be NEXT_STEP: it resets a copy in the step after the end of an episode, as a loop over env
-copies does. In another mode, the last observation of an episode couldn't be distinguished from the first one of the next.
+Rule: its autoreset mode must be NEXT_STEP, which resets a copy in the step after the end of an episode, as a loop over env
+copies does. In another mode, an episode's last observation couldn't be distinguished from the first one of the next episode.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from millrace.protocol.errors import UsageError
 
 
 def make_native(env: EnvSpec, copies: int) -> VectorEnv[Any, Any, Any]:
-    """Make a vector environment of `copies` env copies with the environment's own code. Raises `UsageError`."""
+    """Make `copies` env copies with the environment's own vectorized code. Raises `UsageError` if it can't be used."""
     check_unwrapped_id(env, "native")
     made = env.make_vectorized(copies)
     try:

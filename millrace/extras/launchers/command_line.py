@@ -18,7 +18,7 @@ Flags = TypeVar("Flags", bound=LaunchFlags)
 
 METRICS_PORT = 9464
 SET_BY_LAUNCHER = ("bind", "advertise", "run-dir", "resume", "keys", "insecure", "launched-workers")
-"""Flags of the learner that a launcher sets, so the user must not set them"""
+"""Learner flags that a launcher sets, so the user must not set them"""
 NO_TEXT_IN_YAML = ("true", "false", "null", "on", "off", "yes", "no", "y", "n")
 DNS_LABEL = re.compile(r"[a-z]([-a-z0-9]{0,38}[a-z0-9])?")
 
@@ -35,13 +35,13 @@ def read_flags(
         name, _, _ = flag.partition("=")
         if name.startswith("--") and name.removeprefix("--").replace("_", "-") in set_by_launcher:
             raise UsageError(f"launch {launcher}: {flag} is set by the launcher; leave it out")
-    # This raises for wrong flags. It leaves out --resume, which the launcher sets.
+    # This raises an error for wrong flags. It leaves out --resume, which the launcher sets.
     read_config("learner", [flags.env, "--bind", "tcp://0.0.0.0:5555", *rest])
     return flags, rest
 
 
 def learner_flags(env: str, rest: Sequence[str], workers: int, *, bind: str, runs: str) -> list[str]:
-    """The flags of a learner on a cluster that starts `workers` worker processes for it.
+    """The flags of a learner on a cluster, which starts `workers` worker processes for the learner.
 
     With these flags, the learner resumes the newest run, and waits ten minutes for workers. `bind`: the address where the
     workers join. `runs`: the folder of runs.

@@ -26,11 +26,11 @@ class KubernetesFlags(LaunchFlags, frozen=True, kw_only=True):
     """Print a Kubernetes manifest with a learner and workers: millrace launch kubernetes ENV > k8s.yaml."""
 
     keys: str = ""
-    """key folder to write into the manifest as a Secret; then the manifest itself is secret"""
+    """key folder to write into the manifest as a Secret; the manifest itself must then be kept secret"""
     learner_image: str = "millrace-learner"
-    """image built from docker/Dockerfile, target learner, as the cluster finds it"""
+    """name by which the cluster finds the image built from docker/Dockerfile, target learner"""
     worker_image: str = "millrace-worker"
-    """image built from docker/Dockerfile, target worker, as the cluster finds it"""
+    """name by which the cluster finds the image built from docker/Dockerfile, target worker"""
     storage: str = "10Gi"
     """size of the volume for run folders"""
     learner_cpu: str = "2"
@@ -57,7 +57,7 @@ class SlurmFlags(LaunchFlags, frozen=True, kw_only=True):
     partition: str = ""
     """partition of the cluster; if not given, the cluster's default"""
     python: Path = Path()
-    """the Python interpreter with millrace, on every node; if not given, the one that runs this command"""
+    """Python interpreter on every node that has millrace installed; if not given, the one that runs this command"""
 
 
 class RayFlags(LaunchFlags, frozen=True, kw_only=True):
@@ -66,6 +66,6 @@ class RayFlags(LaunchFlags, frozen=True, kw_only=True):
     address: str = "auto"
     """address of the cluster, HOST:PORT; auto is the environment variable RAY_ADDRESS, or the cluster of this machine"""
     processes: int = 1
-    """worker processes in each actor; the actor takes as many of Ray's cores"""
+    """worker processes in each actor, which takes as many of Ray's cores"""
     port: int = 5555
-    """port where the learner listens, on the address of this node"""
+    """port where the learner listens, on this node's address"""

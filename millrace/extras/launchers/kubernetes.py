@@ -1,8 +1,8 @@
 """`millrace launch kubernetes`: makes a manifest with a learner and workers. Pure, except that it reads a key folder.
 
 The learner is a Job, which ends with the run. If its pod is lost, another pod resumes the run from the newest checkpoint.
-The workers are a Deployment. Its size may change at any time, and it stays for the next learner. The manifest contains
-secrets only if the user named a key folder.
+The workers are a Deployment, which can be resized at any time and stays for the next learner. The manifest contains secrets
+only if the user named a key folder.
 """
 
 from __future__ import annotations
@@ -23,7 +23,10 @@ TOKEN = f"{FIRST_CLIENT}.token"
 
 
 def manifest(flags: KubernetesFlags, rest: Sequence[str], now: datetime) -> str:
-    """The manifest, as YAML documents. `rest`: the user's flags for the learner. Raises `UsageError`."""
+    """The manifest, as YAML documents. `rest`: the user's flags for the learner.
+
+    Raises `UsageError` if a flag or the key folder can't be used.
+    """
     keys = [_secret(flags.name, KeyFolder(expanded(flags.keys, "key folder")), now)] if flags.keys else []
     parts = [*keys, _service(flags), _storage(flags), _learner(flags, rest), _workers(flags), _budget(flags)]
     return _comments(flags) + "---\n" + "---\n".join(parts)

@@ -27,7 +27,9 @@ from millrace.protocol.keys.worker_token import read_token
 
 
 def launch(flags: RayFlags, rest: Sequence[str], watch: Watch) -> Path:
-    """Train a policy. Returns the run folder. `rest`: the user's flags for the learner. Raises `UserFacingError`."""
+    """Train a policy. Returns the run folder. `rest`: the user's flags for the learner. Raises `UserFacingError` if it
+    fails.
+    """
     for name in ("processes", "port"):
         if getattr(flags, name) < 1:
             raise UsageError(f"{name}: expected int >= 1, got {getattr(flags, name)}")
@@ -49,7 +51,7 @@ def launch(flags: RayFlags, rest: Sequence[str], watch: Watch) -> Path:
 
 
 def _token_text(keyring: Keyring | None) -> str:
-    """The first join token in the key folder, as text; empty if the learner needs no keys. Raises `UsageError`."""
+    """The key folder's first join token; empty if the learner needs no keys. Raises `UsageError` if there is none."""
     if keyring is None or keyring.folder is None:
         return ""
     files = [keyring.folder.token_path(name) for name in keyring.allowed.names()]

@@ -1,7 +1,7 @@
 """`millrace launch slurm`: makes the script of one Slurm job that runs a learner and workers. Pure; no scheduler logic.
 
 The job has two steps: the learner on the job's first node, and the workers on nodes that Slurm chooses. All nodes share a
-folder, which contains the learner's address, the keys and the run folders. So a job that is queued again resumes its run.
+folder, which contains the learner's address, the keys and the run folders, so a requeued job resumes its run.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from millrace.protocol.home_folder import expanded
 
 
 def script(flags: SlurmFlags, rest: Sequence[str]) -> str:
-    """The script for sbatch. `rest`: the user's flags for the learner. Raises `UsageError`."""
+    """The script for sbatch. `rest`: the user's flags for the learner. Raises `UsageError` for text sbatch can't take."""
     folder = expanded(flags.folder, "folder").absolute()
     for text in (str(folder), flags.time, flags.partition):
         if any(character.isspace() or character in "%\"'\\" for character in text):

@@ -13,9 +13,9 @@ from typing import Any
 from millrace import Progress
 from millrace.extras.monitoring.run_rows import RowCallback, flat_settings, run_name, tool
 
-MOST_PARAMETERS = 100  # largest number of parameters in one request
-MOST_CHARACTERS = 500  # largest length of a parameter's value
-NOT_ALLOWED = re.compile(r"[^/\w.\- :]")  # characters that MLflow refuses in the name of a metric
+MOST_PARAMETERS = 100  # maximum number of parameters in one request
+MOST_CHARACTERS = 500  # maximum length of a parameter's value
+NOT_ALLOWED = re.compile(r"[^/\w.\- :]")  # characters that MLflow refuses in a metric's name
 RUN_TAG = "millrace.run"
 
 
@@ -32,7 +32,7 @@ class MlflowCallback(RowCallback):
     """
 
     def __init__(self, experiment: str = "millrace", tracking_uri: str | None = None, every_s: float = 1.0) -> None:
-        """`tracking_uri`: by default, the tracking URI of `mlflow`. `every_s`: least number of seconds between two rows.
+        """`tracking_uri`: by default, the tracking URI of `mlflow`. `every_s`: minimum number of seconds between two rows.
 
         Raises `UsageError` if MLflow is not installed.
         """

@@ -1,11 +1,11 @@
 """Serves the learner's metrics to Prometheus at `/metrics`. Their names follow Prometheus's conventions.
 
-Rule: now and then, the training loop publishes a whole snapshot in one assignment. It never waits. The server's threads read
-only the newest snapshot. Labels have few values: millrace's own, and at most `MAX_FACTS` names of `info_keys`, but never
-names of workers, paths or keys.
+Rule: at intervals, the training loop publishes a complete snapshot in one assignment. It never waits. The server's threads
+read only the newest snapshot. Labels have few values: millrace's own, and at most `MAX_FACTS` names of `info_keys`, but
+never names of workers, paths or keys.
 
-Rule: counters count what this learner did. A resumed run continues from a checkpoint that may know less than Prometheus has
-seen, and Prometheus takes a counter that falls for one that has begun again at 0.
+Rule: counters count only what this learner process did. A resumed run continues from a checkpoint whose counts may be lower
+than those that Prometheus has seen, and Prometheus would take a falling counter for one that restarted at 0.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ from millrace.protocol.errors import UsageError
 
 log = logging.getLogger("millrace.learner")
 
-EVERY_S = 0.5  # least time between two snapshots
+EVERY_S = 0.5  # minimum time between two snapshots
 SCRAPE_TIMEOUT_S = 5.0  # if a scraper sends nothing for longer, its connection is closed, and its thread ends
 LAGS = (0, 1, 2, 4, 8, 16, 32)
 """upper bounds of the histogram's buckets, in versions"""
@@ -66,7 +66,7 @@ class MetricsCollector(Collector):
     """Keeps the newest snapshot and turns it into metrics."""
 
     def __init__(self, config: Config, clock: Callable[[], float] = time.time, observed: Observed | None = None) -> None:
-        """`clock`: seconds since 1970. `observed`: the snapshot to show before the first call of `observe`."""
+        """`clock`: seconds since 1970. `observed`: the snapshot to show before the first call to `observe`."""
         self._clock = clock
         self._observed = observed
         self._before: HubSnapshot | None = (
@@ -93,7 +93,7 @@ class MetricsCollector(Collector):
         """All metrics. A thread of the server calls this once for each scrape."""
         yield InfoMetricFamily("millrace_build", "Versions of millrace and of what decides its results.", versions())
         yield InfoMetricFamily("millrace_run", "What is trained.", self._about)
-        # Reported even before the first worker has joined, because an autoscaler may need it to start one.
+        # Reported even before the first worker has joined, because an autoscaler may need this number to start one.
         wanted = "Workers with which each lane has its own: the number to scale to."
         yield GaugeMetricFamily("millrace_workers_wanted", wanted, self._wanted)
         if (observed := self._observed) is not None:
@@ -148,7 +148,7 @@ def _of_progress(hub: HubSnapshot, before: Progress) -> Iterator[Metric]:
 
 
 def _of_facts(facts: Mapping[str, FactMean]) -> Iterator[Metric]:
-    """The numbers of `info_keys`. Their names are values of a label. They may be any text, because labels are escaped."""
+    """The numbers that `info_keys` names. A name is the value of a label and may be any text, because labels are escaped."""
     means = GaugeMetricFamily(
         "millrace_episode_info_mean",
         "Numbers in info, by name: of those of the last 100 training episodes that have it.",

@@ -1,4 +1,4 @@
-"""The data of a run that callbacks send to other programs: settings, and at most one row of numbers in `every_s` seconds.
+"""The run data that callbacks send to other programs: settings, and at most one row of numbers per `every_s` seconds.
 
 Rule: rows with an evaluation and the last row are always sent, including the numbers that callbacks before this one logged.
 Missing numbers are left out.
@@ -58,11 +58,11 @@ class RowFilter:
 class RowCallback(Callback):
     """The base of callbacks that send rows to a tool. A subclass for each tool implements `_begin`, `_send` and `_end`.
 
-    An error of the tool ends the run, with a message of one line that names the tool.
+    An error in the tool ends the run with a one-line message that names the tool.
     """
 
     def __init__(self, tool: str, every_s: float) -> None:
-        """`tool`: the name of the tool's module. `every_s`: least number of seconds between two rows."""
+        """`tool`: the name of the tool's module. `every_s`: minimum number of seconds between two rows."""
         self._tool = tool
         self._rows = RowFilter(every_s)
 

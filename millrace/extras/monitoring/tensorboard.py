@@ -1,4 +1,4 @@
-"""Writes the metrics of a run as TensorBoard events, into the folder tensorboard of the run folder.
+"""Writes a run's metrics as TensorBoard events, into the subfolder tensorboard of the run folder.
 
 Rule: events that can't be written, for example because the disk is full, are written later, like all files of a run. A
 resumed run writes a file of its own, which tells TensorBoard to discard the events after the checkpoint.
@@ -28,7 +28,7 @@ class TensorBoardCallback(RowCallback):
     """Writes one row every `EVERY_S` seconds, and in addition every row with an evaluation and the last row."""
 
     def __init__(self, folder: RunFolder, every_s: float = EVERY_S) -> None:
-        """`every_s`: least number of seconds between two rows."""
+        """`every_s`: minimum number of seconds between two rows."""
         super().__init__("tensorboard", every_s)
         self._folder = folder
         self._file: RecordFile | None = None

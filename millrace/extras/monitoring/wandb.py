@@ -22,7 +22,7 @@ class WandbCallback(RowCallback):
     """
 
     def __init__(self, every_s: float = 1.0, **init: Any) -> None:
-        """`every_s`: least number of seconds between two rows. `init`: keyword arguments of `wandb.init`.
+        """`every_s`: minimum number of seconds between two rows. `init`: keyword arguments for `wandb.init`.
 
         Raises `UsageError` if wandb is not installed.
         """

@@ -21,10 +21,9 @@ class DashboardFlags(msgspec.Struct, frozen=True, kw_only=True):
     folders: Annotated[tuple[Path, ...], Flag("RUNS ...", positional=True)] = ()
     """folders of runs, or run folders; if none is given, runs"""
     bind: str = "127.0.0.1:0"
-    """where the page is served, as HOST:PORT; port 0 is a free one"""
+    """where the page is served, as HOST:PORT; port 0 means any free port"""
     insecure: bool = False
-    """also serve it at an address that others can reach: anyone who learns the page's address sees everything in these runs
-    """
+    """serve the page even where others can reach it: anyone who learns its address sees everything in these runs"""
 
 
 def dashboard(argv: list[str]) -> int:

@@ -17,7 +17,7 @@ from urllib.parse import parse_qs, unquote, urlsplit
 CONTENT_SECURITY_POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self'; "
     "media-src 'self'; form-action 'self'; base-uri 'none'; "
-    "frame-ancestors http://localhost:* http://127.0.0.1:* vscode-webview:"  # notebooks show it in a cell
+    "frame-ancestors http://localhost:* http://127.0.0.1:* vscode-webview:"  # notebooks show the page in a cell
 )
 HEADERS = {
     "Content-Security-Policy": CONTENT_SECURITY_POLICY,

@@ -1,4 +1,4 @@
-"""The runs that the dashboard shows, read from their folders again and again.
+"""The runs that the dashboard shows, read from their folders at each request.
 
 Rule: unchanged files are not read again, and only a bounded number of rows of a long metrics.jsonl is kept. Addresses of
 pages contain a run's key instead of its path.

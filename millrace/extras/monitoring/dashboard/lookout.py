@@ -1,7 +1,7 @@
-"""Asks the learners of the runs on open pages for their status twice a second, and keeps the answers of the last minutes.
+"""Asks each learner whose run has an open page for its status twice a second, and keeps the last minutes' answers.
 
-Rule: a learner is asked in the same way as by `millrace status`, with the same rights, and only while a page of its run is
-open. The memory for a run is bounded, and freed when no page is open. An open page calls `look` once a second (`page.js`).
+Rule: a learner is asked just as `millrace status` asks it, with the same rights, and only while a page of its run is open.
+The memory for a run is bounded, and freed when no page is open. An open page calls `look` once a second (`page.js`).
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ LEARNER: dict[str, str] = {
     "evaluating": "evaluating",
     "starting": "starting",
 }
-"""The picture's word for what a learner is doing, for each phase of its progress"""
+"""The word in the picture "Who waits for whom" for what a learner is doing, by the phase of its progress"""
 WORKER = {
     "stepping": "collecting",
     "repeating": "resetting",
@@ -54,7 +54,7 @@ WORKER = {
     "closing": "resetting",
     "waiting": "waiting",
 }
-"""The picture's word for what a lane is doing, for each activity of its worker"""
+"""The word in that picture for what a lane is doing, by the activity of its worker"""
 
 
 class LaneSample(NamedTuple):
@@ -123,8 +123,8 @@ class Lookout:
         self._thread.join()
 
     def look(self, run: Path) -> Seen:
-        """What is known about the learner of this run. From now on, the learner is asked again and again while a page of the
-        run is open.
+        """What is known about the learner of this run. From now on, the learner is asked repeatedly while a page of the run
+        is open.
         """
         with self._lock:
             watched = self._watched.setdefault(run, _Watched(self._clock()))

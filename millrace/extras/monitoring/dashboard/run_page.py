@@ -80,7 +80,7 @@ class Choice(NamedTuple):
 
 
 def head(line: RunLine, seen: Seen, report: ReportedRun | None, home: str) -> str:
-    """The head of the page: what run it is, a sentence about its activity or how it ended, and its newest warning.
+    """The head of the page: which run it is, what it is doing or how it ended, and its newest warning.
 
     `home`: the address of the page of all runs; empty if the dashboard shows only this run.
     """

@@ -27,7 +27,7 @@ LINGER_S = 2.5  # how long the dashboard stays after the run, so that open pages
 
 
 def serve(folders: Sequence[Path], host: str, port: int, listening: Callable[[str], None]) -> None:
-    """Serve until Ctrl-C. `listening` is called with the address of the first page. Raises `UsageError`.
+    """Serve until Ctrl-C. `listening` is called with the address of the first page. Raises `UsageError` if it can't listen.
 
     This gives the process the lowest priority, so that it doesn't slow training on this machine.
     """
@@ -65,7 +65,7 @@ def _say(line: str) -> None:
 
 
 def main() -> None:
-    """Serve at a free port of this machine, for the program that started this one."""
+    """Serve on a free port of this machine, for the program that started this one."""
     threading.Thread(target=_end_with_input, daemon=True).start()
     try:
         serve([Path(folder) for folder in sys.argv[1:]], "127.0.0.1", 0, _say)

@@ -1,7 +1,8 @@
 """The dashboard's sockets: they accept connections and send the answers of `site.py`. No files are written.
 
-Rule: no client can block the server. A connection has one request. Its head, and each part of the answer, have a deadline
-and a largest size. If there are too many connections, the oldest one is closed. Pages are made one at a time in a thread.
+Rule: no client can block the server. A connection carries one request. The request's head and each part of the answer have a
+deadline and a maximum size. If there are too many connections, the oldest one is closed. Pages are made one at a time in a
+thread.
 """
 
 from __future__ import annotations
@@ -38,7 +39,10 @@ class DashboardServer:
         self._open: dict[asyncio.Task[None], None] = {}  # connections, the oldest first
 
     async def serve(self, host: str, port: int, listening: Callable[[str], None]) -> None:
-        """Serve until it is cancelled. `listening` is called with the address of the first page. Raises `UsageError`."""
+        """Serve until cancelled. `listening` is called with the address of the first page.
+
+        Raises `UsageError` if it can't listen there.
+        """
         named = "" if host in WILDCARDS and ":" not in host else host.strip("[]")
         try:
             server = await asyncio.start_server(self._connected, named or None, port, limit=MOST_HEAD_BYTES)

@@ -1,6 +1,6 @@
 """Charts as SVG text: axes, lines, bands, dots. Pure. The style sheet sets the colors, by class, so that dark mode works.
 
-Rule: up to 56 lines look different. After the seven colors of the style sheet, the colors are used again with dashes.
+Rule: up to 56 lines look different. After the style sheet's seven colors, the colors are reused with dashes.
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ from millrace.protocol.errors import UsageError
 
 
 class PlotFlags(msgspec.Struct, frozen=True, kw_only=True):
-    """Draw the learning curves of a report: a panel for each environment, a color for each group, a band over seeds."""
+    """Draw a report's learning curves: a panel for each environment, a color for each group, a band over seeds."""
 
     runs: Annotated[tuple[Path, ...], Flag("RUN ...", positional=True)]
     """run folders"""

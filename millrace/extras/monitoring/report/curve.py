@@ -42,7 +42,7 @@ class RunRecord(NamedTuple):
     seed: int
     config: dict[str, Any]
     workers_elsewhere: bool
-    """Whether the run's workers were started elsewhere. Then the setting `workers` has no meaning."""
+    """Whether the run's workers were started elsewhere. If so, the setting `workers` has no meaning."""
     rows: list[dict[str, Any]]
 
     def curve(self) -> Curve | None:
@@ -52,7 +52,7 @@ class RunRecord(NamedTuple):
 
 
 def evaluated_at(row: Mapping[str, Any]) -> Any:
-    """The env steps of the policy to which the evaluation in a row of metrics belongs."""
+    """For a row of metrics with an evaluation, the env steps of the evaluated policy."""
     return row.get(EVALUATED_AT_KEY, row[ENV_STEPS_KEY])
 
 
@@ -75,7 +75,8 @@ def points(rows: Sequence[Mapping[str, Any]], key: str, *, over_time: bool = Fal
 def read_run_files(run: Path, rows: list[dict[str, Any]] | None = None) -> RunRecord:
     """Read a run folder.
 
-    `rows`: the rows of its metrics, if they have been read already. Raises `UsageError`, with a one-line message.
+    `rows`: the rows of its metrics, if they have already been read. Raises `UsageError`, with a one-line message, if the
+    folder can't be read.
     """
     RunFolder.open(run)
     elsewhere = check_format(run).workers_elsewhere

@@ -1,7 +1,7 @@
 """Reads a growing metrics.jsonl, each time from where the last read ended, and keeps a bounded number of its rows.
 
-Rule: of a long file, it keeps rows at equal intervals, rows with an evaluation (all of them as long as they are few), and
-the newest row. Of all evaluations it keeps three numbers, so that the best one is known. The newest row is read again each
+Rule: from a long file, it keeps evenly spaced rows, rows with an evaluation (all of these while there are few), and the
+newest row. For every evaluation, it keeps three numbers, so that the best one is known. The newest row is read again each
 time, because a run may add numbers to it. If the file was replaced, for example by a resume, it is read from the beginning.
 """
 
@@ -23,7 +23,7 @@ from millrace.learner.run_folder.regular_files import MOST_BYTES, open_regular
 from millrace.learner.run_folder.results import EVALUATION_KEY, EVALUATION_LENGTH_KEY
 from millrace.protocol.arrays import Doubles, Ints
 
-MOST_ROWS = 256  # of a long file, at least this many rows are kept, and at most twice as many: a chart has 500 points
+MOST_ROWS = 256  # at least this many rows of a long file are kept, and at most twice as many; a chart has 500 points
 CHUNK_BYTES = 1 << 22
 NEWLINE = 10
 OF_AN_EVALUATION = b'"%s"' % EVALUATION_KEY.encode()

@@ -28,7 +28,7 @@ HEIGHT = 380
 MARGIN = 28
 HEAD = 50
 LINE = 20
-LETTERS = 92  # about the number of letters that fit into WIDTH
+LETTERS = 92  # about how many letters fit into WIDTH
 ZOOM = 2  # the PNG is this many times as large as the SVG
 OWN_STYLE = (
     ".picture { font: 13px system-ui, sans-serif; color: var(--soft); }",
@@ -40,7 +40,7 @@ log = logging.getLogger("millrace.learner")
 
 
 class Drawing:
-    """Learning curves as a picture, which notebooks show."""
+    """Learning curves as a picture that notebooks display."""
 
     def __init__(self, svg: str) -> None:
         self.svg = svg

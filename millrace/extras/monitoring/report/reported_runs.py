@@ -1,8 +1,9 @@
-"""The data of the page: the runs, read from their folders, and the groups of runs.
+"""The page's data: the runs, read from their folders, and the groups of runs.
 
 Rule: if a run hasn't finished, the page shows its curve and its progress. Runs whose environments have different keyword
 arguments are runs of different environments. Runs form a group if they differ only in their seeds and in settings that don't
-affect what is learned from an env step. A run that an error or an interrupt ended is in its group, but isn't part of a mean.
+affect what is learned from an env step. A run ended by an error or an interrupt belongs to its group but isn't part of the
+mean.
 """
 
 from __future__ import annotations
@@ -154,7 +155,9 @@ class ReportData:
         return list(dict.fromkeys(group.env for group in self.groups))
 
     def short_names(self) -> list[str]:
-        """A unique name for each run, in the order of `runs`. It has the environment and group only if there are several."""
+        """A unique name for each run, in the order of `runs`. Environment and group are part of it only if there are
+        several.
+        """
         groups_of_env = Counter(group.env for group in self.groups)
         names = []
         for group, run in self.runs:
@@ -165,9 +168,9 @@ class ReportData:
 
 
 def read_run(path: Path, rows: list[dict[str, Any]] | None = None) -> ReportedRun:
-    """Read a run folder. `rows`: the rows of its metrics, if they have been read already.
+    """Read a run folder. `rows`: the rows of its metrics, if they have already been read.
 
-    Raises `UsageError`, with a one-line message.
+    Raises `UsageError`, with a one-line message, if the folder can't be read.
     """
     files = read_run_files(path, rows)
     of_algorithm = files.config.get(files.algo)
