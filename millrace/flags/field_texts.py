@@ -1,4 +1,4 @@
-"""Reads from a record's source code the string under each field. It is the help text of the field's flag."""
+"""Reads the string under each field of a record from the source code. This string is the help text of the field's flag."""
 
 from __future__ import annotations
 

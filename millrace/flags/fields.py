@@ -29,7 +29,7 @@ class Flag:
     positional: bool = False
     """whether this is a positional argument"""
     hidden: bool = False
-    """whether the help leaves it out, because only processes of millrace pass it to one another"""
+    """whether the help leaves it out, because only millrace's own processes pass it to one another"""
 
 
 class FlagField(NamedTuple):
@@ -70,7 +70,7 @@ class FlagField(NamedTuple):
         return f"{shown}|none" if self.optional else shown
 
 
-@cache  # evaluating the annotations of a record takes milliseconds
+@cache  # evaluating a record's annotations takes milliseconds
 def fields_of(record: type[msgspec.Struct]) -> dict[str, FlagField]:
     """The fields of a record, by name. Fields of base classes come first."""
     found = {}
@@ -84,12 +84,12 @@ def fields_of(record: type[msgspec.Struct]) -> dict[str, FlagField]:
 
 
 def is_choice(hint: Any) -> bool:
-    """Whether a type is a Literal, or a Literal or None."""
+    """Whether a type is a Literal, with or without None."""
     return get_origin(_plain(hint)[0]) is Literal
 
 
 def choices(hint: Any) -> list[str]:
-    """The values that a type allows, as text. The type is a Literal, or a Literal or None."""
+    """The values, as text, that a type allows. The type is a Literal, with or without None."""
     kind, optional = _plain(hint)
     return [*map(str, get_args(kind)), *(["none"] if optional else [])]
 

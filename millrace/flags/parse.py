@@ -2,7 +2,7 @@
 
 Rules: a word that begins with a dash and isn't a number is a flag. Other words are values of the flag before them, up to the
 number of values that the flag takes; the rest are positional arguments. A value that begins with a dash is written after an
-equals sign: `--name=-x`. If a flag is given twice, the last one counts. Errors of the user are one line.
+equals sign: `--name=-x`. If a flag is given twice, the last one counts. A user's mistake is reported in one line.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class Typed(NamedTuple):
 
 
 def parse_flags(record: type[FlagsT], argv: Sequence[str], command: str) -> FlagsT:
-    """Parse these words as a record of this type. Raises `UsageError`, or SystemExit(0) after `--help`."""
+    """Parse these words as a record of this type. Raises `UsageError` for wrong flags, or SystemExit(0) after `--help`."""
     fields = fields_of(record)
     if asks_for_help(argv):
         show_help(command, " ".join((record.__doc__ or "").split()), {"flags": (record, list(fields))})
@@ -97,7 +97,7 @@ def given_values(
     command: str,
     hint: Callable[[str], str] = lambda name: "",
 ) -> dict[str, Any]:
-    """The values that were typed, by field. Raises `UsageError`.
+    """The values that were typed, by field. Raises `UsageError` for unknown flags and wrong values.
 
     `hint` takes the name of an unknown flag, and returns the end of the error's line.
     """

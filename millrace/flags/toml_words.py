@@ -25,7 +25,7 @@ NOTHING = ("none", "null", "nil", "undefined")
 def read_word(word: str) -> object:
     """The value of a word. If it is a value in another language, raises `UsageError`, which says what to write instead."""
     try:
-        # The word is in a table of one line, so that it can begin neither a comment nor another key.
+        # The word is in a one-line table, so that it can begin neither a comment nor another key.
         table = tomllib.loads(f"one = {{value = {word}}}")
     except (ValueError, RecursionError):
         table = {}

@@ -25,7 +25,7 @@ RecordT = TypeVar("RecordT", bound=msgspec.Struct)
 
 
 def read_words(field: FlagField, words: Sequence[str]) -> Any:
-    """Parse these words as the value of this field. Raises `UsageError`."""
+    """Parse these words as the value of this field. Raises `UsageError` if they aren't one."""
     if field.optional and list(words) in (["none"], ["None"]):
         return None
     match get_origin(field.kind):
@@ -81,7 +81,7 @@ def _whole(value: Any) -> Any:
 
 
 def convert(values: Mapping[str, Any], record: type[RecordT], origins: Mapping[str, str]) -> RecordT:
-    """Make the record of these values from Python or TOML. Raises `UsageError`.
+    """Make a record from these values, which come from Python or TOML. Raises `UsageError` if one has a wrong type.
 
     `origins`: how an error refers to each value, such as `--max-lag` or `my.toml: max_lag`, by the value's name.
     """
@@ -112,7 +112,7 @@ def what_was_expected(message: str, hint: Any) -> str:
 
 
 def _entry(field: FlagField, name: str, word: str) -> Any:
-    """The value of an entry in a table. Raises `UsageError`."""
+    """The value of an entry in a table. Raises `UsageError` if the word isn't one."""
     try:
         value = read_word(word)
         return msgspec.convert(value, get_args(field.kind)[1])

@@ -39,7 +39,7 @@ class Crew:
 
     count: int = 0
     lanes: int = 0
-    """the lanes of the run, if its settings leave the number of workers open, so that a better one is suggested; else 0"""
+    """the run's lanes, if its settings leave the number of workers open and a better number may be suggested; otherwise 0"""
     envs: int = 0
     """the env copies in these lanes"""
     evaluating: int = 0
@@ -108,10 +108,10 @@ def _log_folder(run: Path) -> Path:
 def worker_cores(config: RolloutConfig) -> list[int]:
     """The cores to which local workers are pinned, in turn; empty if they aren't pinned.
 
-    New weights wake all workers at once, while the learner still runs. Linux then often puts two workers on one core and
-    leaves another core idle, too briefly for it to move a worker there. Workers aren't pinned if they are fewer than the
-    cores: Linux finds a free core for each, and pinned workers might share a core with the workers of another run. Nor are
-    they pinned in a run with a lag, because nothing would be gained.
+    New weights wake all workers at once, while the learner is still running. Linux then often puts two workers on one core
+    and leaves another core idle, but too briefly to move a worker there. Workers aren't pinned if there are fewer of them
+    than cores, because Linux then finds a free core for each, whereas pinned workers might share a core with another run's
+    workers. Nor are they pinned in a run with a lag, because nothing would be gained.
     """
     if not hasattr(os, "sched_setaffinity"):
         return []

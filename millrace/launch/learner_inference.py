@@ -1,8 +1,8 @@
 """A pool whose workers only step env copies. The policy acts here, for one half of the copies while the other half steps.
 
-The learner collects from a single worker, which is a thread of this process. The env copies of this worker belong to a
-vector environment, whose workers are processes. So tickets, ledger, rows, checkpoints and errors work as in every run, and a
-lane gets the same seeds and random numbers as in a worker that acts itself.
+The learner collects from a single worker, which is a thread of this process. This worker's env copies belong to a vector
+environment, whose workers are processes. Tickets, ledger, rows, checkpoints and errors therefore work as in any other run,
+and a lane gets the same seeds and random numbers as in a worker that acts itself.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ from millrace.workers.evaluate.evaluator import Evaluator
 from millrace.workers.supervise.supervisor import Supervisor
 from millrace.workers.worker_thread import WorkerThread
 
-NEVER_S = 1e9  # the timeout of an order that may take any time
+NEVER_S = 1e9  # timeout of an order that may take any length of time
 
 
 @dataclass(frozen=True)
@@ -51,9 +51,9 @@ class ActingSettings:
 
     copies: VectorEnvSettings
     lanes: int
-    """number of lanes for rollouts; their copies come first"""
+    """number of lanes that collect rollouts; their copies come first"""
     evaluation_copies: int
-    """number of copies for evaluations; these copies come last"""
+    """number of evaluation copies; these come last"""
     facts: Sequence[str]
     """names of the facts that are read"""
     workers: int
@@ -166,7 +166,7 @@ class SteppingPool:
 
 @contextmanager
 def open_stepping_pool(settings: ActingSettings) -> Iterator[SteppingPool]:
-    """Bind the address where the stepping workers join. Raises `UsageError`."""
+    """Bind the address where the stepping workers join. Raises `UsageError` if it can't be bound."""
     with open_worker_pool(BindSettings(), "inproc") as own, ExitStack() as of_env:
         yield SteppingPool(settings, open_vector_env_pool(settings.copies, of_env), own)
 
@@ -222,7 +222,7 @@ class _BeforeWaits:
         self._env = env
         self._workers = workers
         self._timeout_s = timeout_s
-        self._there_s = 0.0  # the last time at which there was a worker, or the beginning of the wait
+        self._there_s = 0.0  # the last time when there was a worker, or the beginning of the wait
 
     def __call__(self, pulse: Pulse) -> None:
         """Begin a wait."""

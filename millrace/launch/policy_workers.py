@@ -1,4 +1,4 @@
-"""Workers that play the episodes of a saved policy: processes of this machine, or workers that join from elsewhere."""
+"""Workers that play episodes with a saved policy: processes on this machine, or workers that join from elsewhere."""
 
 from __future__ import annotations
 
@@ -44,7 +44,8 @@ class PlayingWorkers:
 def policy_player(policy: SavedPolicy, which: PlayingWorkers, watch: Callable[[str], None]) -> Iterator[PolicyPlayer]:
     """A context manager that starts the workers and yields a `PolicyPlayer`, which plays episodes with them.
 
-    `watch` is called with the progress, as text. Raises `UserFacingError`, or `KeyboardInterrupt` after a signal.
+    `watch` is called with the progress, as text. Raises `UserFacingError` if the workers can't start or fail, or
+    `KeyboardInterrupt` after a signal.
     """
     with ExitStack() as stack:
         interrupts = stack.enter_context(Interrupts())

@@ -19,7 +19,7 @@ LONGEST_FOLDER = 80
 
 
 def private_address(transport: str, stack: ExitStack) -> str:
-    """An address that no other process uses; `stack` removes its files. Raises `UsageError`."""
+    """An address that no other process uses; `stack` removes its files. Raises `UsageError` for an unknown transport."""
     match transport:
         case "inproc":
             return f"inproc://millrace-{os.getpid()}-{time.monotonic_ns()}"

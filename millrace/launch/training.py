@@ -47,8 +47,8 @@ def train(config: Config, resume: Path | None, watch: Watch, env: EnvSpec | None
     """Train a policy. Returns the run folder.
 
     `env`: the environment, unless workers find it by the name in the settings. `elsewhere`: workers are started elsewhere
-    and join at `config.bind`. Raises `UserFacingError`, or `Interrupted` if the user stopped the run, even if training had
-    ended by then.
+    and join at `config.bind`. Raises `UserFacingError` if the run fails, or `Interrupted` if the user stopped it, even if
+    training had ended by then.
 
     In a run with shards, rank 0 of the learner processes has the workers and the run folder; the other ranks take part in
     its updates.
@@ -57,7 +57,7 @@ def train(config: Config, resume: Path | None, watch: Watch, env: EnvSpec | None
     if config.shards == 1 and (line := trains_alone(os.environ)):
         log.warning("%s", line)
     check_loopback(place, insecure=config.insecure_shards)
-    if place.rank > 0:  # its machine may have neither the run folder nor the folder of the run to start from
+    if place.rank > 0:  # its machine may lack both the run folder and the folder of the run to start from
         from millrace.learner.shards.roles import follow  # imports PyTorch
 
         return follow(config, place)
@@ -110,7 +110,7 @@ def _train(
         lobby = pool.begin(known.described, masked=known.spaces.masked)
         interrupts = Interrupts(config.grace_s)
         stack.callback(lambda: pool.stop(interrupts.at_most(STOP_WITHIN_S)))
-        folder = folder or stack.enter_context(run_folder(config, None))  # if workers are elsewhere, once one has joined
+        folder = folder or stack.enter_context(run_folder(config, None))  # if workers are elsewhere: once one has joined
         from millrace.learner.open_run import (
             open_run,  # imports PyTorch, unless it was imported while a worker described the environment
         )
@@ -149,7 +149,7 @@ def _learners(config: Config, place: Place, poll: Callable[[], None]) -> Abstrac
 
 
 def _pool(config: Config, env: EnvSpec, workers: int, *, elsewhere: bool) -> AbstractContextManager[WorkerPool]:
-    """The pool of the run's workers. The first rollouts wait until `workers` of them have joined."""
+    """The pool of the run's workers. No rollout begins until `workers` of them have joined."""
     where = BindSettings(config.bind if elsewhere else "", config.keys, config.insecure, config.advertise)
     if config.inference == "workers":
         # Workers elsewhere decide for themselves whether to accept code.

@@ -40,7 +40,7 @@ from millrace.protocol.specs import StepSpec, WaitSpec
 from millrace.protocol.wire.shared_memory import SUPPORTED, SharedMemory, new_memory
 from millrace.protocol.wire.wake_up import SPIN_S, WakePipe
 
-CLOSE_TIMEOUT_S = 5.0  # time for workers to leave at `close`; local workers that are still there are killed
+CLOSE_TIMEOUT_S = 5.0  # time for workers to leave at `close`; after it, remaining local workers are killed
 JOIN_TIMEOUT_S = 60.0  # time for local workers to join
 LEARNER_TIMEOUT_S = 600.0  # a worker elsewhere joins again if it receives nothing from the learner for this long
 STEP_TIMEOUT_LEAST_S = 60.0
@@ -98,8 +98,8 @@ def make_vec(
         on_worker_loss: what to do if a worker is lost. "truncate" returns its env copies as truncated, with `worker_lost` in
             their infos, and continues with new copies on another worker. "raise" raises `WorkerLost`.
         timeout: how many seconds a worker may take to answer before it counts as lost.
-        max_env_failures: how often workers may die in the environment's code, counted as in a training run: consecutively,
-            and within an hour (in proportion to env copies and hours).
+        max_env_failures: how often workers may die in the environment's code. As in a training run, there is a limit on
+            consecutive deaths and one on deaths within an hour, which grows with env copies and hours.
         copy: return copies of the observations. If False, the next step overwrites them.
         render_mode: passed on to the environment.
         wrappers: applied to every env copy in its worker, the first one innermost: classes, functions, or names such as
@@ -148,7 +148,7 @@ def make_vec(
 
 
 def start_vector_env(settings: VectorEnvSettings, crew: Crew) -> ZmqVectorEnv:
-    """Start a vector environment and wait for its workers. They get the log files and cores of `crew`.
+    """Start a vector environment and wait for its workers, which get the log files and cores of `crew`.
 
     Raises `UsageError`, `NoWorkers` and `EnvironmentFailed`.
     """
@@ -274,7 +274,8 @@ def open_vector_env_pool(settings: VectorEnvSettings, resources: ExitStack) -> V
     where = settings.listen
     if where.bind and settings.workers:
         raise UsageError(f"workers: expected 0, got {settings.workers}; with a bind address, start the workers yourself")
-    # Local workers need no timeout: they end with this process, and this process notices at once if one of them ends.
+    # Local workers need no timeout, because they end with this process, and this process notices at once if one of them
+    # ends.
     requested = requested_copies(settings, LEARNER_TIMEOUT_S if where.bind else math.inf)
     if where.bind:
         check_address(advertised_address("tcp://*:1", where.advertise, "machine"))
@@ -284,10 +285,10 @@ def open_vector_env_pool(settings: VectorEnvSettings, resources: ExitStack) -> V
 
 
 def call_timeouts_of(timeout_s: float) -> CallTimeouts:
-    """How long a call of the environment may take before the worker's supervisor ends the worker.
+    """How long a call to the environment may take before the worker's supervisor ends the worker.
 
-    This is longer than `timeout_s`, after which the learner treats the worker as lost and kills a local one. So this limit
-    only matters for a worker elsewhere, and while the learner isn't waiting.
+    This is longer than `timeout_s`, after which the learner treats the worker as lost and kills a local one. This limit
+    therefore matters only for a worker elsewhere, and while the learner isn't waiting.
     """
     seconds = max(STEP_TIMEOUT_LEAST_S, 2 * timeout_s) if timeout_s < STEP_TIMEOUT_MOST_S else 0.0
     return CallTimeouts(seconds, seconds)

@@ -3,9 +3,9 @@
 By default there is one worker for each core. If steps wait, the cores are idle, and a run collects faster if each lane has a
 worker of its own. This can't be known before the run, so the workers are watched while they collect.
 
-Rule: a worker computes if any thread or process of it runs, or is ready to run. So workers that lack a core don't seem to
-wait. Rule: workers are only suggested. If some joined now, lanes would move to them, and episodes that can't be repeated
-would end, so results would depend on the moment.
+Rule: a worker counts as computing if any of its threads or processes is running or ready to run, so a worker that lacks a
+core isn't taken for one that waits. Rule: more workers are only suggested. If some joined during the run, lanes would move
+to them, and episodes that can't be replayed would end, so results would depend on the time of joining.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from millrace.protocol.call_timeouts import Doing
 from millrace.workers.supervise.process_group import SessionUse
 
 LOOK_EVERY_S = 0.1
-MOST_TIME = 0.05  # share of the time that looking may take; it reads all of /proc
-LOOKS = 50  # this many are judged together
-MOST_LOOKS = 1000  # after these, steps won't begin to wait
+MOST_TIME = 0.05  # share of the time that looks may take, because each reads all of /proc
+LOOKS = 50  # this many looks are judged together
+MOST_LOOKS = 1000  # after this many looks, steps are unlikely to begin to wait
 ENOUGH = 0.5  # if workers wait for this share of the time, a core has time for a second worker
-OF_MEMORY = 0.8  # share of the available memory that more workers may take
+OF_MEMORY = 0.8  # share of the available memory that additional workers may take
 COLLECTING: frozenset[Doing] = frozenset({"resetting", "stepping", "repeating", "acting"})
 
 
@@ -37,7 +37,7 @@ class WaitingSteps:
     """Watches the workers of one run."""
 
     def __init__(self, workers: int, lanes: int, envs: int) -> None:
-        """So many workers collect, in a run with so many lanes and env copies. Without lanes, nothing is watched."""
+        """`workers`: the number that collect. `lanes`, `envs`: those of the run. Without lanes, nothing is watched."""
         self._workers = workers
         self._lanes = lanes
         self._envs = envs
@@ -51,7 +51,8 @@ class WaitingSteps:
         return self._workers < self._lanes and self._looks < MOST_LOOKS and now >= self._look_at_s
 
     def look(self, workers: Sequence[SeenWorker], free_bytes: int | None, began_s: float, ended_s: float) -> str:
-        """Record what the workers do, as seen from `began_s` to `ended_s`. Returns a line for the user; mostly empty.
+        """Record what the workers do, as seen from `began_s` to `ended_s`. Returns a line for the user, which is usually
+        empty.
 
         `free_bytes`: the available memory of this machine; None if it isn't known.
         """

@@ -4,8 +4,8 @@ The order is: open the pool, which binds its address; make or open the folder to
 log how to start one elsewhere; let a worker in the lobby describe the environment; `begin` with the workers that collect.
 
 Rule: whatever happens, no worker or thread outlives the context of `start`, and no socket file or folder outlives the pool.
-Workers that still run at the end of this context are stopped almost at once. To give them time to finish their work, call
-`stop` first.
+Workers still running when the context of `start` exits are stopped almost at once. To give them time to finish their work,
+call `stop` first.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ class WorkerPool(Protocol):
         ...
 
     def stop(self, within_s: float) -> None:
-        """Ask all local workers and threads to leave, and end those that still run after `within_s`."""
+        """Ask all local workers and threads to leave, and end those still running after `within_s`."""
         ...
 
 
@@ -127,7 +127,7 @@ def _started(bound: Bound, token: Token | None, crew: Crew, name: str) -> Runnin
 
 @contextmanager
 def open_worker_pool(where: BindSettings, transport: str, code: str = "") -> Iterator[ActingPool]:
-    """A context manager that binds `where.bind`, or if it is empty an address of this transport for local workers.
+    """A context manager that binds `where.bind` or, if that is empty, an address of this transport for local workers.
 
     `code`: see `millrace.learner.members.bound.bind`. Raises `UsageError`.
     """

@@ -1,4 +1,4 @@
-"""Predicts the env steps/s of a run with a small queueing model. Pure.
+"""Predicts a run's env steps/s with a small queueing model. Pure.
 
 A round is one rollout of each lane: T steps of all env copies. A worker steps the copies of its lanes one after another, so
 its round takes T times the sum of their step times. A round of the run ends when the slowest worker's round ends; then the
@@ -140,7 +140,7 @@ def _round_with_lag_s(times_s: Doubles, learner_s: float, max_lag: int) -> float
     ready_s = np.zeros(workers)  # when each worker finished its newest round
     updated_s: list[float] = []  # when each update ended
     for number in range(rounds):
-        opened_s = updated_s[number - max_lag - 1] if number > max_lag else 0.0  # when the lag lets it begin
+        opened_s = updated_s[number - max_lag - 1] if number > max_lag else 0.0  # when the lag allows the round to begin
         ready_s = np.maximum(ready_s, opened_s) + times_s[:, number]
         updated_s.append(max(updated_s[-1] if updated_s else 0.0, float(ready_s.max())) + learner_s)
     counted = rounds - 1 - WARM_UP
@@ -148,7 +148,7 @@ def _round_with_lag_s(times_s: Doubles, learner_s: float, max_lag: int) -> float
 
 
 def _stretched_s(collecting_s: float, busy: float, learner_s: float, cores: int) -> float:
-    """Time of a round in which on average `busy` workers compute while the learner updates, if all get equal CPU shares.
+    """Time of a round in which `busy` workers compute, on average, while the learner updates, if all get equal CPU shares.
 
     While workers and learner both compute, each is slower by `stretch`. Then the one that takes longer continues alone.
     """

@@ -6,7 +6,7 @@ from typing import Literal
 
 import msgspec
 
-COMPUTES = 0.5  # if the share of CPU time in a step is larger, the step counts as computing, otherwise as waiting
+COMPUTES = 0.5  # if the share of CPU time in a step is above this, the step counts as computing, otherwise as waiting
 WORKER_BYTES = 50 << 20
 """Memory of a worker without an env copy."""
 
@@ -119,9 +119,9 @@ class Machine(msgspec.Struct, frozen=True, kw_only=True):
     free_bytes: int | None = None
     """free memory; None if the system doesn't report it"""
     most_copies: int = 0
-    """how many env copies may run at the same time, for example because of licences; 0: any number"""
+    """maximum number of env copies that may run at the same time, for example because of licences; 0: no limit"""
     load: float = 0.0
-    """load average over the minute before: the number of other processes that used a core or waited for one"""
+    """load average over the preceding minute: the number of other processes that used a core or waited for one"""
 
 
 class Overheads(msgspec.Struct, frozen=True, kw_only=True):

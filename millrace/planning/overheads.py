@@ -2,9 +2,8 @@
 
 For this, it collects from an environment that does nothing.
 
-Rule: nothing is assumed about the machine. Rounds of different sizes are timed, and the times of a row, a lane, a copy and a
-rollout are computed from the differences. CPU time is measured, so that other programs on this machine hardly affect the
-result.
+Rule: nothing is assumed about the machine. Rounds of different sizes are timed, and the time per row, lane, copy and rollout
+is computed from the differences. CPU time is measured, so that other programs on this machine hardly affect the result.
 """
 
 from __future__ import annotations
@@ -172,7 +171,7 @@ def _update(config: Config, env: StoodFor) -> tuple[UpdateTime, bool]:
 
 
 def _steps_of_update(config: Config) -> int:
-    """Number of steps in a measured rollout. It is smaller than in a run if the time of an update is proportional to it."""
+    """Number of steps in a measured rollout. It is smaller than in a run if an update's time is proportional to it."""
     steps = config.algorithm.rollout_steps
     match config.algorithm:
         case QLearningConfig():  # a setting determines the number of gradient steps in an update

@@ -42,7 +42,7 @@ OF_PROBE = 0.7  # share of the time in which the environment is measured; millra
 LEAST_S = 5.0
 EVALUATION_COPIES = Config().eval_copies
 MACHINES = (1, 2, 10)
-BUSY = 0.5  # if the load average divided by the number of cores is larger, the machine counts as busy
+BUSY = 0.5  # if the load average per core is above this, the machine counts as busy
 RESETS_COUNT = 1.1  # resets in the background are advised if they make a run faster by at least this factor
 SLOW_START_S = 10.0
 
@@ -59,16 +59,16 @@ def plan(
     """Measure an environment on this machine, and recommend settings for a run, with the speed to expect.
 
     The environment is stepped with random actions, first one copy, then several side by side. Then millrace's own part is
-    measured, with an environment that does nothing. Your environment runs only in worker processes, so that a crash or a
-    hang becomes a line of `advice`.
+    measured, with an environment that does nothing. Your environment runs only in worker processes, so a crash or a hang
+    merely adds a line to `advice`.
 
     Args:
         env: an id that `gymnasium.make` accepts, a `gymnasium.envs.registration.EnvSpec`, or a callable that returns an
             environment. The environment may be PettingZoo's, with several agents.
         env_kwargs: keyword arguments of the environment.
         wrappers: as in `millrace.train`.
-        max_env_copies: how many env copies may run at the same time, for example because of floating licences. 0: any
-            number.
+        max_env_copies: maximum number of env copies that may run at the same time, for example because of floating licences;
+            0: no limit.
         seconds: about how long the measurement may take. Allow more time if a step, or the start of a copy, takes seconds.
 
     Returns a `RunPlan`. Raises `UsageError` if an argument is wrong or the environment can't be found, and a `RunError`,
@@ -116,7 +116,7 @@ def plan_of(env: ProbedEnv, *, max_env_copies: int, seconds: float, say: Callabl
 
 
 def _limits(max_env_copies: int, allowed: int) -> list[ChosenSetting]:
-    """The settings that limit a run to the number of env copies that are allowed."""
+    """The settings that limit a run to the allowed number of env copies."""
     found = []
     if max_env_copies:
         found.append(ChosenSetting("max_env_copies", max_env_copies, "with those of evaluations"))
@@ -127,7 +127,7 @@ def _limits(max_env_copies: int, allowed: int) -> list[ChosenSetting]:
 
 
 def _evaluation_copies(allowed: int) -> int:
-    """How many of the allowed copies play evaluations: the default number, or 1 if the default is more than a third."""
+    """How many of the allowed copies play evaluations: the default number, or 1 if that is more than a third of them."""
     return EVALUATION_COPIES if not allowed or allowed >= 3 * EVALUATION_COPIES else 1
 
 

@@ -39,7 +39,7 @@ from millrace.workers.copies.env_errors import CopyFailed
 from millrace.workers.copies.mask_reader import MaskReader
 
 LEAST_STEPS = 8  # number of steps that each copy makes, even if they take longer than planned
-SCRIPT = 1009  # number of random actions, which all copies take in the same order, again and again
+SCRIPT = 1009  # number of random actions, which all copies take in the same order, in a loop
 SEED = 1
 WARM_UP = 2  # this many steps at the beginning of a copy aren't counted
 OF_ALONE = 0.15  # share of the time in which one copy steps alone
@@ -112,7 +112,7 @@ def probe(env: ProbedEnv, machine: Machine, seconds: float) -> Probed:
         if costs.steps_per_s < WORTH_WHILE * measured.side_by_side[-1].steps_per_s:
             break
         measured = msgspec.structs.replace(measured, side_by_side=(*measured.side_by_side, costs))
-    if len(sessions) == 1 and not first.wrong:  # a second copy must show whether the environment repeats itself
+    if len(sessions) == 1 and not first.wrong:  # a second copy must show whether the environment is deterministic
         sessions.append(_session(env, 1, OF_ALONE * seconds, give_up_at_s))
     return Probed(_with_all(measured, sessions), first.observation_space, first.action_space, first.seats)
 
@@ -213,7 +213,8 @@ def _session(env: ProbedEnv, workers: int, seconds: float, give_up_at_s: float, 
 
 
 def _step(envs: ZmqVectorEnv, traces: list[list[int]], end_at_s: float, give_up_at_s: float) -> bool:
-    """Step all copies until `end_at_s`, each one again as soon as its step has ended. Actions that a mask forbids are never
+    """Step all copies until `end_at_s`; a copy's next step begins as soon as its previous one has ended. Actions that a mask
+    forbids are never
     taken.
 
     Returns whether the masks are in the infos.
@@ -235,7 +236,7 @@ def _step(envs: ZmqVectorEnv, traces: list[list[int]], end_at_s: float, give_up_
         try:
             allowed = masks.read_all(observation, infos, terminated=~over, truncated=over)
             masks_in_info |= bool(spec.choices) and not in_observation and MASK in infos
-        except CopyFailed:  # what is called a mask isn't one
+        except CopyFailed:  # what the environment calls a mask isn't one
             allowed = np.broadcast_to(masks.everything, (len(over), spec.choices))
         actions = []
         for i, copy in enumerate(ready):
@@ -293,7 +294,7 @@ def _digest(arrays: Sequence[Array]) -> int:
 
 
 def _repeats(traces: Sequence[Sequence[int]]) -> bool | None:
-    """Whether all copies returned the same in all steps that they have in common; None if fewer than two were stepped."""
+    """Whether all copies returned the same results in the steps that all made; None if fewer than two were stepped."""
     traces = [trace for trace in traces if trace]
     if len(traces) < 2:
         return None
@@ -305,7 +306,7 @@ def _repeats(traces: Sequence[Sequence[int]]) -> bool | None:
 
 
 def _measured_alone(env: ProbedEnv, session: _SteppedCopies) -> Measurements:
-    """The measurements that a session with one copy gives."""
+    """The measurements from a session with one copy."""
     leaves = observation_leaves(session.observation_space)
     keys = session.observation_space.spaces if isinstance(session.observation_space, spaces.Dict) else {}
     return Measurements(

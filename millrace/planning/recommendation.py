@@ -1,6 +1,6 @@
 """Recommends settings for a measured environment, with reasons: algorithm, env copies, workers, lanes and lag. Pure.
 
-Rule: of all sizes whose expected env steps/s are at least `AS_GOOD` times the best, choose the ones with the least lag, then
+Rule: among all sizes whose expected env steps/s are at least `AS_GOOD` times the best, choose those with the least lag, then
 the fewest env copies, then the fewest workers. These are the rules of docs/how-to/algorithms.md and
 docs/how-to/slow_environments.md.
 """
@@ -17,10 +17,10 @@ from millrace.planning.in_words import counted, number_in_words, time_in_words
 from millrace.planning.measurements import WORKER_BYTES, Machine, Measurements
 
 AS_GOOD = 0.95
-SLOW_S = 0.005  # if step time / number of copies at once is larger, an algorithm with a replay buffer finishes sooner
-SLOW_WITH_IMAGES_S = 0.05  # the same limit for continuous actions and images
+SLOW_S = 0.005  # if a step takes longer, divided by the copies at once, an algorithm with a replay buffer ends sooner
+SLOW_WITH_IMAGES_S = 0.05  # the limit if actions are continuous and observations are images
 MOST_ENVS = 64  # if a step computes rather than waits, more env copies gain little
-UNEVEN = 3.0  # steps are uneven if the 95th percentile of the step time, divided by the median, is larger
+UNEVEN = 3.0  # steps are uneven if the 95th percentile of the step time is above this multiple of the median
 LEARNER_BYTES = 500 << 20
 TRANSITION_BYTES = 24  # memory of a transition in addition to its observation
 REPLAY_SIZES = (1_000_000, 500_000, 200_000, 100_000, 50_000, 20_000, 10_000)
@@ -150,7 +150,7 @@ def candidates(learning: Learning, measured: Measurements, machine: Machine) -> 
 
 
 def _lanes_for(workers: int, envs: int) -> int:
-    """The least number of lanes that divides `envs` and is a multiple of `workers`; `envs` if there is none."""
+    """The smallest number of lanes that divides `envs` and is a multiple of `workers`; `envs` if there is none."""
     return next((lanes for lanes in range(workers, envs + 1, workers) if envs % lanes == 0), envs)
 
 
@@ -170,7 +170,7 @@ def _numbers_of_envs(measured: Measurements, machine: Machine, learning: Learnin
 
 
 def best(rates: Mapping[Sizes, float]) -> Sizes:
-    """Choose sizes by the rule of this file. `rates`: the expected env steps/s of each candidate."""
+    """Choose sizes by the rule at the top of this file. `rates`: the expected env steps/s of each candidate."""
     enough = AS_GOOD * max(rates.values())
     good = [sizes for sizes, rate in rates.items() if rate >= enough]
     return min(good, key=lambda sizes: (sizes.max_lag, sizes.envs, sizes.workers, -sizes.lanes))

@@ -1,7 +1,7 @@
-"""An environment that has the spaces of another one and does nothing, so that only the time of millrace itself is measured.
+"""An environment that has the spaces of another one and does nothing, so that only millrace's own time is measured.
 
-Rule: it returns the same observation at each step, and its episode never ends. If steps of the real environment wait, its
-steps wait too, because a process computes more slowly for a while after it was asleep. The sum of the rewards of a step is
+Rule: it returns the same observation at each step, and its episode never ends. If the real environment's steps wait, the
+stand-in's steps wait too, because a process computes more slowly for a while after it has slept. A step's rewards add up to
 the CPU time in seconds that the worker has used since the previous step.
 """
 
@@ -91,7 +91,7 @@ class StandInOfAgents:
         return self._shown, {agent: {} for agent in self.agents}
 
     def step(self, actions: Any) -> Any:
-        """Return the same observation again. The agents' rewards sum up to the CPU time."""
+        """Return the same observation again. The agents' rewards add up to the CPU time."""
         goes_on = dict.fromkeys(self.agents, False)
         cpu_s = _worker.cpu_s(self._wait_s) / len(self.agents)
         return self._shown, dict.fromkeys(self.agents, cpu_s), goes_on, goes_on, {agent: {} for agent in self.agents}
@@ -103,7 +103,7 @@ class StandInOfAgents:
 def shown(space: gymnasium.Space[Any]) -> Any:
     """A random observation of this space. If it has an action mask, the mask allows every action.
 
-    Its floats are as close to 0 as those of an environment, because bounds may be so large that they say nothing.
+    Its floats are as close to 0 as a typical environment's, because bounds may be too large to be informative.
     """
     observation = _with_small_floats(space).sample()
     if isinstance(space, spaces.Dict) and MASK in space.spaces:

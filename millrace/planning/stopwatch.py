@@ -66,7 +66,7 @@ class Notes:
         self._delay.close()
 
     def _flush(self, now_s: float) -> None:
-        if now_s - self._looked_at_s >= self._look_after_s:  # less and less often, because it reads all of /proc
+        if now_s - self._looked_at_s >= self._look_after_s:  # at growing intervals, because it reads all of /proc
             self._look(now_s)
             self._look_after_s *= 2
         self._file.write(np.array(self._rows).tobytes())
@@ -129,7 +129,7 @@ class _TimedAgents:
 
 
 def stopwatch(env: Any, folder: str) -> Any:
-    """Wrap the environment so that its calls are noted in a file of this folder."""
+    """Wrap the environment so that its calls are noted in a file in this folder."""
     notes = Notes(folder)
     return _TimedAgents(env, notes) if has_seats(env) else _Timed(env, notes)
 
@@ -154,7 +154,7 @@ class CopyTimes(NamedTuple):
 
     @property
     def bytes(self) -> int:
-        """The largest memory that was measured."""
+        """The largest amount of memory that was measured."""
         return int(self.processes[:, 2].max()) if len(self.processes) else 0
 
 
