@@ -1,4 +1,4 @@
-"""Stable-Baselines3's PPO on tasks of several agents: `python -m benchmarks.agents_stable_baselines3 TASK SEED`.
+"""Stable-Baselines3's PPO on multi-agent tasks: `python -m benchmarks.agents_stable_baselines3 TASK SEED`.
 
 It needs `pip install stable-baselines3 supersuit mpe2 pygame-ce`. It uses 8 env copies and minibatches of 256, and otherwise
 Stable-Baselines3's own settings. It prints the mean return of 100 greedy episodes, summed over all agents.

@@ -1,9 +1,9 @@
-"""The time of an update's matrix products alone, at the best speed that one core reaches: a lower bound for an update.
+"""The time of an update's matrix products alone, at one core's highest speed: a lower bound on an update's time.
 
-Rule: both numbers are measured, not assumed. torch counts the floating-point operations of the products in one update,
-forward and backward, while the networks run in torch. The speed is that of the fastest square product that was tried.
-Activations, the loss, the optimizer and every call take additional time, so an update can come close to the bound, but not
-reach it.
+Rule: the number of operations and the speed are measured, not assumed. torch counts the floating-point operations of the
+products in one update, forward and backward, while the networks run in torch. The speed is that of the fastest square
+product that was tried. Activations, the loss, the optimizer and every call take additional time, so an update can come close
+to the bound, but not reach it.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ TRIES = 15
 def products_ms(run: Callable[[], object], updates: int) -> float:
     """Milliseconds that the matrix products of an update take at the speed of `flop_per_s`.
 
-    `run` makes this number of updates, with networks that run in torch.
+    `run` makes `updates` updates, with networks that run in torch.
     """
     with FlopCounterMode(display=False) as counter:
         run()

@@ -1,10 +1,10 @@
-"""Compares the speed of training without evaluations, with evaluations that it waits for, and with evaluations alongside.
+"""Compares the speed of training without evaluations, with ones that it waits for, and with ones that run alongside.
 
 `python -m benchmarks.beside`, or for one algorithm with `--algo sac`. A step of the environment sleeps for 50 ms, so that
 the number of cores doesn't matter. Four workers train, with one env copy each. An evaluation is four episodes of eight steps
-on one worker. An evaluation is due whenever training has taken twice its time, so that evaluations take a third of the time
-if training waits for them. The rate is env steps/s between the first counted update and the last, including evaluations. All
-contenders take turns.
+on one worker. An evaluation is due whenever training has lasted twice as long as an evaluation, so evaluations take a third
+of the time if training waits for them. The rate is env steps/s between the first counted update and the last, including
+evaluations. All contenders take turns.
 """
 
 from __future__ import annotations

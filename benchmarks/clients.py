@@ -1,9 +1,9 @@
 """Compares the C++ client with the Python worker: `python -m benchmarks.clients`. It needs a C++ compiler and CMake.
 
 `steps`: env steps/s of CartPole-v1 in one worker on loopback that only steps, with random actions (`millrace.make_vec`).
-Both kinds of worker take turns. `loop`: the time of an action in a program that owns its loop at 50 Hz and acts itself,
-while a learner updates all the time. `many`: a hundred C++ clients of one learner. All figures depend on what else runs on
-the machine.
+Both kinds of worker take turns. `loop`: the time per action in a program that owns its loop at 50 Hz and acts itself, while
+a learner updates continuously. `many`: a hundred C++ clients of one learner. All figures depend on what else runs on the
+machine.
 """
 
 from __future__ import annotations
@@ -40,14 +40,14 @@ LONGEST_S = 300.0
 
 
 def build(folder: Path) -> None:
-    """Build the C++ examples in this folder. Raises `CalledProcessError`."""
+    """Build the C++ examples in this folder. Raises `CalledProcessError` if that fails."""
     flags = ["cmake", "-S", str(SOURCE), "-B", str(folder), "-DCMAKE_BUILD_TYPE=Release"]
     for command in (flags, ["cmake", "--build", str(folder), "--target", "cartpole", "control_50hz"]):
         subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
 
 
 def free_address() -> str:
-    """An address on loopback that is free."""
+    """A free address on loopback."""
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         return f"tcp://127.0.0.1:{taken.getsockname()[1]}"
@@ -87,7 +87,7 @@ def step_rate(command: Sequence[str], copies: int, seconds: float) -> float:
 
 
 def loop_at_50_hz(folder: Path, ticks: int) -> dict[str, float]:
-    """Run a program that owns its loop, while a learner updates all the time. Returns shares, and times in µs."""
+    """Run a program that owns its loop, while a learner updates continuously. Returns shares, and times in µs."""
     address = free_address()
     flags = (
         f"CartPole-v1 --preset none --bind {address} --envs 1 --lanes 1 --rollout-steps 50 --batch-size 25 --n-epochs 200"

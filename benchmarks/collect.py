@@ -5,9 +5,9 @@ torch), rollouts of T = 128 steps are stored with their log-probabilities, and e
 takes random actions, stores nothing and resets at an episode's end. There are two kinds of bare loop. `sampled`, to which
 the targets refer, uses plain `gymnasium.make` and `action_space.sample()`, which is the usual way to measure. `drawn` is the
 fastest loop over these copies: without gymnasium's checker, which the collector also leaves out, and with actions that were
-sampled beforehand. `native` is the environment's vectorized form and `envpool` the environment in envpool, both in a bare
-loop and as a lane. `bfloat16` processes images in bfloat16. `no network` has a policy without a network, so it measures
-storing and stepping. Contenders that aren't installed are left out.
+sampled beforehand. `native` is the environment's vectorized form and `envpool` the environment in envpool; each is measured
+in a bare loop and as a lane. `bfloat16` processes images in bfloat16. `no network` has a policy without a network, so it
+measures storing and stepping. Contenders that aren't installed are left out.
 
 All contenders of a case take turns, one pair of processes at a time, with one thread each. The figures are medians over the
 rounds. On a machine that also does other work, use `--cpu`: it counts CPU time, which other work doesn't change.

@@ -1,6 +1,6 @@
-"""Times several implementations of the same work in turns. Reports medians of the times, and of the ratios in each turn.
+"""Times several implementations of the same work in turns. Reports medians of the times, and of the ratios within a turn.
 
-It measures CPU seconds of this process with one thread, which depend less on other load than wall-clock time does.
+It measures this process's CPU seconds with one thread, which depend less on other load than wall-clock time does.
 """
 
 from __future__ import annotations

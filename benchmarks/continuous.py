@@ -5,9 +5,9 @@ Stable-Baselines3 makes a gradient step after each env step. millrace makes 8 gr
 learner, while one worker process collects.
 
 Env steps/s are measured after `learning_starts`. The time to -200 is measured from the start of the command (with imports
-and evaluations) until the mean return of a greedy evaluation is -200. There is an evaluation of 10 episodes every 1,000 env
-steps. The share of the arithmetic is the time that the matrix products of a gradient step alone take, divided by the time of
-an env step.
+and evaluations) until the mean return of a greedy evaluation reaches -200. There is an evaluation of 10 episodes every 1,000
+env steps. The share of the arithmetic is the time that the matrix products of a gradient step alone take, divided by the
+time of an env step.
 """
 
 from __future__ import annotations

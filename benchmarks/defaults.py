@@ -2,7 +2,7 @@
 
 Rule: each run is `millrace train ENV --preset none` with the flags of a variant. A figure is the mean return of the final
 policy over the run's own greedy episodes. Finished runs are kept in benchmarks/results/defaults, by the name of the variant,
-and a later call makes only the missing runs. So remove that folder after you have changed the code or a variant.
+and a later call makes only the missing runs, so remove that folder after changing the code or a variant.
 
 `--variant NAME=FLAGS` adds a variant; without one, only the defaults are run.
 """

@@ -140,7 +140,7 @@ def parts(workers: int, seconds: float) -> Parts:
 
 
 def trained(workers: int, lag: int, updates: int) -> float:
-    """Median seconds of an update in a whole training run, without the first updates."""
+    """Median seconds of an update in a whole training run, leaving out the first updates."""
     with tempfile.TemporaryDirectory() as folder:
         config = settings(
             workers,

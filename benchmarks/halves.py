@@ -1,9 +1,9 @@
 """Simulates acting on a GPU with `--inference learner`: `python -m benchmarks.halves`. It needs no GPU, and measures none.
 
-Sixteen workers step 128 copies, whose steps sleep, and the policy sleeps for as long as a pass on the device would take. So
-neither uses this machine's cores, as on a machine with sixteen cores and a GPU. The lanes are stepped in one part, and in
-two: then the policy acts for one half of the copies while the other half steps. What a step and a pass take on a real
-machine is for `benchmarks.gpu` to say; here both are given, and the observations are small.
+Sixteen workers step 128 copies, whose steps sleep, and the policy sleeps for as long as a pass on the device would take.
+Neither competes for this machine's cores, just as on a machine with sixteen cores and a GPU. The lanes are stepped in one
+part or in two. With two parts, the policy acts for one half of the copies while the other half steps. `benchmarks.gpu`
+measures how long a step and a pass take on a real machine; here both times are given, and the observations are small.
 """
 
 from __future__ import annotations
@@ -35,17 +35,17 @@ from millrace.workers.copies.split_vector_env import SplitVectorEnv
 WORKERS = 16
 LANES = 32  # two for each worker, one in each half
 COPIES = 128
-STEPS = 64  # of a rollout
+STEPS = 64  # number of steps in a rollout
 UPDATES = 8
 WARM_UP = 3  # updates that are not counted
 ENV = "benchmarks.slow_env:Constant-v0"
-PASS_S = (0.5e-3, 1e-3, 2e-3)  # of a pass, whatever its size
-COPY_S = 4e-6  # more for each copy
-STEP_S = 0.27e-3  # what a step of Pong takes on one core
+PASS_S = (0.5e-3, 1e-3, 2e-3)  # time of a pass, whatever its size
+COPY_S = 4e-6  # additional time of a pass for each copy
+STEP_S = 0.27e-3  # time of a step of Pong on one core
 
 
 class Device:
-    """A policy that takes as long as one on a device, and returns what the policy that it wraps does."""
+    """Wraps a policy and returns the same actions, but takes as long as a policy on a device would."""
 
     def __init__(self, policy: Policy, pass_s: float) -> None:
         self._policy = policy

@@ -1,7 +1,7 @@
 """Compares `--inference workers` with `--inference learner`: `python -m benchmarks.inference`.
 
-It trains PPO in both modes, in turns. It measures env steps/s of two workers while the learner waits for rollouts, which
-leaves out updates, and the memory of a worker. The machine need not be idle, because the two modes are compared within a
+It trains PPO in both modes, in turns. It measures the memory of a worker, and env steps/s of two workers while the learner
+waits for rollouts, which leaves out updates. The machine need not be idle, because the two modes are compared within a
 round.
 """
 
@@ -29,7 +29,7 @@ from millrace.learner.config.layers import resolve
 from millrace.learner.run_folder.progress import Progress
 from millrace.protocol.env_spec import EnvSpec
 
-WARM_UP = 2  # number of updates that aren't counted, because env copies are made and torch is imported meanwhile
+WARM_UP = 2  # number of updates that aren't counted, because env copies are made and torch is imported during them
 MODES = ("workers", "learner")
 
 

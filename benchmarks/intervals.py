@@ -15,7 +15,7 @@ import numpy as np
 from millrace.protocol.arrays import Doubles
 
 FEWEST = 5
-"""least number of seeds for an interval"""
+"""minimum number of seeds for an interval"""
 RESAMPLES = 10_000
 COVERED = 95
 """percentage of the resampled means that are in the interval"""

@@ -1,10 +1,10 @@
-"""Trains a run while it injects faults: it kills and stops processes of the run, at times that depend only on a seed.
+"""Trains a run while injecting faults: it kills and suspends the run's processes, at times that depend only on a seed.
 
 `python -m benchmarks.killed FOLDER --faults 40 -- millrace train ENV ...` repeats the command with `--resume auto` whenever
 the learner ends before the run is finished. `--faults 0` trains the same run undisturbed. `benchmarks.killed_tables`
 compares such runs.
 
-Rule: a fault is injected when the run reaches a certain number of env steps, so that a slow machine has as many faults as a
+Rule: a fault is injected when the run reaches a certain number of env steps, so that a slow machine gets as many faults as a
 fast one. Only processes that descend from this one are affected. FOLDER contains the run folder, the output of the learners,
 and faults.jsonl.
 """
@@ -115,7 +115,7 @@ def _line(process: psutil.Process) -> str:
 
 
 def _to(processes: Callable[[Run], list[psutil.Process]], number: signal.Signals, stopped_s: float = 0.0) -> Cause:
-    """A fault that sends a signal to one of these processes. If the signal stops it, it continues after `stopped_s`."""
+    """A fault that sends a signal to one of these processes. If the signal suspends it, it resumes after `stopped_s`."""
 
     def fault(run: Run, generator: random.Random) -> bool:
         if not (found := processes(run)):

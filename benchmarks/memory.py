@@ -21,7 +21,7 @@ from benchmarks.writing import bars, write
 
 STEPS = 20_000
 TARGET_WORKER_MB = 70
-INTERVAL_S = 0.3  # least time between two measurements
+INTERVAL_S = 0.3  # minimum time between two measurements
 
 
 class Tree:

@@ -1,8 +1,8 @@
 """Measures how many bytes the packing of rollouts saves, and the time that it takes. Part of `benchmarks/wire.py`.
 
 For rollouts of Atari's size and CartPole's, packed in every way, it measures CPU seconds of one thread at each end, minus
-those of the unpacked rollout. From these follows the speed of a network below which packing pays off. It also measures the
-time from end to end over an encrypted connection, where every byte costs time, and the time of rounding weights.
+those for the unpacked rollout. These determine the network speed below which packing pays off. It also measures the
+end-to-end time over an encrypted connection, where every byte costs time, and the time of rounding weights.
 """
 
 from __future__ import annotations

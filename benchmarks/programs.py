@@ -1,7 +1,7 @@
 """Programs that train CartPole-v1 with the same settings: millrace's command line, and programs of other systems.
 
-Rule: all get the same hyperparameters, one torch thread, and a process tree of their own with a cold start. The first
-lines of each program in `benchmarks/peers` list the settings that its system lacks.
+Rule: all programs get the same hyperparameters, one torch thread, and a process tree of their own with a cold start. The
+first lines of each program in `benchmarks/peers` list the settings that its system lacks.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ DQN = COMMON | {
     "gradient_steps": 128, "learning_starts": 1000, "replay_size": 100_000, "net": [256, 256],
     "target_every": 128, "double": False, "epsilon_steps": 8000, "epsilon_end": 0.04, "max_grad_norm": 10.0,
 }  # fmt: skip
-LEAST_S = 0.05  # time between two calls of `look`
+LEAST_S = 0.05  # minimum time between two calls to `look`
 OUTPUT = "out"  # the file, in a program's folder, that contains its output
 LONGEST_S = 300.0
 
@@ -64,7 +64,7 @@ class Contender(NamedTuple):
     peer: str = ""
     """the system in whose virtual environment it runs; empty: this Python"""
     most_envs: int = 64
-    """largest number of env copies that it can run on this machine"""
+    """maximum number of env copies that it can run on this machine"""
     own: bool = False
     """whether it uses its own settings instead of the common ones"""
     flags: tuple[str, ...] = ()
@@ -153,7 +153,7 @@ def missing() -> list[str]:
 def started(command: Sequence[str], folder: Path) -> Iterator[subprocess.Popen[bytes]]:
     """A context manager that starts a program in this folder, with one thread for numpy, and its output in `OUTPUT`.
 
-    At the end of the context, the program and its child processes are killed.
+    When the context exits, the program and its child processes are killed.
     """
     threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
     path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])

@@ -12,7 +12,7 @@ from millrace.protocol.arrays import Bytes
 
 
 class RandomFrames(gymnasium.Env[Bytes, Any]):
-    """Shows eight random frames, which are made once, again and again. It has six actions. Rewards are 0."""
+    """Shows the same eight random frames in a loop. It has six actions. Rewards are 0."""
 
     def __init__(self, side: int = 84, channels: int = 4) -> None:
         """Frames are `side` × `side` pixels with this number of channels, uint8."""

@@ -49,7 +49,8 @@ EVALUATION = ("eval_every", "eval_episodes")
 def read(path: Path, *, only_final: bool) -> Score | None:
     """The score of a run, or None if the run hasn't finished.
 
-    `only_final`: leave out the best policy. Then the command has no settings of evaluations, because they change no weights.
+    `only_final`: leave out the best policy. The command then omits evaluation settings, because these don't affect the
+    weights.
     """
     folder = RunFolder.open(path)
     config = config_of_run(path)
@@ -85,7 +86,7 @@ def _played(path: Path, config: Config, found: Evaluation | None, which: Which) 
 
 
 def command(config: Config, leave_out: Sequence[str] = ()) -> str:
-    """The shortest command line that repeats this run, with S as its seed. `leave_out`: settings to leave out."""
+    """The shortest command line that reproduces this run, with S as its seed. `leave_out`: settings to leave out."""
     # With max_lag 0, the number of workers has no effect on the results.
     leave_out = (*leave_out, *NOT_IN_COMMANDS, *(() if config.max_lag else ("workers",)))
     words = ["millrace", "train", config.env, "--seed", "S"]

@@ -1,9 +1,9 @@
-"""Compares the env steps/s of `RolloutService` with those of the built-in trainer: `millrace bench service`.
+"""Compares the env steps/s of `RolloutService` with the built-in trainer's: `millrace bench service`.
 
 All contenders collect CartPole-v1 with two processes, the same policy, seed and sizes, over ipc. The loop over the service
-only publishes the same weights again. The trainer's algorithm does the same, so that its figure is the rate of collecting.
-The upper limit is two collectors without any messages. The last row is the service with the same network, written as an
-`OwnPolicy`. Rounds are interleaved, and a share is the median of the shares within a round.
+only publishes the same weights again. The trainer's algorithm does the same, so that the trainer's figure is the rate of
+collecting. The upper limit is two collectors without any messages. The last row is the service with the same network,
+written as an `OwnPolicy`. Rounds are interleaved, and a share is the median of the shares within a round.
 """
 
 from __future__ import annotations

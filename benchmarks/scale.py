@@ -5,7 +5,7 @@ are those of `simulated.py`: real sockets over loopback TCP, real messages, and 
 There is one lane for each worker, and an update takes one rollout of every lane. CPU time is that of the learner's whole
 process, including ZeroMQ's thread.
 
-Rule: no rollout may be lost, and the CPU time for a rollout must not grow with the number of workers.
+Rule: no rollout may be lost, and the CPU time per rollout must not grow with the number of workers.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from millrace.protocol.wire.learner_link import LearnerLink
 WORKERS = (10, 100, 1000)
 PROCESSES = 2
 WARM_UP = 5  # number of updates that aren't counted
-FLAT = 1.2  # target for the CPU time of a rollout with the most workers, as a multiple of that with the fewest
+FLAT = 1.2  # target for the CPU time per rollout with the most workers, as a multiple of that with the fewest
 
 
 class Measured(msgspec.Struct, frozen=True, kw_only=True):

@@ -1,4 +1,4 @@
-"""Returns that millrace's runs have reached (scores.json), and returns that others have published (published_scores.toml).
+"""Returns that millrace's runs have reached (scores.json) and returns that others have published (published_scores.toml).
 
 The repository doesn't contain run folders, but only the numbers that the tables need from them. To add runs:
 `python -m benchmarks.results RUN ...`
@@ -45,7 +45,7 @@ class PublishedScore(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     """A return that another project has published."""
 
     env: str
-    """millrace's name of the environment with which it is compared"""
+    """millrace's name for the environment with which it is compared"""
     algo: str
     system: str
     returns: float
@@ -60,7 +60,7 @@ def read_scores() -> list[Score]:
 
 
 def write_scores(scores: Iterable[Score]) -> None:
-    """Write the scores of millrace."""
+    """Write millrace's scores."""
     ordered = sorted(scores, key=lambda score: (score.env, score.algo, score.env_steps, score.command))
     SCORES.write_bytes(b"[\n" + b",\n".join(map(msgspec.json.encode, ordered)) + b"\n]\n")
 

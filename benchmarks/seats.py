@@ -1,10 +1,10 @@
-"""Rows/s of vector environments with several agents under random actions: `python -m benchmarks.seats`.
+"""Rows/s of multi-agent vector environments under random actions: `python -m benchmarks.seats`.
 
 Each env copy has 16 agents, which all act in an episode of 100 steps. A step takes little time, or sleeps for 1 ms. A row is
-a step of one agent. The contenders are the vector environments of millrace, PufferLib and supersuit (as far as they are
-installed), with equally many processes, and a plain loop over the copies in this process, which stores nothing. In each
-round each contender is made, run and closed once, in an order that changes from round to round. Rates are medians over
-rounds; ratios are computed within a round.
+a step of one agent. The contenders are the vector environments of millrace, PufferLib and supersuit (if installed), with the
+same number of processes, and a plain loop over the copies in this process, which stores nothing. In each round each
+contender is made, run and closed once, in an order that changes from round to round. Rates are medians over rounds; ratios
+are computed within a round.
 """
 
 from __future__ import annotations

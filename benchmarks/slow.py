@@ -2,11 +2,11 @@
 
 All run PPO with 64 steps, minibatches of 256 and 10 epochs, on 16 env copies in 16 processes. The environment sleeps
 (`benchmarks/slow_env.py`), so that the number of cores doesn't matter and only waiting is measured. The ideal is 16 copies
-that never wait: 16 processes that step and do nothing else. They are slower than the durations of steps and resets suggest,
-because a machine wakes a process a little late. Each run is a process tree of its own; all take turns. Two more rows are
-loops over `millrace.make_vec` that act at random and learn nothing: one with `step`, one with `send` and `recv`.
-`--only-loops` measures these and the ideal. `--peers` adds the installed systems that can run 16 processes. `--picture FILE`
-draws who waits for whom.
+that never wait: 16 processes that step and do nothing else. These processes are slower than the durations of steps and
+resets suggest, because a machine wakes a process a little late. Each run is a process tree of its own; all take turns. Two
+more rows are loops over `millrace.make_vec` that act at random and learn nothing: one with `step`, one with `send` and
+`recv`. `--only-loops` measures these and the ideal. `--peers` adds the installed systems that can run 16 processes.
+`--picture FILE` draws who waits for whom.
 """
 
 from __future__ import annotations

@@ -32,7 +32,7 @@ from gymnasium.spaces import Box, Discrete
 MEAN_STEP_S = 0.005
 SIGMA = 1.0
 RESET_S = 0.2
-SHORTEST = 50  # least number of steps in an episode
+SHORTEST = 50  # minimum number of steps in an episode
 LONGEST = 150
 TIMELINE = "SLOW_ENV_TIMELINE"
 STEPS_PER_S = 1 / (MEAN_STEP_S + RESET_S / ((SHORTEST + LONGEST) / 2))  # env steps/s of a copy that never waits
@@ -111,7 +111,7 @@ class SlowPendulum(PendulumEnv):
     """Pendulum-v1 whose steps take longer."""
 
     def __init__(self, render_mode: str | None = None, *, step_s: float) -> None:
-        """`step_s`: by how many seconds a step takes longer."""
+        """`step_s`: how many seconds longer a step takes."""
         super().__init__(render_mode)
         self._step_s = step_s
 

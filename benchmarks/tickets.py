@@ -2,8 +2,8 @@
 
 `python -m benchmarks.tickets` runs the real coordinator (`learner/rollouts/ticket_coordinator.py`) in simulated time. There
 are three lanes, each on a worker of its own. The rollouts of a lane differ in duration (`ROLLOUT_S`), an update takes as
-long as a short rollout, and messages take no time. So the picture shows only the effect of the rule for tickets, and is the
-same on every machine.
+long as a short rollout, and messages take no time. The picture therefore shows only the effect of the rule for tickets, and
+is the same on every machine.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from millrace.protocol.messages import PROTOCOL_VERSION, Collect, Hello
 
 OUT = Path(__file__).parents[1] / "docs" / "images" / "tickets.png"
 LANES = 3
-ROLLOUT_S = (1.0, 1.6, 1.1, 2.0)  # durations of successive rollouts, over and over; lane n begins with the n-th one
+ROLLOUT_S = (1.0, 1.6, 1.1, 2.0)  # durations of successive rollouts, in a cycle; lane n begins with the n-th one
 UPDATE_S = 1.0
 NOTHING = np.zeros(0, np.float32)
 

@@ -2,10 +2,10 @@
 
 `--peers` adds all other systems that `python -m benchmarks.peers.install` has installed, memory, and Stable-Baselines3's A2C
 and DQN. Env steps/s are measured from the third update on. The time to solve the task is measured from the start of the
-command (with imports and evaluations) until the mean return of a greedy evaluation is 475; for millrace, until the program
-has ended. There is an evaluation of 20 episodes every 5,000 env steps. Each run is a process tree of its own with a cold
-start; all take turns. A run that fails is reported and left out. The last row of the table is the speed that the arithmetic
-alone would allow.
+command (with imports and evaluations) until the mean return of a greedy evaluation reaches 475; for millrace, until the
+program has ended. There is an evaluation of 20 episodes every 5,000 env steps. Each run is a process tree of its own with a
+cold start; all take turns. A run that fails is reported and left out. The last row of the table is the speed that the
+arithmetic alone would allow.
 """
 
 from __future__ import annotations

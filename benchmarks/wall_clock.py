@@ -1,8 +1,8 @@
 """How long it takes to train a good policy if a step takes 10 ms, 50 ms or 1 s: `python -m benchmarks.wall_clock COMMAND`.
 
-Rule: nothing waits for hours of slow steps. What is learned from an env step doesn't depend on the duration of the step, if
-the lag is the same. So the minutes are computed from two measurements: curves (greedy return over env steps, trained on fast
-env copies) and rates (env steps/s on 16 copies whose steps take a given time). Both are kept in the repository.
+Rule: nothing waits for hours of slow steps. If the lag is the same, what is learned from an env step doesn't depend on how
+long the step takes. The minutes are therefore computed from two measurements: curves (greedy return over env steps, trained
+on fast env copies) and rates (env steps/s on 16 copies whose steps take a given time). Both are kept in the repository.
 
 `commands` prints the commands that train the curves. `collect FOLDER ...` adds the curves of all runs in these folders to
 curves.json. `rates` measures rates and adds them to rates.json; all programs take turns. `table` writes

@@ -28,7 +28,7 @@ RATES = Path(__file__).with_name("rates.json")
 LOOK_S = 0.5
 LONGEST_S = 600.0
 LEAST_UPDATES = 2
-"""least number of updates over which a rate is measured"""
+"""minimum number of updates over which a rate is measured"""
 
 
 class Rate(msgspec.Struct, kw_only=True):
@@ -77,7 +77,7 @@ def rate_at(step_s: float, rates: Sequence[Rate]) -> RateAt | None:
     """The rate of a program at a step time, from its measured rates; None if there are none.
 
     If it wasn't measured, it is computed from the nearest shorter step time. At longer step times, updates are a smaller
-    part of the time, so that they are known less precisely.
+    part of the time, so their duration is known less precisely.
     """
     if not rates:
         return None

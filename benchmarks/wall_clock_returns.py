@@ -1,7 +1,8 @@
-"""The table of returns of docs/explanation/wall_clock.md: how good each program's policy is after some env steps. Pure.
+"""The table of returns in docs/explanation/wall_clock.md: how good each program's policy is after some env steps. Pure.
 
-Rule: a seed's return is that of its first evaluation after at least so many env steps, not the best one so far. The last
-column compares XQC after few env steps with SAC after many: how much less experience the newer algorithm needs.
+Rule: a seed's return is that of its first evaluation after at least the given number of env steps, not the best one so far.
+The last column compares XQC after few env steps with SAC after many, to show how much less experience the newer algorithm
+needs.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ def return_after(curve: Curve, env_steps: int) -> float | None:
 
 
 def returns_after(curves: Sequence[Curve], env: str, program: Program, env_steps: int) -> list[float]:
-    """The returns of all seeds of a program on a task that have so many env steps, by seed."""
+    """A program's returns on a task, in the order of seeds, for all seeds with at least this many env steps."""
     mine = [curve for curve in curves if (curve.env, curve.system, curve.algo) == (env, *program)]
     found = (return_after(curve, env_steps) for curve in sorted(mine, key=lambda curve: curve.seed))
     return [returned for returned in found if returned is not None]

@@ -40,12 +40,12 @@ CURVE = "curve.jsonl"
 MODEL = "model.zip"
 REPLAY = "replay.pkl"
 OTHER_EPISODES = 1_000_000
-"""the seed of the evaluations, so that they play other episodes than training"""
+"""the evaluations' seed, which makes them play other episodes than training"""
 EVALUATIONS_OF_A_CHECKPOINT = 5
 
 
 class WriteCurve(BaseCallback):
-    """Evaluates the policy now and then, and saves checkpoints from which a later process continues."""
+    """Evaluates the policy at intervals, and saves checkpoints from which a later process continues."""
 
     def __init__(self, folder: Path, env: VecEnv, every: int, episodes: int) -> None:
         super().__init__()

@@ -1,8 +1,7 @@
-"""The tables of docs/explanation/wall_clock.md: minutes until a policy reaches a return, from curves and rates. Pure.
+"""The tables in docs/explanation/wall_clock.md: minutes until a policy reaches a return, from curves and rates. Pure.
 
-Rule: the minutes of a seed are the env steps of its first evaluation that reaches the return, divided by the env steps/s.
-The return is the one that millrace's SAC reaches at about 300,000 env steps. If a seed never reaches it, its time is
-infinite.
+Rule: a seed's minutes are the env steps of its first evaluation that reaches the return, divided by the env steps/s. The
+return is the one that millrace's SAC reaches at about 300,000 env steps. If a seed never reaches it, its time is infinite.
 """
 
 from __future__ import annotations

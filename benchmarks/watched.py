@@ -1,7 +1,7 @@
 """Measures how much an open page of the dashboard slows the run that it shows, compared with a run without a dashboard.
 
-`python -m benchmarks.watched`. Separate processes on the machine that trains serve and read the page, as with `--dashboard`
-and a browser there. The page is requested once a second. The rate is env steps/s between two updates after the same numbers
+`python -m benchmarks.watched`. On the machine that trains, separate processes serve and read the page, as with `--dashboard`
+and a local browser. The page is requested once a second. The rate is env steps/s between two updates after the same numbers
 of env steps in all runs, because CartPole's episodes grow longer while it learns. Contenders take turns, and each goes first
 equally often.
 """

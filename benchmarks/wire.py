@@ -1,10 +1,10 @@
 """Measures sending a rollout from one process to another: `python -m benchmarks.wire`.
 
 Large rollouts (14.6 MB, Atari): seconds from before `encode` in the sender until after decoding in the receiver, with one
-rollout on its way at a time, compared with plain ROUTER and DEALER sockets that send the same arrays unpacked, in turns. The
-rollouts consist of noise, or of frame stacks, which are sent packed. Small rollouts (9 KB, CartPole): CPU µs of the Python
-thread at each end. All rollouts: bytes of the frames and of ZeroMQ's framing, compared with the bytes of the arrays. Then
-what packing rollouts and rounding weights saves, and the time that it takes.
+rollout on its way at a time. For comparison, plain ROUTER and DEALER sockets take turns and send the same arrays unpacked.
+The rollouts consist of noise, or of frame stacks, which are sent packed. Small rollouts (9 KB, CartPole): CPU µs of the
+Python thread at each end. All rollouts: bytes of the frames and of ZeroMQ's framing, compared with the bytes of the arrays.
+Finally, what packing rollouts and rounding weights saves, and how long it takes.
 """
 
 from __future__ import annotations

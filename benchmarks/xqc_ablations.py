@@ -1,6 +1,6 @@
 """Variants of XQC that each lack one of its parts, to measure what the part contributes.
 
-`python -m benchmarks.xqc_ablations` prints the commands that train them. If no setting turns a part off, a class of its own
+`python -m benchmarks.xqc_ablations` prints the commands that train them. If no setting turns a part off, a separate class
 does, as in `--algo benchmarks.xqc_ablations:WithoutTarget`.
 """
 
@@ -23,7 +23,7 @@ STEPS = 101_000
 
 
 class WithoutTarget(XQC):
-    """The newest critics value the next observations, as in CrossQ."""
+    """The newest critics evaluate the next observations, as in CrossQ."""
 
     def move_target(self) -> None:
         """Copy the critics to the target critics."""
