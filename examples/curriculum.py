@@ -1,9 +1,10 @@
-"""A curriculum: CartPole with a pole that grows when the policy has learned to balance the shorter one.
+"""A curriculum: CartPole with a pole that grows whenever the policy has learned to balance the shorter one.
 
     python examples/curriculum.py
 
-The callback sets an attribute of every env copy; it takes effect with the next weights, so the result does not depend on the
-number of workers, and a resumed run goes on where it was. Evaluations are of the full task: the environment as it is made.
+The callback sets an attribute of every env copy, which takes effect together with the next weights. The result therefore
+doesn't depend on the number of workers, and a resumed run continues with the same pole. Evaluations use the full task,
+because the attribute isn't set in their env copies.
 """
 
 from __future__ import annotations
@@ -20,14 +21,14 @@ ENOUGH = 60.0  # mean return at which the pole grows
 
 
 class GrowingPole(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """CartPole whose pole has the half length `pole`, from the next reset on."""
+    """CartPole with a pole of half length `pole`; a new value takes effect at the next reset."""
 
     def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
         super().__init__(env)
         self.pole = FULL
 
     def reset(self, **keywords: Any) -> tuple[Any, dict[str, Any]]:
-        """Start an episode with a pole of the length that is set now."""
+        """Start an episode with a pole of the current length."""
         cart_pole = self.unwrapped
         assert isinstance(cart_pole, CartPoleEnv)
         cart_pole.length = self.pole
@@ -41,15 +42,15 @@ def growing_pole() -> gymnasium.Env[Any, Any]:
 
 
 class Curriculum(millrace.Callback):
-    """Makes the pole longer as soon as the last episodes were good."""
+    """Makes the pole longer as soon as recent episodes were good."""
 
     def on_start(self, progress: millrace.Progress) -> None:
-        """A new run begins with the short pole; a resumed one has what it had."""
+        """Begin a new run with the short pole. A resumed run keeps its pole."""
         if not progress.updates:
             progress.set_env_attr("pole", FIRST)
 
     def on_update(self, progress: millrace.Progress) -> None:
-        """Look at the last 100 episodes."""
+        """Make the pole longer if the mean return of the last 100 episodes is high enough."""
         pole = progress.env_attrs["pole"]
         progress.log("pole", pole)
         if pole < FULL and (progress.return_mean or 0.0) > ENOUGH:

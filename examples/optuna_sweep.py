@@ -1,16 +1,17 @@
-"""A sweep with optuna: each trial trains several seeds, and is pruned between its evaluations if others were better.
+"""A sweep with optuna: each trial trains several seeds, and is pruned after an evaluation if other trials were better.
 
     pip install optuna
     python examples/optuna_sweep.py
 
-It makes 20 trials of 3 seeds with 50,000 env steps each: up to 3 million env steps, of which pruning saves a part. Two cores
-take from ten minutes to half an hour. Each trial prints a line when it ends; `sweep(2, steps=5_000)` is a quick try.
+It runs 20 trials of 3 seeds with 50,000 env steps each. That is at most 3 million env steps, some of which pruning saves,
+and takes between ten minutes and half an hour on two cores. Each trial prints a line when it ends. For a quick test, call
+`sweep(2, steps=5_000)`.
 
-A trial's value is the mean return over its seeds. The seeds run one after another; at each evaluation optuna sees the mean
-of those so far. A pruned run ends as if its steps were done, so its workers leave and its folder is whole.
+A trial's value is the mean return over its seeds. The seeds run one after another; at each evaluation, optuna sees the mean
+over the seeds so far. A pruned run ends as if its steps were done, so its workers leave and its folder is complete.
 
-The value of the best trial is the highest of many, so it is biased upwards. The last line trains with its settings and other
-seeds, and prints what they reach.
+The best trial's value is the highest of many, so it is biased upwards. The program's last line therefore trains with that
+trial's settings and other seeds, and prints the returns that they reach.
 """
 
 from __future__ import annotations
@@ -27,15 +28,15 @@ ENV, STEPS = "CartPole-v1", 50_000
 
 
 class Prune(millrace.Callback):
-    """Tells optuna the evaluations of one seed, and ends the run if optuna prunes the trial."""
+    """Reports one seed's evaluations to optuna, and ends the run if optuna prunes the trial."""
 
     def __init__(self, trial: optuna.Trial, finished: list[float], most_steps: int) -> None:
-        """`finished`: the returns of the seeds before. `most_steps`: more than the env steps of one seed."""
+        """`finished`: the returns of the previous seeds. `most_steps`: a number larger than one seed's env steps."""
         self.trial, self.finished, self.first_step = trial, finished, len(finished) * most_steps
         self.pruned = False
 
     def on_evaluation(self, progress: millrace.Progress) -> bool:
-        """Report the mean over the seeds so far. False ends the run."""
+        """Report the mean over the seeds so far. Returns False to end the run."""
         assert progress.evaluation is not None
         self.trial.report(fmean([*self.finished, progress.evaluation.return_mean]), self.first_step + progress.env_steps)
         self.pruned = self.pruned or self.trial.should_prune()
@@ -50,7 +51,7 @@ def final_return(run: millrace.Run) -> float:
 
 
 def objective(trial: optuna.Trial, env: str = ENV, **settings: Any) -> float:
-    """Train all seeds with the settings of this trial."""
+    """Train all seeds with this trial's settings."""
     chosen = {
         "learning_rate": trial.suggest_float("learning_rate", 1e-4, 1e-2, log=True),
         "gamma": trial.suggest_categorical("gamma", [0.98, 0.99]),
@@ -68,7 +69,7 @@ def objective(trial: optuna.Trial, env: str = ENV, **settings: Any) -> float:
 
 
 def sweep(trials: int, **settings: Any) -> optuna.Study:
-    """Try settings. `settings` are keywords of `millrace.train` that all trials have in common."""
+    """Run the trials. `settings`: keywords for `millrace.train` that all trials share."""
     study = optuna.create_study(
         direction="maximize",
         sampler=optuna.samplers.TPESampler(seed=1),

@@ -1,7 +1,7 @@
-"""The weights of a run in Stable-Baselines3's MlpPolicy: `python examples/policy_in_sb3.py` (needs stable-baselines3).
+"""Loads a run's weights into Stable-Baselines3's MlpPolicy: `python examples/policy_in_sb3.py` (needs stable-baselines3).
 
-For array observations and the default networks of PPO, A2C, IMPALA and REINFORCE. The files of a run contain no critic, so
-the value estimates of this policy mean nothing.
+It supports array observations and the default networks of PPO, A2C, IMPALA and REINFORCE. A run's files contain no critic,
+so this policy's value estimates are meaningless.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ import millrace
 
 
 def stable_baselines3_actor(run: str | os.PathLike[str]) -> Callable[[Any], Any]:
-    """A function from an observation to the greedy action, by Stable-Baselines3's policy with the weights of a run."""
+    """A function that maps an observation to the greedy action of Stable-Baselines3's policy with a run's weights."""
     card = json.loads((Path(run) / "policy.json").read_text())
     arrays = load_file(Path(run) / "policy.safetensors")
     spec = card["policy"]
-    env = gymnasium.make(card["env"], **card["env_kwargs"])  # if the environment is your own, register it first
+    env = gymnasium.make(card["env"], **card["env_kwargs"])  # register your own environment first
     policy = ActorCriticPolicy(
         env.observation_space,
         env.action_space,
@@ -38,7 +38,7 @@ def stable_baselines3_actor(run: str | os.PathLike[str]) -> Callable[[Any], Any]
 
     state = policy.state_dict()
     for i in range(len(spec["net"])):
-        for kind in ("weight", "bias"):  # every second layer of their Sequential is an activation
+        for kind in ("weight", "bias"):  # every second layer of the policy's Sequential is an activation
             state[f"mlp_extractor.policy_net.{2 * i}.{kind}"] = arrays[f"actor.{i}.{kind}"]
     for kind in ("weight", "bias"):
         state[f"action_net.{kind}"] = arrays[f"actor.out.{kind}"]
@@ -46,7 +46,7 @@ def stable_baselines3_actor(run: str | os.PathLike[str]) -> Callable[[Any], Any]
         state["log_std"] = arrays["actor.log_std"]
     policy.load_state_dict(state)
 
-    divisor = spec["observation"][0]["divisor"]  # 255 for bytes from 0 to 255, else 1
+    divisor = spec["observation"][0]["divisor"]  # 255 for bytes from 0 to 255, otherwise 1
 
     def act(observation: Any) -> Any:
         observation = np.asarray(observation) / np.float32(divisor)

@@ -1,7 +1,7 @@
 """PPO in JAX over `millrace.RolloutService`: `pip install jax`, then `python examples/ppo_jax.py`.
 
-Workers collect under the newest parameters; the whole update is one compiled JAX function. `--bind tcp://0.0.0.0:5555` takes
-workers from other machines. `--save FILE` saves the state; a later start with the same file goes on from there.
+Workers collect with the newest parameters; the whole update is one compiled JAX function. With `--bind tcp://0.0.0.0:5555`,
+workers on other machines can join. `--save FILE` saves the state; a later start with the same file continues from it.
 """
 
 from __future__ import annotations
@@ -25,19 +25,19 @@ COLLECTING = ("rollout_steps", "workers", "envs", "lanes", "seed", "bind", "keys
 
 @dataclass(frozen=True)
 class Settings:
-    """Hyperparameters of RL Baselines3 Zoo for CartPole-v1."""
+    """RL Baselines3 Zoo's hyperparameters for CartPole-v1."""
 
     env: str = "CartPole-v1"
     steps: int = 100_000
-    target: float = 475.0  # mean return of the last 100 training episodes that ends the run
+    target: float = 475.0  # the run ends at this mean return of the last 100 training episodes
     seed: int = 1
     workers: int = 2
     envs: int = 8
     lanes: int = 4
     rollout_steps: int = 32
     epochs: int = 20
-    learning_rate: float = 1e-3  # falls to 0
-    clip: float = 0.2  # falls to 0
+    learning_rate: float = 1e-3  # decreases to 0
+    clip: float = 0.2  # decreases to 0
     gamma: float = 0.98
     lambda_: float = 0.8
     value_weight: float = 0.5

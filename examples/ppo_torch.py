@@ -1,8 +1,8 @@
 """PPO in PyTorch over `millrace.RolloutService`: `python examples/ppo_torch.py`.
 
-The workers act with the policy `MLP(300, 300)`. Everything else is here: the critic, the advantages, the loss, the
-optimizer. With these settings the weights equal those of `millrace train --algo ppo`, bit for bit: layers above 256 units
-pass in PyTorch there, too.
+The workers act with the policy `MLP(300, 300)`. Everything else is in this file: the critic, the advantages, the loss, the
+optimizer. With these settings, the weights are bit for bit those of `millrace train --algo ppo`, which also uses PyTorch for
+layers of more than 256 units.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from millrace.algorithms import Purpose, torch_seed
 
 @dataclass(frozen=True)
 class Settings:
-    """The settings, named as those of `millrace train`."""
+    """The settings, named as in `millrace train`."""
 
     env: str = "CartPole-v1"
     steps: int = 100_000
@@ -43,7 +43,7 @@ class Settings:
 
 
 class ActorCritic:
-    """An actor and a critic whose parameters are one flat vector, the actor's first, as the workers take them."""
+    """An actor and a critic whose parameters are one flat vector that begins with the actor's, as workers expect them."""
 
     def __init__(self, actor: tuple[millrace.Piece, ...], inputs: int, settings: Settings) -> None:
         widths = (inputs, *settings.net)

@@ -1,8 +1,9 @@
 """PPO in one file over a millrace vector environment: `python examples/ppo_vector_env.py`.
 
-The loop has the style of CleanRL's single-file implementations. It uses only `make_vec` of millrace, in the place of
-`gymnasium.make_vec(..., vectorization_mode="async")`. One detail of gymnasium 1.x is easily missed: in NEXT_STEP mode the
-step after the end of an episode resets the env copy. This row is not a transition, so the loss leaves it out (`valid`).
+The loop has the style of CleanRL's single-file implementations. From millrace it uses only `make_vec`, in place of
+`gymnasium.make_vec(..., vectorization_mode="async")`. One detail of gymnasium 1.x is easily missed: in NEXT_STEP mode, the
+step after the end of an episode resets the env copy. The row of this step is not a transition, so the loss leaves it out
+(`valid`).
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ import millrace
 
 @dataclass(frozen=True)
 class Settings:
-    """Hyperparameters of RL Baselines3 Zoo for CartPole-v1."""
+    """RL Baselines3 Zoo's hyperparameters for CartPole-v1."""
 
     env: str = "CartPole-v1"
     workers: int = 2
@@ -35,8 +36,8 @@ class Settings:
     rollout_steps: int = 32
     epochs: int = 20
     minibatch: int = 256
-    learning_rate: float = 1e-3  # falls to 0
-    clip: float = 0.2  # falls to 0
+    learning_rate: float = 1e-3  # decreases to 0
+    clip: float = 0.2  # decreases to 0
     gamma: float = 0.98
     lambda_: float = 0.8
     value_weight: float = 0.5
@@ -65,7 +66,7 @@ class Agent(nn.Module):
         self.critic = network(inputs, 1, 1.0)
 
     def distribution(self, obs: Tensor) -> Categorical:
-        """The distribution over actions, for each observation."""
+        """The distribution over actions for each observation."""
         return Categorical(logits=self.actor(obs), validate_args=False)
 
     def value(self, obs: Tensor) -> Tensor:
@@ -90,9 +91,9 @@ def train(settings: Settings = Settings(), *, quiet: bool = False) -> tuple[Agen
     """Train. Returns the agent, and the mean return of its last 100 episodes."""
     s, T, N = settings, settings.rollout_steps, settings.copies
     torch.manual_seed(s.seed)
-    torch.set_num_threads(1)  # more threads do not make such small networks faster
+    torch.set_num_threads(1)  # more threads don't make such small networks faster
     returns: deque[float] = deque(maxlen=100)
-    # Only this line is particular to millrace.
+    # Only this line is specific to millrace.
     with closing(RecordEpisodeStatistics(millrace.make_vec(s.env, N, workers=s.workers))) as env:
         agent = Agent(env)
         optimizer = torch.optim.Adam(agent.parameters(), eps=1e-5)

@@ -2,8 +2,9 @@
 
     python examples/saved_states.py
 
-When a worker is lost, or a run is resumed, another env copy goes on where the lost one was, without repeating its steps. The
-wrappers stand where nothing outside of them remembers anything: frames that are stacked outside would be missing.
+When a worker is lost or a run is resumed, a new env copy continues from the state of the old one, without replaying its
+steps. No wrapper outside of these may have a state of its own: frames that are stacked outside, for example, would be
+missing.
 """
 
 from __future__ import annotations
@@ -25,16 +26,16 @@ with suppress(ImportError):
 
 
 class AtariState(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """Saves an Atari game with its emulator's random numbers, and how many lives and frames it has had."""
+    """Saves an Atari game with the state of its emulator's random generator, and its numbers of lives and frames."""
 
     def save_state(self) -> bytes:
-        """The emulator's own format."""
+        """The state in the emulator's own format."""
         game: Any = self.unwrapped
         state: bytes = game.clone_state(include_rng=True).serialize()
         return state
 
     def load_state(self, state: bytes) -> None:
-        """Put it back."""
+        """Restore the game."""
         from ale_py import ALEState
 
         game: Any = self.unwrapped
@@ -42,10 +43,10 @@ class AtariState(gymnasium.Wrapper[Any, Any, Any, Any]):
 
 
 class MujocoState(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """Saves all from which MuJoCo computes its next step, and where the bodies were: tasks compute rewards from it."""
+    """Saves everything that MuJoCo's next step depends on, and the bodies' positions, from which tasks compute rewards."""
 
     def save_state(self) -> bytes:
-        """The numbers of `mjSTATE_INTEGRATION`, then the places of all bodies, float64."""
+        """The numbers of `mjSTATE_INTEGRATION`, followed by the positions of all bodies, as float64."""
         task: Any = self.unwrapped
         numbers = np.empty(self._size())
         mujoco.mj_getState(task.model, task.data, numbers, INTEGRATION)
@@ -53,7 +54,7 @@ class MujocoState(gymnasium.Wrapper[Any, Any, Any, Any]):
         return state
 
     def load_state(self, state: bytes) -> None:
-        """Put them back: twice, because what MuJoCo computes from them changes what its next step begins with."""
+        """Restore the numbers twice, because what MuJoCo computes from them changes the state before its next step."""
         task: Any = self.unwrapped
         numbers, places = np.split(np.frombuffer(state), [self._size()])
         mujoco.mj_setState(task.model, task.data, numbers, INTEGRATION)
@@ -68,7 +69,7 @@ class MujocoState(gymnasium.Wrapper[Any, Any, Any, Any]):
 
 
 class TcpSimulator(gymnasium.Env[Any, Any]):
-    """A simulator that answers `reset`, `step`, `save` and `load` over TCP: a byte that says what, a length, and bytes."""
+    """A simulator that answers `reset`, `step`, `save` and `load` over TCP. A request is a kind byte, a length, and data."""
 
     observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (2,), np.float32)
     action_space = gymnasium.spaces.Discrete(2)
@@ -77,27 +78,27 @@ class TcpSimulator(gymnasium.Env[Any, Any]):
         self._connection = socket.create_connection(("127.0.0.1", port), timeout=60)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Begin an episode from a seed of `np_random`, so that the simulator repeats itself."""
+        """Begin an episode with a seed drawn from `np_random`, so that the simulator is deterministic."""
         super().reset(seed=seed)
         answer = self._ask(b"r", struct.pack("<q", int(self.np_random.integers(2**31))))
         return np.frombuffer(answer[:8], np.float32), {}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Ask for one step."""
+        """Request one step."""
         answer = self._ask(b"s", bytes([int(action)]))
         reward, ended = struct.unpack("<d?", answer[8:17])
         return np.frombuffer(answer[:8], np.float32), reward, ended, False, {}
 
     def save_state(self) -> bytes:
-        """What the simulator writes when it is asked to save."""
+        """The simulator's answer to a `save` request."""
         return self._ask(b"w", b"")
 
     def load_state(self, state: bytes) -> None:
-        """Let the simulator read it."""
+        """Send the state to the simulator."""
         self._ask(b"l", state)
 
     def close(self) -> None:
-        """Hang up."""
+        """Close the connection."""
         self._connection.close()
 
     def _ask(self, what: bytes, content: bytes) -> bytes:
@@ -116,7 +117,7 @@ class TcpSimulator(gymnasium.Env[Any, Any]):
 
 
 def train(**settings: Any) -> millrace.Run:
-    """Train on Pong whose games are saved. If you kill a worker meanwhile, its lanes go on, and no step is repeated."""
+    """Train on Pong with saved games. If you kill a worker meanwhile, its lanes continue, and no step is replayed."""
     return millrace.train("ALE/Pong-v5", wrappers=[AtariState], env_kwargs={"obs_type": "ram"}, **settings)
 
 

@@ -1,10 +1,10 @@
-"""Four tasks in one run: CartPole with four lengths of the pole, of which each env copy has one, by its number.
+"""Four tasks in one run: CartPole with four pole lengths. Each env copy has one of them, which depends on its number.
 
     python examples/tasks_by_number.py
 
-The number of a copy is the same in every run, on every machine and after a resume. So each copy keeps its task, and the
-result does not depend on the number of workers. The force of the motor is randomized by the number, too; evaluations have
-the true one. With `eval_copies=4`, the episodes of an evaluation are equally many of each task.
+A copy's number is the same in every run, on every machine and after a resume. Each copy therefore keeps its task, and the
+result doesn't depend on the number of workers. The motor's force is also randomized by the number; evaluations use the true
+force. With `eval_copies=4`, an evaluation has equally many episodes of each task.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ POLES = {"short": 0.3, "usual": 0.5, "long": 1.0, "longest": 2.0}  # half length
 
 
 class Named(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """Reports the return of an episode in `info`, under the name of its task."""
+    """Reports an episode's return in `info`, under the name of its task."""
 
     def __init__(self, env: gymnasium.Env[Any, Any], task: str) -> None:
         super().__init__(env)
@@ -53,7 +53,7 @@ def make_task(copy: millrace.EnvCopy) -> gymnasium.Env[Any, Any]:
 
 
 def train(**settings: Any) -> millrace.Run:
-    """Train on all tasks. The returns by task are metrics, as `rollout/return_long` and `eval/return_long`."""
+    """Train on all tasks. Each task's return is a metric, such as `rollout/return_long` and `eval/return_long`."""
     names = [f"return_{task}" for task in POLES]
     return millrace.train(make_task, info_keys=names, **{"envs": 8, "lanes": 4, "eval_copies": 4, **settings})
 
