@@ -1,1 +1,1 @@
-"""What makes the documentation site out of docs/, the code and some files of the repository (`make site`)."""
+"""Builds the documentation site from docs/, the code and some files of the repository (`make site`)."""

@@ -1,4 +1,4 @@
-"""reference/commands.md: the help of every command, from the commands themselves."""
+"""Makes reference/commands.md: the help of every command, from the commands themselves."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ SHORT = "`millrace learner` has the flags of [`millrace train`](#millrace-train)
 
 
 def page() -> str:
-    """The page."""
+    """The page as Markdown."""
     parts = [HEAD, _block("")]
     for title, commands in GROUPS.items():
         parts.append(f"\n## {title}\n")
@@ -41,7 +41,7 @@ def page() -> str:
 
 
 def lines_of(name: str) -> list[str]:
-    """The command lines whose help the page shows for a command: with subcommands one for each."""
+    """The command lines whose help the page shows for a command: one for each subcommand, if there are any."""
     match name:
         case "launch":
             return [name, *(f"launch {launcher}" for launcher in LAUNCHERS)]
@@ -55,8 +55,8 @@ def lines_of(name: str) -> list[str]:
 
 @cache
 def help_of(line: str) -> str:
-    """What `millrace LINE --help` prints in a terminal of 100 columns, without colors."""
-    if line == "bench":  # a process of its own, so its output cannot be redirected here
+    """The output of `millrace LINE --help` in a terminal with 100 columns, without colors."""
+    if line == "bench":  # it starts a process of its own, whose output can't be redirected here
         command = [sys.executable, "-m", "millrace", "bench", "--help"]
         return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=True).stdout.rstrip()
     printed = io.StringIO()

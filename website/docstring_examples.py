@@ -1,7 +1,7 @@
-"""An extension of Griffe (mkdocstrings): what the pages show of docstrings beyond their text.
+"""An extension for Griffe (mkdocstrings): what the pages show in addition to the text of docstrings.
 
-Examples in doctest's style become blocks of code. A class or function that is no method says where its source is, because
-the repository has no public address to link to.
+Doctest-style examples become code blocks. For a class, and for a function that isn't a method, the page says where its
+source is, because the repository has no public address to link to.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from website.doctest_fences import with_fences
 
 
 class DocstringExamples(griffe.Extension):  # type: ignore[misc]  # mypy skips griffe
-    """Puts fences around examples, and the place of the source behind them."""
+    """Puts fences around examples, and adds the place of the source."""
 
     def on_object(self, *, obj: griffe.Object, **kwargs: Any) -> None:
         """See `griffe.Extension`."""

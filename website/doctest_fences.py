@@ -1,4 +1,4 @@
-"""Examples in doctest's style as fenced blocks of Markdown. Pure.
+"""Turns doctest-style examples into fenced Markdown blocks. Pure.
 
 Rule: an example begins with a line `>>>` and ends with an empty line or the end of the docstring.
 """
@@ -7,7 +7,7 @@ from __future__ import annotations
 
 
 def with_fences(text: str) -> str:
-    """A docstring in which each example stands in a fenced block."""
+    """The docstring, with each example in a fenced block."""
     lines: list[str] = []
     indent: str | None = None
     for line in text.split("\n"):

@@ -1,4 +1,4 @@
-"""Hooks of mkdocs (mkdocs.yml names this file): pages from outside docs/, pages made from the code, and links."""
+"""Hooks for mkdocs (mkdocs.yml names this file): pages from outside docs/, pages generated from the code, and links."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from website.pages import FROM_ELSEWHERE, MADE, ROOT, DeadLink, for_site, writte
 from website.tables import as_cards
 
 LOOKED_UP = ("reference/", "project/")
-"""Pages that a search shows after the others: their many names would hide the page that answers the question."""
+"""Pages that a search lists last, because their many names would hide the page that answers the question."""
 
 
 def on_files(files: Files, /, *, config: MkDocsConfig) -> Files:
-    """Add the pages that are not in docs/."""
+    """Add the pages that aren't in docs/."""
     for source, page in FROM_ELSEWHERE.items():
         files.append(File.generated(config, page, content=(ROOT / source).read_text(encoding="utf-8")))
     for page, make in MADE.items():
@@ -24,7 +24,7 @@ def on_files(files: Files, /, *, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, /, *, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Rewrite the links of a page. Raises PluginError for a link to a file that does not exist."""
+    """Rewrite the links on a page. Raises PluginError for a link to a file that doesn't exist."""
     path = page.file.src_uri
     if path.startswith(LOOKED_UP):
         page.meta["search"] = {"boost": 0.2}
@@ -35,5 +35,5 @@ def on_page_markdown(markdown: str, /, *, page: Page, config: MkDocsConfig, file
 
 
 def on_page_content(html: str, /, *, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Name the column of each cell, for narrow screens."""
+    """Label each table cell with its column's name, for narrow screens."""
     return as_cards(html)

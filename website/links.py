@@ -1,6 +1,6 @@
-"""Links and headings of a Markdown text. Pure.
+"""Finds the links and headings in Markdown text. Pure.
 
-Rule: what stands in a fenced code block or between backticks is no link and no heading.
+Rule: text in a fenced code block or between backticks is neither a link nor a heading.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ ELSEWHERE = re.compile(r"^[a-z][a-z0-9+.-]*:")
 
 
 class Link(NamedTuple):
-    """A link of a page."""
+    """A link on a page."""
 
     line: int
     text: str
@@ -27,7 +27,7 @@ class Link(NamedTuple):
 
 
 def outside_fences(text: str) -> Iterator[tuple[int, str]]:
-    """The lines of a text that are not in a fenced code block, and their numbers from 1."""
+    """The lines that aren't in a fenced code block, with their line numbers, counted from 1."""
     fence = ""
     for number, line in enumerate(text.split("\n"), 1):
         mark = FENCE.match(line)
@@ -40,7 +40,7 @@ def outside_fences(text: str) -> Iterator[tuple[int, str]]:
 
 
 def links(text: str) -> list[Link]:
-    """All links and images of a page, also those to other hosts."""
+    """All links and images on a page, including those to other hosts."""
     found: list[Link] = []
 
     def note(match: re.Match[str]) -> str:
@@ -52,18 +52,18 @@ def links(text: str) -> list[Link]:
 
 
 def with_links(text: str, new: Callable[[Link, str], str]) -> str:
-    """The text with each link replaced. `new` gets the link and its Markdown, and returns the Markdown to put there."""
+    """The text with each link replaced. `new` gets the link and its Markdown, and returns the new Markdown."""
     return _substituted(text, lambda match: new(Link(0, match["text"], match["target"]), match[0]))
 
 
 def _substituted(text: str, new: Callable[[re.Match[str]], str]) -> str:
-    """The text after `new` has replaced each link. A link may span lines; code is left alone."""
+    """The text after `new` has replaced each link. A link may span lines; code stays unchanged."""
     code = _code_spans(text)
     return LINK.sub(lambda match: match[0] if any(a <= match.start() < b for a, b in code) else new(match), text)
 
 
 def _code_spans(text: str) -> list[tuple[int, int]]:
-    """Where code begins and ends: each fenced block, and each piece of a line between backticks."""
+    """Where code begins and ends: each fenced block, and each part of a line between backticks."""
     plain = {number for number, _ in outside_fences(text)}
     spans: list[tuple[int, int]] = []
     start = 0
@@ -77,12 +77,12 @@ def _code_spans(text: str) -> list[tuple[int, int]]:
 
 
 def elsewhere(target: str) -> bool:
-    """Whether this is an address of another host (or of a mail box)."""
+    """Whether this is an address on another host, or an email address."""
     return bool(ELSEWHERE.match(target))
 
 
 def resolved(source: str, target: str) -> tuple[str, str]:
-    """Path, from the top of the repository, and anchor of a relative link in the file `source`. `..` may lead out of it."""
+    """The path and the anchor of a relative link in the file `source`. `..` may lead out of the repository."""
     path, _, anchor = target.partition("#")
     return (posixpath.normpath(posixpath.join(posixpath.dirname(source), path)) if path else source), anchor
 
@@ -93,13 +93,13 @@ def slug(title: str, separator: str = "-") -> str:
 
 
 def headings(text: str) -> list[str]:
-    """The titles of a page, without Markdown."""
+    """The titles on a page, without Markdown."""
     matches = (HEADING.match(line) for _, line in outside_fences(text))
     return [_plain(match["title"]) for match in matches if match]
 
 
 def anchors(text: str) -> set[str]:
-    """All anchors of a page: of its headings (a title that comes again gets a number), and those that it names itself."""
+    """All anchors on a page: those of its headings (a repeated title gets a number), and explicit ones."""
     found: set[str] = set()
     for title in headings(text):
         name = slug(title)
@@ -113,5 +113,5 @@ def anchors(text: str) -> set[str]:
 
 
 def _plain(title: str) -> str:
-    """A title without the marks of links, code and emphasis."""
+    """A title without the Markdown for links, code and emphasis."""
     return re.sub(r"[`*]", "", LINK.sub(lambda match: match["text"], re.sub(r"\s*\{[^}]*\}$", "", title)))

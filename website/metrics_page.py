@@ -1,4 +1,4 @@
-"""reference/metrics.md: every number of metrics.jsonl, TensorBoard and Prometheus, from the code that makes them."""
+"""Makes reference/metrics.md: every number in metrics.jsonl, TensorBoard and Prometheus, from the code that logs it."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ In a name, NAME stands for a name that you chose.
 """
 EVERY_NUMBER = Progress(return_mean=1.0, length_mean=1.0, facts={"NAME": FactMean(mean=1.0, missing=0)})
 SAMPLE = Observed(1.0, HubSnapshot(Ledger(), incarnations=[], lags=[], progress=EVERY_NUMBER))
-"""A hub of which every metric has a value."""
+"""A hub in which every metric has a value."""
 PROMETHEUS = """## Prometheus
 
 A learner with `--metrics-bind 127.0.0.1:9464` shows these at `http://127.0.0.1:9464/metrics`. Prometheus itself adds
@@ -38,7 +38,7 @@ A learner with `--metrics-bind 127.0.0.1:9464` shows these at `http://127.0.0.1:
 
 
 def page() -> str:
-    """The page."""
+    """The page as Markdown."""
     parts = [HEAD]
     for title, names in METRICS.items():
         rows = ((anchored(name, f"`{name}`"), label(name), each.unit, each.text) for name, each in names.items())
@@ -48,7 +48,7 @@ def page() -> str:
 
 
 def prometheus() -> Iterator[tuple[str, str, str, str]]:
-    """Name as Prometheus shows it, type, labels and text of each metric of a learner that trains."""
+    """For each metric of a learner that trains: its name in Prometheus, its type, its labels and its text."""
     for metric in MetricsCollector(Config(env="CartPole-v1"), observed=SAMPLE).collect():
         labels = {label for sample in metric.samples for label in sample.labels} - {"le"}
         shown = "" if metric.type == "info" else ", ".join(f"`{label}`" for label in sorted(labels))

@@ -1,7 +1,7 @@
-"""The pages of the site: those of docs/, files from elsewhere in the repository, and those made from the code.
+"""The pages of the site: those in docs/, files from elsewhere in the repository, and those generated from the code.
 
-Rule: a link to a file of the repository that is no page becomes plain code, because the repository has no public address.
-A link to a file that does not exist is an error.
+Rule: a link to a repository file that isn't a page becomes plain code, because the repository has no public address. A link
+to a file that doesn't exist is an error.
 """
 
 from __future__ import annotations
@@ -22,34 +22,33 @@ FROM_ELSEWHERE = {
 }
 """Files outside docs/ that are pages: path in the repository -> path in the site"""
 START = {"docs": "index.md"}
-"""What links to these files becomes a link to this page."""
+"""Paths in the repository whose links lead to another page of the site"""
 MADE: dict[str, Callable[[], str]] = {
     **python_page.pages(),
 }
-"""Pages that are made from the code when the site is built: path in the site -> what makes it"""
+"""Pages that are generated from the code when the site is built: path in the site -> function that makes the page"""
 KEPT: dict[str, Callable[[], str]] = {
     "reference/settings.md": settings_page.page,
     "reference/commands.md": commands_page.page,
     "reference/metrics.md": metrics_page.page,
 }
-"""Pages that are made from the code and kept in docs/, so that links lead to them in the repository too"""
+"""Pages that are generated from the code and kept in docs/, so that links to them also work in the repository"""
 
 
 class DeadLink(Exception):
-    """A link to a file that does not exist."""
+    """A link to a file that doesn't exist."""
 
 
 def written_pages() -> dict[str, str]:
-    """The pages that someone wrote: path in the site -> path in the repository."""
+    """The hand-written pages: path in the site -> path in the repository."""
     found = {str(path.relative_to(ROOT / "docs")): str(path.relative_to(ROOT)) for path in (ROOT / "docs").rglob("*.md")}
     return found | {page: source for source, page in FROM_ELSEWHERE.items()}
 
 
 def for_site(page: str, source: str, text: str) -> str:
-    """The text of a page with its links as the site needs them. Raises DeadLink for a file that does not exist.
+    """The text of a page, with links as the site needs them. Raises DeadLink for a link to a file that doesn't exist.
 
-    `source`: the path of the file in the repository. A link to a page of docs/ that is missing is left to mkdocs, which
-    reports it.
+    `source`: the path of the file in the repository. A link to a missing page in docs/ is left to mkdocs, which reports it.
     """
 
     def new(link: Link, markdown: str) -> str:
@@ -67,7 +66,7 @@ def for_site(page: str, source: str, text: str) -> str:
 
 
 def page_of(path: str) -> str | None:
-    """The page or picture of the site that a file of the repository becomes; None if it becomes none."""
+    """The page or picture that a repository file becomes in the site; None if it isn't part of the site."""
     if path in START:
         return START[path]
     if path.startswith("docs/"):
@@ -76,7 +75,7 @@ def page_of(path: str) -> str | None:
 
 
 def as_code(text: str, path: str) -> str:
-    """What stands in place of a link to a file: its path, after the text of the link if that says more."""
+    """The replacement for a link to a file: the file's path, preceded by the link's text if that says more."""
     name = text.strip("`")
     return f"`{path}`" if name in (path, posixpath.basename(path), f"{path}/") else f"{text} (`{path}`)"
 

@@ -1,6 +1,6 @@
-"""reference/python.md lists the public names, and a page of reference/python/ shows each group of them.
+"""Makes reference/python.md, which lists the public names, and a page in reference/python/ for each group of them.
 
-mkdocstrings replaces each `:::` line of a page with signature and docstring.
+mkdocstrings replaces each `:::` line on a page with a signature and docstring.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class Group(NamedTuple):
     title: str
     about: str
     names: str
-    """names of `millrace` and its public modules, with spaces between"""
+    """names from `millrace` and its public modules, separated by spaces"""
 
 
 GROUPS = {
@@ -106,18 +106,18 @@ GROUPS = {
 WITHOUT_MEMBERS = (
     "Config", ".PPO", ".A2C", ".IMPALA", ".REINFORCE", ".DQN", ".Rainbow", ".SAC", ".TD3", ".TQC", ".CrossQ", ".XQC",
 )  # fmt: skip
-"""Ends of names whose members are on another page, or are those of a base"""
+"""Endings of names whose members are on another page, or are those of a base class"""
 WITH_INHERITED_MEMBERS = {"millrace.Progress"}
-"""Names whose base is no public name of its own"""
+"""Names whose base class isn't public"""
 
 
 def pages() -> dict[str, Callable[[], str]]:
-    """What makes each page, by its path in the site."""
+    """The function that makes each page, by the page's path in the site."""
     return {"reference/python.md": index} | {f"reference/python/{name}.md": partial(page, name) for name in GROUPS}
 
 
 def index() -> str:
-    """The page that lists all names. It has the anchor of each, as the page that shows it."""
+    """The page that lists all names. It has an anchor for each name, like the page that shows the name."""
     parts = [HEAD]
     for page, group in GROUPS.items():
         rows = [(anchored(name, f"[`{name}`](python/{page}.md#{name})"), about(name)) for name in names_of(group)]
@@ -126,7 +126,7 @@ def index() -> str:
 
 
 def page(name: str) -> str:
-    """The page of a group."""
+    """A group's page."""
     group = GROUPS[name]
     shown = (f"::: {each}\n{_options(each)}\n" for each in names_of(group))
     return f"# {group.title}\n\n{group.about}\n\n" + "".join(shown)
@@ -141,7 +141,7 @@ def _options(name: str) -> str:
 
 
 def names_of(group: Group) -> list[str]:
-    """The full public names of a group."""
+    """A group's names, as full public names."""
     return [f"millrace.{name}" for name in group.names.split()]
 
 
@@ -156,6 +156,6 @@ def about(name: str) -> str:
 
 
 def anchors(page: str) -> set[str]:
-    """The anchors that mkdocstrings makes on a page of the site: the full name of each object."""
+    """The anchors that mkdocstrings makes on a page: the full name of each object."""
     group = GROUPS.get(page.removeprefix("reference/python/").removesuffix(".md"))
     return set() if group is None else set(names_of(group))

@@ -1,4 +1,4 @@
-"""reference/settings.md: every setting of a run, from the records that hold them."""
+"""Makes reference/settings.md: every setting of a run, from the records that define them."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ KINDS = {bool: "true or false", int: "int", float: "float", str: "text", Path: "
 
 
 def page() -> str:
-    """The page."""
+    """The page as Markdown."""
     parts = [HEAD + "".join(f"- **{one.name.lower()}**: {one.value}\n" for one in OnResume)]
     parts.append("\n## Basics\n\n" + _table(Config, [name for name in BASIC if name not in LAYERS]))
     parts.append(
@@ -95,7 +95,7 @@ def flag(name: str) -> str:
 
 
 def default(value: Any) -> str:
-    """A default, as it is written on the command line."""
+    """A default as it is written on the command line."""
     if value is None:
         return "none"
     if value in ("", (), {}):
@@ -110,7 +110,7 @@ def default(value: Any) -> str:
 
 
 def values(hint: Any) -> str:
-    """Which values a type allows, in words."""
+    """The values that a type allows, in words."""
     kind, notes = _bare(hint)
     if kind in KINDS:
         return KINDS[kind] + "".join(notes)
@@ -143,7 +143,7 @@ def _bare(hint: Any) -> tuple[Any, list[str]]:
 
 
 def _bounds(meta: msgspec.Meta) -> Iterator[str]:
-    le = None if meta.le == LARGEST else meta.le  # no reader of the page meets that
+    le = None if meta.le == LARGEST else meta.le  # too large to matter to a reader
     if meta.ge is not None and le is not None:
         yield f", {meta.ge:g} to {le:g}"
         return

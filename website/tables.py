@@ -1,6 +1,6 @@
-"""Tables of the pages: anchors in their Markdown, and labels in their HTML for narrow screens. Pure.
+"""Tables on the pages: anchors in their Markdown, and labels in their HTML for narrow screens. Pure.
 
-Rule: on a phone each row of a table of three or more columns is a card (docs/site.css), so a cell has to name its column.
+Rule: on a phone, each row of a table with three or more columns is a card (docs/site.css), so a cell must name its column.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ TAG = re.compile(r"<[^>]+>")
 
 
 def anchored(anchor: str, markdown: str) -> str:
-    """Markdown that a link can lead to."""
+    """The Markdown with an anchor, so that links can lead to it."""
     return f'<span id="{anchor}">{markdown}</span>'
 
 
 def as_cards(html: str) -> str:
-    """The HTML of a page in which each cell of a table names its column."""
+    """The page's HTML, with each table cell naming its column."""
     return TABLE.sub(lambda match: _labelled(match[0]), html)
 
 
