@@ -82,7 +82,7 @@ def elsewhere(target: str) -> bool:
 
 
 def resolved(source: str, target: str) -> tuple[str, str]:
-    """The path and the anchor of a relative link in the file `source`. `..` may lead out of the repository."""
+    """The path in the repository, and the anchor, of a relative link in the file `source`. `..` may lead outside."""
     path, _, anchor = target.partition("#")
     return (posixpath.normpath(posixpath.join(posixpath.dirname(source), path)) if path else source), anchor
 
