@@ -23,7 +23,7 @@ TRIES = 15
 def products_ms(run: Callable[[], object], updates: int) -> float:
     """Milliseconds that the matrix products of an update take at the speed of `flop_per_s`.
 
-    `run` makes `updates` updates, with networks that run in torch.
+    `run` performs `updates` updates, with networks that run in torch.
     """
     with FlopCounterMode(display=False) as counter:
         run()

@@ -22,7 +22,7 @@ from benchmarks.writing import write
 COPIES = 4
 EPISODES = 4
 EPISODE_STEPS = 8
-# Env steps that training makes in twice the time of an evaluation, whose env copies share a worker.
+# Env steps that training takes in twice the time of an evaluation, whose env copies share a worker.
 EVERY = 2 * EPISODES * EPISODE_STEPS * COPIES
 WARM_UP_STEPS = 2 * COPIES * 16
 SETTINGS: dict[str, Any] = {

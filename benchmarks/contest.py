@@ -28,7 +28,7 @@ class Contest(NamedTuple):
     target: float | None
     """the largest fraction of the peer's time that `ours` should take"""
     runs: Mapping[str, Callable[[], float]]
-    """`peer`, `graph` (millrace with autograd) and `ours` (what millrace chooses): functions that make some updates and
+    """`peer`, `graph` (millrace with autograd) and `ours` (what millrace chooses): functions that perform some updates and
     return the CPU seconds of one
     """
 

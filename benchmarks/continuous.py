@@ -1,7 +1,7 @@
 """SAC and TD3 on Pendulum-v1 with Stable-Baselines3's hyperparameters: `python -m benchmarks.continuous`.
 
 Rule: both systems use the same networks, batch size, replay buffer, learning rates and replay ratio (1), and one env copy.
-Stable-Baselines3 makes a gradient step after each env step. millrace makes 8 gradient steps after every 8 env steps, in the
+Stable-Baselines3 takes a gradient step after each env step. millrace takes 8 gradient steps after every 8 env steps, in the
 learner, while one worker process collects.
 
 Env steps/s are measured after `learning_starts`. The time to -200 is measured from the start of the command (with imports

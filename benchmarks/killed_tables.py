@@ -59,7 +59,7 @@ class Killed:
         return sum(event["new_episodes"] for event in self.events if event["event"] == "lane_continued")
 
     def made_again(self) -> int:
-        """Number of env steps that were made twice, because they were made after the checkpoint of a resumed run."""
+        """Number of env steps that were taken twice, because they followed the checkpoint from which a run was resumed."""
         found = 0
         for number, fault in enumerate(self.faults):
             saved = [CONTINUES.search(event["message"]) for event in self.after(number)]

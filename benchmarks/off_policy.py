@@ -36,7 +36,7 @@ LAGS = (0, 8)
 SEEDS = 5
 SETTINGS: dict[str, Any] = {
     "steps": 200_000,
-    "workers": 4,  # many workers and small batches, so that the learner is the slower side, and rollouts get old
+    "workers": 4,  # many workers and small batches make the learner the slower side, and rollouts get old
     "envs": 8,
     "lanes": 4,
     "rollout_steps": 16,

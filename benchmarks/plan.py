@@ -2,8 +2,9 @@
 
 For each of eight environments (`benchmarks/plan_envs.py`) it makes a plan. Then it trains with the plan's algorithm, env
 copies and rollout steps on a grid of workers, lanes and lags, and measures the env steps/s of each run after its first
-updates. It reports how close the recommended settings come to the best of the grid, and the expected speed to the measured
-one. The runs of a grid take turns. An algorithm with a replay buffer makes gradient steps from the second update on.
+updates. It reports how close the recommended settings come to the grid's best, and how close the expected speed is to the
+measured one. The runs of a grid take turns. An algorithm with a replay buffer takes gradient steps from the second update
+on.
 """
 
 from __future__ import annotations
@@ -106,7 +107,7 @@ def rate(env: str, settings: dict[str, Any], cell: Cell, seconds: float) -> floa
 
 
 def compared(names: Sequence[str], seconds: float, rounds: int, say: Any, *, with_grid: bool) -> dict[str, dict[str, Any]]:
-    """For each environment, its plan and the env steps/s of each cell of its grid (or of the plan's cell only)."""
+    """For each environment, its plan and the env steps/s of each cell in its grid (or only of the plan's cell)."""
     found = {}
     for name in names:
         env = f"{plan_envs.__name__}:{ENVS[name]}"

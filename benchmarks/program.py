@@ -89,7 +89,7 @@ def overview() -> str:
 
 
 def main(argv: list[str]) -> int:
-    """Run the benchmark that `argv` names, or all. Returns the exit code. Raises `UsageError`."""
+    """Run the benchmark that `argv` names, or all. Returns the exit code. Raises `UsageError` for wrong arguments."""
     if argv and argv[0] in ("-h", "--help"):
         print(overview())
         return 0

@@ -79,7 +79,7 @@ PEERS = {
 
 
 def rate(name: str, contender: Contender, seed: int) -> float:
-    """Env steps/s after the warm-up. Raises `RuntimeError`."""
+    """Env steps/s after the warm-up. Raises `RuntimeError` if the run fails."""
     updates = UPDATES if contender.ours else UPDATES_OF_PEERS
     settings = SETTINGS | {"steps": updates * COPIES * SETTINGS["rollout_steps"], "seed": seed}
     if contender.ours:

@@ -3,8 +3,8 @@
 `benchmarks.slow_env:TenMilliseconds-v0` is Pendulum-v1 in which each step takes 10 ms longer. In `FiftyMilliseconds-v0`, a
 step takes 50 ms longer, and an episode has 1,000 steps instead of 200.
 
-`benchmarks.slow_env:Lognormal-v0`: a step takes 5 ms on average (lognormal, sigma 1), a reset 200 ms, and an episode has
-50 to 150 steps. The durations depend only on the reset seed. A copy that never waits makes 100 steps in 0.7 s.
+`benchmarks.slow_env:Lognormal-v0`: a step takes 5 ms on average (lognormal, sigma 1), a reset 200 ms, and an episode has 50
+to 150 steps. The durations depend only on the reset seed. A copy that never waits takes 100 steps in 0.7 s.
 
 `benchmarks.slow_env:Constant-v0`: a step takes `seconds`, a reset no time, and an episode has `steps` steps.
 

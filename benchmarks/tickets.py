@@ -1,4 +1,4 @@
-"""Draws docs/images/tickets.png, which shows when workers collect rollouts and when the learner makes updates.
+"""Draws docs/images/tickets.png, which shows when workers collect rollouts and when the learner updates the policy.
 
 `python -m benchmarks.tickets` runs the real coordinator (`learner/rollouts/ticket_coordinator.py`) in simulated time. There
 are three lanes, each on a worker of its own. The rollouts of a lane differ in duration (`ROLLOUT_S`), an update takes as

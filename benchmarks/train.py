@@ -53,7 +53,7 @@ class Measure(NamedTuple):
         return self.settings["envs"] <= each.most_envs and not (each.own and self.settings is LARGE)
 
     def of(self, contender: str, seed: int) -> dict[str, float]:
-        """Run the contender. Returns one or two numbers, by column of the table. Raises `RuntimeError`."""
+        """Run the contender. Returns one or two numbers, by column of the table. Raises `RuntimeError` if the run fails."""
         settings = self.settings | {"steps": self.steps, "seed": seed}
         match self.kind:
             case "rate":

@@ -2,7 +2,7 @@
 
 All do the same work on the same rows (4 observations, 2 actions, actor and critic 4-64-64-·, tanh): they take the minibatch
 out of the batch, normalize advantages, compute the clipped surrogate, value loss, entropy, approx_kl and clip fraction, clip
-the gradient by its norm, make a step of Adam with eps 1e-5, and read the losses as numbers. The usual style uses modules,
+the gradient by its norm, take a step of Adam with eps 1e-5, and read the losses as numbers. The usual style uses modules,
 `torch.distributions.Categorical`, `clip_grad_norm_` and torch's own Adam.
 """
 

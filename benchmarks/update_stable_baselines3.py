@@ -1,7 +1,7 @@
 """Compares gradient steps of off-policy algorithms and updates of A2C with Stable-Baselines3's, on the same shapes.
 
 DQN: both sample 64 transitions, compute targets with the target network and the Huber loss, clip the gradient by its norm,
-and make a step of Adam. A2C, with 8 env copies: Stable-Baselines3 already has the values from acting, while millrace
+and take a step of Adam. A2C, with 8 env copies: Stable-Baselines3 already has the values from acting, while millrace
 recomputes them; both compute advantages, losses, one step of RMSProp, and what they log. Continuous actions: the shapes of
 Pendulum, with 256 transitions; the peers of TQC and CrossQ are those of sb3-contrib.
 """
@@ -77,7 +77,7 @@ def some_batch(steps: int, seed: int) -> Batch:
 
 
 def dqn(width: int, target: float) -> Contest:
-    """The contest of a gradient step of DQN on 64 transitions."""
+    """The contest of a DQN gradient step on 64 transitions."""
     rows = 64
     size = 10_000
     config = DQNConfig(
@@ -187,7 +187,7 @@ def beside_sac(name: str, width: int) -> Contest:
 
 
 def a2c(steps: int, target: float) -> Contest:
-    """The contest of an update of A2C on this number of steps of 8 env copies."""
+    """The contest of an A2C update on this number of steps of 8 env copies."""
     batch = some_batch(steps, 0)
     config = A2CConfig(rollout_steps=steps)
 

@@ -52,7 +52,7 @@ class Program(NamedTuple):
     def warm_up_steps(self, env: str) -> int:
         """Number of env steps at the beginning that a rate leaves out.
 
-        In PPO these are the steps of the first update. Other algorithms have made some gradient steps after them.
+        In PPO these are the steps of the first update. Other algorithms have taken some gradient steps by then.
         """
         return self.steps_of_an_update(env) if self.algo == "ppo" else WARM_UP_STEPS
 

@@ -111,7 +111,7 @@ def can_be_measured(program: Program, env: str, step_s: float, seconds: float) -
 def measure(
     program: Program, env: str, step_s: float, seed: int, *, seconds: float, threads: int = 1, device: str = "cpu"
 ) -> float:
-    """Measure env steps/s over at least this many seconds after the warm-up. Raises `RuntimeError`."""
+    """Measure env steps/s over at least this many seconds after the warm-up. Raises `RuntimeError` if the run fails."""
     command = rate_command(program, env, step_s, seed, threads, device)
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as name:
         folder = Path(name)

@@ -126,7 +126,7 @@ def step_times() -> list[float]:
 
 
 def quickest_table(tasks: Mapping[str, Sequence[Row]]) -> str:
-    """A table of the quickest algorithm at each step time, among all programs and among those of Stable-Baselines3."""
+    """A table of the quickest algorithm at each step time, among all programs and among Stable-Baselines3's."""
     head = ("task", "of all", f"of {THEIRS}")
     theirs = {env: [row for row in rows if row.program.system == THEIRS] for env, rows in tasks.items()}
     return table(head, [[env, ranges_text(rows), ranges_text(theirs[env])] for env, rows in tasks.items()])

@@ -33,7 +33,7 @@ class Named(gymnasium.Wrapper[Any, Any, Any, Any]):
         return super().reset(**keywords)
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """Make a step, and add its reward to the return."""
+        """Take a step, and add its reward to the return."""
         observation, reward, terminated, truncated, info = super().step(action)
         self.total += float(reward)
         return observation, reward, terminated, truncated, {**info, self.key: self.total}

@@ -1,8 +1,8 @@
 """A saved policy that acts: `millrace.load`. It reads the run folder; it needs no environment, and torch only for images.
 
-Rule: for the same observations it chooses the same actions as the workers of `millrace evaluate`, bit for bit, if you pass
-    as many observations at once as a worker has env copies (`--copies`). In a batch of another size, the last bits of a
-    matrix product may differ.
+Rule: for the same observations, it chooses the same actions as the workers of `millrace evaluate`, bit for bit. This holds
+    if you pass as many observations at once as a worker has env copies (`--copies`). In a batch of another size, the last
+    bits of a matrix product may differ.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ class LoadedPolicy:
     """A policy loaded from a run folder: `policy(observation)` returns an action for `env.step`. `millrace.load` makes it.
 
     It takes one observation of the environment's space, or n of them stacked along a first axis, and returns one action or n
-    actions. An action is an element of the environment's action space: it has the space's dtype and shape, is within its
-    bounds, and counts from its `start`. For a Dict or Tuple space it is a dict or tuple. Pass observations as the
+    actions. An action is an element of the environment's action space: it has the space's dtype and shape, is within the
+    space's bounds, and counts from its `start`. For a Dict or Tuple space, it is a dict or tuple. Pass observations as the
     environment returns them; the policy normalizes them if it was trained with normalization.
 
-    A policy with a recurrent core remembers what it saw in each env copy: call `reset(n)` before the first observations, and
-    pass `first` to mark the copies that begin a new episode.
+    A policy with a recurrent core remembers what it saw in each env copy. Call `reset(n)` before you pass the first
+    observations, and pass `first` to mark the copies that begin a new episode.
 
     >>> import gymnasium, millrace
     >>> policy = millrace.load(run)

@@ -80,7 +80,7 @@ def evaluate(
         run: A `Run`, or a run folder.
         episodes: Number of episodes; by default 100, or 3 with `video`.
         env: The environment that the run was started with, if it can't be found by its name because it was made in another
-            script or notebook. (You don't need it if you call `evaluate` on the `Run` that `train` returned.)
+            script or notebook. (The `Run` that `train` returned knows its environment, so its `evaluate` doesn't need it.)
         wrappers: The wrappers that the run was started with, if they can't be found by their names either.
         progress: Show the progress.
         **keywords: The flags of `millrace evaluate`: `seed`, the episodes' seed; `best`, to use the policy with the best
@@ -121,7 +121,7 @@ def record(
             ~/.minari/datasets.
         steps: Number of env steps. The last episode is finished, unless that would take more than twice this number.
         env: The environment that the run was started with, if it can't be found by its name because it was made in another
-            script or notebook. (You don't need it if you call `record` on the `Run` that `train` returned.)
+            script or notebook. (The `Run` that `train` returned knows its environment, so its `record` doesn't need it.)
         wrappers: The wrappers that the run was started with, if they can't be found by their names either.
         progress: Show the progress.
         **keywords: The flags of `millrace record`: `stochastic`, to sample actions; `npy`, a file to which each step is also

@@ -106,10 +106,10 @@ class RolloutService:
     so that none of them is lost during a long computation.
 
     `publish` sets the weights: the flat float32 vector [P] of the policy, or an array for each of its pieces. `gather`, or
-    one iteration over the service, waits until one rollout of each lane has arrived, and returns them as a `RolloutBatch` of
-    T = `rollout_steps` rows of `envs` env copies. With `max_lag=0`, a batch was collected with the weights that you
-    published last. With `max_lag=n`, it was collected with the weights that were the newest at the `gather` call n batches
-    earlier.
+    one iteration over the service, waits until a rollout of each lane has arrived, and returns all of them as one
+    `RolloutBatch`. It has T = `rollout_steps` rows for each of the `envs` env copies. With `max_lag=0`, a batch was
+    collected with the weights that you published last. With `max_lag=n`, it was collected with the weights that were the
+    newest at the `gather` call n batches earlier.
 
     `publish`, `gather`, `evaluate` and `save` raise `UsageError` after `close`, and if they are called from another thread.
     `gather` and `evaluate` raise a `RunError` if no further rollout can arrive: `NoWorkers`, `Stalled`, `EnvironmentFailed`
@@ -148,9 +148,9 @@ class RolloutService:
                 "gymnasium.wrappers:FlattenObservation".
             rollout_steps: T, the number of steps of each env copy in a batch.
             restore: a file that `save` wrote, from which to continue. Your arrays in it are then in `restored`.
-            **settings: the settings of `millrace train` for environments, workers, network and timeouts, with the same names
-                and defaults, such as `envs=8`, `lanes=4` and `max_lag=0`. With `bind="tcp://0.0.0.0:5555"` no worker is
-                started here: workers elsewhere join with `millrace worker`.
+            **settings: the settings of `millrace train` for environments, workers, network and timeouts. They have the same
+                names and defaults, such as `envs=8`, `lanes=4` and `max_lag=0`. With `bind="tcp://0.0.0.0:5555"` no worker
+                is started here: workers elsewhere join with `millrace worker`.
 
         Raises `UsageError` if an argument is wrong, `NoWorkers` if too few workers join in time, `EnvironmentFailed` if the
         environment can't be made, and `PolicyFailed` if your `OwnPolicy` can't be made.

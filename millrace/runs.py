@@ -273,8 +273,8 @@ def train(
         wrappers: Applied to every env copy, including evaluation copies, the first one innermost: classes, functions, or
             names such as "gymnasium.wrappers:FlattenObservation".
         config: A TOML file of settings.
-        resume: A `Run` or run folder, to continue from its newest checkpoint; or "auto", to continue the newest run of this
-            environment, algorithm and seed if there is one, and otherwise start a new run. `config` then overrides the
+        resume: A `Run` or run folder, to continue from its newest checkpoint; or "auto", to continue the newest run with
+            this environment, algorithm and seed, or to start a new run if there is none. `config` then overrides the
             settings of the run.
         preset: The name of a preset (`millrace presets` lists them); "auto": the preset of `env`, if there is one; "none":
             no preset.

@@ -182,7 +182,7 @@ class DroppingView(ProgressView):
 class RateLimitedView:
     """Shows the first progress, then at most one every `every_s` seconds, and always the last one.
 
-    A new note is printed at once. A view that prints lines prints them at growing intervals while the run makes no update.
+    A new note is printed at once. A view that prints lines prints them at growing intervals while there is no update.
     """
 
     def __init__(self, view: ProgressView, every_s: float, clock: Callable[[], float]) -> None:

@@ -2,8 +2,8 @@
 
 Each peer has a virtual environment of its own in `benchmarks/peers/envs`, because their pinned versions conflict. They share
 one PyTorch in `envs/torch`. A file `shared_torch.pth` in each environment puts that folder behind the environment's own
-packages, so that torch is found there unless the environment has one of its own. The installation takes about 1 GB for torch
-and 2 GB for the rest.
+packages, so torch is found there unless the environment has its own. The installation takes about 1 GB for torch and 2 GB
+for the rest.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def installed() -> list[str]:
 
 
 def install(name: str) -> None:
-    """Make the peer's environment from scratch. Raises `CalledProcessError`."""
+    """Make the peer's environment from scratch. Raises `CalledProcessError` if an installation step fails."""
     peer = PEERS[name]
     folder = ENVS / name
     share_torch()

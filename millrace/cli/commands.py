@@ -1,8 +1,8 @@
 """All commands of `millrace` and of its extras, in groups, with the function that runs each command.
 
-Rule: a command's module is imported only when the command runs, so that `--help` is fast, and so that a machine with only a
-worker's packages can run the commands that need no other packages. Other packages install commands as entry points of the
-group `millrace.commands`. These are read only for `--help`, or if the user types a name that isn't built in.
+Rule: a command's module is imported only when the command runs. This makes `--help` fast, and a machine with only a worker's
+packages can run the commands that need no other packages. Other packages install commands as entry points of the group
+`millrace.commands`. These are read only for `--help`, or if the user types a name that isn't built in.
 """
 # ruff: noqa: E501
 

@@ -88,7 +88,7 @@ def result(summary: Summary) -> list[str]:
 
 
 def next_commands(run: Path, summary: Summary | None, command: str) -> list[str]:
-    """Shell commands that show the run, play its policy, and, if the run made all its steps, train as long again."""
+    """Shell commands that show the run, play its policy, and, if the run has taken all its steps, train as long again."""
     where = shlex.quote(str(run))
     evaluated = None if summary is None else summary.evaluation
     against = " --against ANOTHER_RUN" if evaluated is not None and evaluated.score_interval is not None else ""

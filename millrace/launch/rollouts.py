@@ -39,7 +39,7 @@ def start(
     """Start a hub and wait until its workers have joined. Returns the hub, the run and the described environment.
 
     Closing `resources` releases everything. `listens`: wait for workers from elsewhere at `config.bind`, instead of starting
-    local ones. `past`: the state of a saved service to continue from. Raises `UserFacingError`.
+    local ones. `past`: the state of a saved service to continue from. Raises `UserFacingError` if no run can begin.
     """
     workers = workers_to_wait_for(config, None if listens else local_workers(config))
     code = env.called_code or ("a policy's factory" if isinstance(policy, OwnPolicy) else "")

@@ -77,7 +77,7 @@ def make_vec(
     Args:
         env: anything that `gymnasium.make` accepts, a callable that returns an environment, or a list with one of these for
             each env copy. If the environment is defined only in your script or notebook (as a callable or a registered id),
-            it is sent to the workers as code: over TCP only to workers that have a key.
+            it is sent to the workers as code. Over TCP, code is sent only to workers that have a key.
         num_envs: number of env copies; by default 1, or the length of the list. If the environment has several agents, as
             PettingZoo's have, each agent of a copy has its own row, and the attribute `num_envs` counts rows; see `step`.
         workers: number of worker processes to start on this machine; by default one for each core that this process may
@@ -156,7 +156,7 @@ def start_vector_env(settings: VectorEnvSettings, crew: Crew) -> ZmqVectorEnv:
 
     def died(event: Failed) -> None:
         for lane in event.lanes if event.worked_s is not None else ():
-            deaths.collected(lane)  # the worker has made steps, and here each step counts as a result
+            deaths.collected(lane)  # the worker has taken steps, and here each step counts as a result
         if line := deaths.count(event, time.monotonic()):
             logging.getLogger("millrace.learner").warning("%s", line)
 

@@ -129,7 +129,7 @@ def _started(bound: Bound, token: Token | None, crew: Crew, name: str) -> Runnin
 def open_worker_pool(where: BindSettings, transport: str, code: str = "") -> Iterator[ActingPool]:
     """A context manager that binds `where.bind` or, if that is empty, an address of this transport for local workers.
 
-    `code`: see `millrace.learner.members.bound.bind`. Raises `UsageError`.
+    `code`: see `millrace.learner.members.bound.bind`. Raises `UsageError` if the address can't be bound.
     """
     with ExitStack() as resources:
         if where.bind:

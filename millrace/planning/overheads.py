@@ -89,7 +89,7 @@ class _Round(NamedTuple):
 
 
 def overheads(config: Config, env: StoodFor) -> Overheads:
-    """Measure the overheads for runs with these settings. This takes a few seconds. Raises `UserFacingError`."""
+    """Measure the overheads for runs with these settings. This takes a few seconds. Raises `UserFacingError` if it fails."""
     one_long = _round(config, env, _Size(1, 1, LONG))
     one_short = _round(config, env, _Size(1, 1, SHORT))
     many_long = _round(config, env, _Size(COPIES, COPIES, LONG))

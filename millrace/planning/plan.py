@@ -72,7 +72,7 @@ def plan(
         seconds: about how long the measurement may take. Allow more time if a step, or the start of a copy, takes seconds.
 
     Returns a `RunPlan`. Raises `UsageError` if an argument is wrong or the environment can't be found, and a `RunError`,
-    such as `EnvironmentFailed`, if the environment made no step.
+    such as `EnvironmentFailed`, if the environment completed no step.
 
     >>> import millrace
     >>> plan = millrace.plan("Pendulum-v1", seconds=6)

@@ -38,7 +38,7 @@ from millrace.protocol.specs import ActionSpec
 from millrace.workers.copies.env_errors import CopyFailed
 from millrace.workers.copies.mask_reader import MaskReader
 
-LEAST_STEPS = 8  # number of steps that each copy makes, even if they take longer than planned
+LEAST_STEPS = 8  # number of steps that each copy takes, even if they last longer than planned
 SCRIPT = 1009  # number of random actions, which all copies take in the same order, in a loop
 SEED = 1
 WARM_UP = 2  # this many steps at the beginning of a copy aren't counted
@@ -84,7 +84,7 @@ class Probed(NamedTuple):
 def probe(env: ProbedEnv, machine: Machine, seconds: float) -> Probed:
     """Step one copy, then several side by side, for about this many seconds in total.
 
-    Raises `UserFacingError` if no step could be made.
+    Raises `UserFacingError` if no step was completed.
     """
     began_s = time.monotonic()
     give_up_at_s = began_s + seconds
@@ -155,7 +155,7 @@ class _SteppedCopies(NamedTuple):
 
     @property
     def is_whole(self) -> bool:
-        """Whether all copies made steps and nothing went wrong."""
+        """Whether all copies took steps and nothing went wrong."""
         stepped = sum(len(each.steps) > WARM_UP for each in self.times)
         return stepped == len(self.traces) and not self.wrong
 
@@ -294,7 +294,7 @@ def _digest(arrays: Sequence[Array]) -> int:
 
 
 def _repeats(traces: Sequence[Sequence[int]]) -> bool | None:
-    """Whether all copies returned the same results in the steps that all made; None if fewer than two were stepped."""
+    """Whether all copies returned the same results in the steps that all took; None if fewer than two were stepped."""
     traces = [trace for trace in traces if trace]
     if len(traces) < 2:
         return None

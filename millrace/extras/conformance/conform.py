@@ -59,7 +59,7 @@ class ClientCommand:
     command: tuple[str, ...]
     """the words of the command, in which `{address}` and `{token}` are replaced"""
     with_keys: bool = False
-    """whether the connection is encrypted, so that the client needs a token"""
+    """whether the connection is encrypted; if so, the client needs a token"""
 
 
 def conform(

@@ -1,4 +1,4 @@
-"""Checks the rollouts of one lane: each continues the one before, and returns and log-probabilities are right. Pure.
+"""Checks that a lane's rollouts continue each other, and that their returns and log-probabilities are right. Pure.
 
 It recomputes everything that a learner can recompute: which rows are valid, the returns and lengths of episodes, and, with
 the numpy policy, the log-probabilities of the actions under the weights that chose them.
@@ -34,7 +34,7 @@ class LaneRows:
         self._length = np.zeros(run.copies, np.int64)
 
     def see(self, rollout: Rollout, weights: Weights) -> None:
-        """Check the next rollout, whose row format was already checked. Raises `Broken`."""
+        """Check the next rollout, whose row format was already checked. Raises `Broken` if it breaks a rule."""
         self._check_begin(rollout)
         self._check_episodes(rollout)
         if can_be_recomputed(self._run):

@@ -153,7 +153,7 @@ class Learner:
     # --------------------------------------------------------------------------------------------------------- hearing
 
     def take(self, event: ClientEvent, wanted: Callable[[ClientEvent], bool]) -> bool:
-        """Update the state for an event. Returns whether it is the event that the check waits for. Raises `Broken`."""
+        """Update the state for an event. Returns whether the check waits for it. Raises `Broken` if it breaks a rule."""
         match event:
             case Ended():
                 self._forget_process()

@@ -34,7 +34,7 @@ class PlayedRows:
         self._weights = weights
 
     def see_rows(self, rows: EpisodeRows) -> None:
-        """Check the next rows of an episode. Raises `Broken`."""
+        """Check the next rows of an episode. Raises `Broken` if they break a rule."""
         order = self._order
         if not (order.send_rows or order.send_frames):
             raise Broken(Rule.ROWS_FIRST, "no rows: the order does not ask for them", brief(rows))
@@ -52,7 +52,7 @@ class PlayedRows:
         before.append(rows)
 
     def see_answer(self, answer: Evaluated) -> None:
-        """Check the Evaluated, which ends the answer. Raises `Broken`."""
+        """Check the Evaluated, which ends the answer. Raises `Broken` if the answer breaks a rule."""
         order = self._order
         k = len(self.rows)
         if not len(answer.episodes) == len(answer.cut) == k:

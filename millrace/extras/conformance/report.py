@@ -1,7 +1,7 @@
 """The report about a client, as lines for people and as plain data for programs. Pure.
 
-Rule: a reader who has never seen the code understands a failure. The report quotes the broken rule in the words of the wire
-document, says where the rule is, what was expected, what the client did, and what to do next.
+Rule: a reader who has never seen the code must understand a failure. The report quotes the broken rule in the words of the
+wire document, says where the rule is, what was expected, what the client did, and what to do next.
 """
 
 from __future__ import annotations

@@ -98,7 +98,7 @@ ClientEvent = Heard | Ended
 
 
 def nothing(event: ClientEvent) -> bool:
-    """A `Wait.wanted` that accepts no event, so that the wait lasts for its whole time."""
+    """A `Wait.wanted` that accepts no event, so the wait lasts for its whole time."""
     return False
 
 

@@ -201,7 +201,7 @@ class WatchedSession:
             )
 
     def see(self, message: ToLearner, now: float) -> None:
-        """Check one message of this session. Raises `Broken`."""
+        """Check one message of this session. Raises `Broken` if it breaks a rule."""
         if self.said_goodbye:
             raise Broken(Rule.AFTER_GOODBYE, "nothing after Goodbye", brief(message))
         match message:
@@ -462,7 +462,7 @@ def check_stepped(message: Stepped, spec: StepSpec) -> None:
 
 
 def resets_too_early(around: Sequence[tuple[bytes, bytes]]) -> bool:
-    """Whether the copy was reset too early, so that every episode's last observation is the first one of the next episode.
+    """Whether the copy was reset too early, which makes every episode's last observation the first one of the next episode.
 
     `around`: pairs of these observations, for episodes that terminated. False if all episodes begin in the same way, because
     then the pairs prove nothing.

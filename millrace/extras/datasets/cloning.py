@@ -3,7 +3,7 @@
     L = −E[log π(a|o)] + vf_coef · E[(V(o) − G)²]     (SAC and TD3: without the critic)
     G = Σ γⁱ r over the rest of the episode, + γᵏ V(its last observation) if it was truncated
 
-Rule: a gradient step depends only on the demonstrations and on the algorithm's saved state, which counts the steps made so
+Rule: a gradient step depends only on the demonstrations and on the algorithm's saved state, which counts the steps taken so
     far. Interrupted cloning therefore continues bit for bit. For the same reason, an epoch's order of rows is sampled from
     the seed and the epoch's number.
 """
@@ -34,7 +34,7 @@ LEARNING_RATE = 1e-3  # updates often use a lower rate, to change little; with t
 
 
 def clone(algorithm: Algorithm, episodes: Iterable[Batch], pulse: Callable[[], None]) -> dict[str, float]:
-    """Clone these episodes for `clone_epochs`. A resumed run doesn't repeat the gradient steps that were already made.
+    """Clone these episodes for `clone_epochs`. A resumed run doesn't repeat the gradient steps that were already taken.
 
     `episodes`: each one is a batch of one column. `pulse`, which may save the state, is called after each gradient step.
     Returns metrics over all steps of the episodes: `clone/loss`, and how close the policy's most probable actions are to the

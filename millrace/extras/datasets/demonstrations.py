@@ -1,6 +1,6 @@
 """Demonstrations as arrays: observations, actions, and discounted returns. Pure.
 
-Rule: each observation is stored once, so that images take no more memory than in the dataset.
+Rule: each observation is stored once, so images take no more memory than in the dataset.
 """
 
 from __future__ import annotations

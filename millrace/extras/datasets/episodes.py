@@ -1,11 +1,11 @@
 """Assembles whole episodes from the rows of rollouts. Pure: arrays in, arrays out.
 
 Rule: every valid row is in exactly one whole episode, or waits for its episode to end (`waiting`), or is counted as left out
-    (`left_out`). A reset row is not part of an episode. An episode that spans several rollouts is assembled only if all of
-    them arrived, in order, and each continues the previous one, so that no episode has a gap. (The first rollout of an
-    incarnation may continue an earlier rollout, of another worker or from before a resume; `fresh` tells in which env copies
-    it doesn't. A client that owns its loop makes steps between two rollouts, so the second rollout doesn't continue the
-    first, and its first row isn't valid.)
+    (`left_out`). A reset row is not part of an episode. No episode has a gap: if it spans several rollouts, it is assembled
+    only if all of them arrived, in order, and each continues the previous one. (An incarnation's first rollout may continue
+    an earlier rollout, which another worker collected or which precedes a resume; `fresh` tells in which env copies it
+    doesn't. A client that owns its loop takes steps between two rollouts, so the second rollout doesn't continue the first,
+    and its first row isn't valid.)
 """
 
 from __future__ import annotations

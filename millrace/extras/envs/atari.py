@@ -1,8 +1,8 @@
 """Atari games with the preprocessing of Mnih et al. (2015): frame skip 4, grayscale, 84 × 84, the last four screens stacked.
 
 Rule: an observation is a stack of screens [4, 84, 84], whichever program steps the game. The single game, the emulator's
-vectorized form and envpool differ only in their random numbers, and in the frames before an episode's first screen: these
-are zeros, except that envpool repeats the first screen.
+vectorized form and envpool differ only in their random numbers, and in the frames before an episode's first screen. These
+are zeros, but in envpool they are copies of the first screen.
 
 The environment's keyword arguments are the fields of `GameSettings` and further arguments for the emulator. Scores with
 different settings can't be compared. Ending episodes at lost lives and clipping rewards are meant for training; turn them
@@ -51,7 +51,7 @@ class GameSettings:
     """
     terminal_on_life_loss: bool = False
     """End an episode at each lost life; the next episode continues the same game. Returns are then those of single lives, so
-    evaluate without this setting. envpool makes no-op actions after each lost life.
+    evaluate without this setting. envpool takes no-op actions after each lost life.
     """
     clip_rewards: bool = False
     """Clip rewards to ±1. Returns are then not scores, so evaluate without this setting."""
@@ -182,7 +182,7 @@ class _VectorFiresAfterLives(VectorWrapper):
 
 
 class _EndsWithLives(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """Ends an episode at each lost life. The next reset then makes one no-op step in the same game, unless the game is over
+    """Ends an episode at each lost life. The next reset then takes one no-op step in the same game, unless the game is over
     or `reset` gets a seed.
     """
 

@@ -1,8 +1,9 @@
 """The env copies of one lane in envpool, with time limits that are applied here.
 
 Rule: autoreset is NextStep, as in envpool. Flags are exact, unlike envpool's: if an episode terminates in the last step that
-its time limit allows, envpool reports it only as truncated. Therefore, envpool gets a limit that is one step longer, which
-it never reaches, because this file truncates an episode at its time limit and resets the copy explicitly in the next step.
+its time limit allows, envpool reports it only as truncated. Therefore, envpool gets a limit that is one step longer. It
+never reaches this limit, because this file truncates an episode at its time limit and resets the copy explicitly in the next
+step.
 """
 
 from __future__ import annotations

@@ -21,7 +21,7 @@ from millrace.learner.run_folder.record_file import RecordFile
 from millrace.learner.run_folder.run_folder import RunFolder
 from millrace.protocol.errors import RunError
 
-EVERY_S = 0.2  # a fast run makes a hundred updates in this time, and writing an event takes as long as a small minibatch
+EVERY_S = 0.2  # a fast run has a hundred updates in this time, and writing an event takes as long as a small minibatch
 
 
 class TensorBoardCallback(RowCallback):

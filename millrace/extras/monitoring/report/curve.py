@@ -92,8 +92,8 @@ def read_run_files(run: Path, rows: list[dict[str, Any]] | None = None) -> RunRe
 def common_grid(curves: Sequence[Curve]) -> tuple[Doubles, Doubles]:
     """Interpolate curves linearly at common env steps.
 
-    Returns the env steps [G], which all curves cover, and the returns [curves, G]. They end where the shortest curve ends,
-    so that no curve is extrapolated.
+    Returns the env steps [G], which all curves cover, and the returns [curves, G]. Both end where the shortest curve ends,
+    so no curve is extrapolated.
     """
     first = max(curve.env_steps[0] for curve in curves)
     last = min(curve.env_steps[-1] for curve in curves)
