@@ -20,7 +20,7 @@ NotNegative = Annotated[float, msgspec.Meta(ge=0)]
 
 @dataclass(frozen=True)
 class Flag:
-    """Properties of a flag, in the annotation of its field."""
+    """Properties of a flag, given in its field's annotation."""
 
     metavar: str = ""
     """placeholder for the values in the help; if empty, it follows from the type"""

@@ -69,7 +69,7 @@ def cut_at_dashes(argv: Sequence[str]) -> tuple[list[str], list[str]]:
 
 
 def typed_flags(argv: Sequence[str]) -> list[Typed]:
-    """The flags that were typed, in order, even unknown ones. The first entry has the words before the first flag."""
+    """The flags that were typed, in order, including unknown ones. The first entry has the words before the first flag."""
     flags = [Typed("", None, [])]
     for word in argv:
         if word in EVERYWHERE:

@@ -43,7 +43,7 @@ class Crew:
     envs: int = 0
     """the env copies in these lanes"""
     evaluating: int = 0
-    """how many of the workers only evaluate: the last ones"""
+    """how many of the workers, counted from the last one, only evaluate"""
     logs: Path | None = None
     """the folder of the workers' logs; None: workers write to this process's stderr"""
     cores: Sequence[int] = ()

@@ -99,7 +99,7 @@ class Measurements(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def ends_every(self) -> float:
-        """Number of steps between two resets of a copy; infinite if it isn't known."""
+        """Number of steps between two resets of a copy; infinite if unknown."""
         return self.episode_steps or float("inf")
 
     @property

@@ -1,7 +1,7 @@
 """The checks of the collector profile: the client chooses actions with the weights, and sends rollouts.
 
-Each check is a function that `profiles.py` lists; see `script.py`. Its docstring says what the learner does to the client.
-In every check, the watch also recomputes what it can of every rollout (`lane_rows.py`).
+Each check is a function listed in `profiles.py`, written as `script.py` explains. Its docstring says what the learner does
+to the client. In every check, the watch also recomputes what it can of every rollout (`lane_rows.py`).
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ from millrace.protocol.wire.plain_values import pack
 from millrace.protocol.wire.weight_dtypes import to_wire_dtype
 
 STEPS = 32  # T, the number of steps of a rollout in most checks
-TIMED_STEPS = 200  # T of the rollouts that measure how fast the client is
+TIMED_STEPS = 200  # T of the rollouts that measure the client's speed
 TIMED_ROLLOUTS = 3
 LONG_S = 1.0  # duration of a long rollout
 LONGEST_STEPS = 50_000  # largest T of a long rollout
@@ -79,7 +79,7 @@ class Collecting:
         self._sequences = Counter[tuple[int, int]]()  # sequence number of the next permit, by lane and incarnation
 
     def random_parameters(self, seed: int) -> Floats:
-        """Random parameters [P] float32, of a policy that prefers some actions."""
+        """Random parameters [P] float32, for a policy that prefers some actions."""
         size = acting_size(self.run.policy)
         return np.random.default_rng(seed).normal(0, 0.3, size).astype(np.float32)
 
@@ -117,7 +117,7 @@ class Collecting:
 
     @property
     def rollout_s(self) -> float:
-        """How long the client needs for a rollout, in a session that `collecting_at_length` began."""
+        """How long the client takes for a rollout, in a session begun by `collecting_at_length`."""
         return self.learner.step_s * self.run.rollout_steps
 
     def begin(self, *permits: Permit) -> Script[None]:
@@ -126,7 +126,7 @@ class Collecting:
         yield Wait(self.rollout_s / 5)
 
     def rollout(self, permit: Permit, rule: Rule | None = None) -> Script[Rollout]:
-        """The rollout for a permit that was dealt. Waits if the rollout hasn't arrived yet.
+        """The rollout for a permit that was dealt. Waits until the rollout arrives.
 
         If it doesn't arrive, raises `Broken` with `rule`, or by default with the rule that was probably broken.
         """
@@ -259,7 +259,7 @@ def collects(learner: Learner) -> Script[None]:
 
 
 def _repeats(one: Rollout, other: Rollout) -> bool:
-    """Whether all observations and actions of two rollouts are the same, bit for bit."""
+    """Whether all observations and actions of two rollouts are identical."""
     return all(a.tobytes() == b.tobytes() for a, b in zip((*one.obs, one.action), (*other.obs, other.action), strict=True))
 
 
@@ -303,7 +303,7 @@ def declines_other_agents(learner: Learner) -> Script[None]:
 
 
 def truncates_at_the_limit(learner: Learner) -> Script[None]:
-    """Collect with weights that act well, so that episodes reach the time limit."""
+    """Collect with the weights of a good policy, so that episodes reach the time limit."""
     longest = yield from time_limit(learner)
     session = yield from collecting(learner, steps=longest + 10)
     reached = False
@@ -400,7 +400,7 @@ def collects_in_order(learner: Learner) -> Script[None]:
 
 
 def lists_what_it_holds(learner: Learner) -> Script[None]:
-    """Let permits wait, because the weights of the first one weren't sent. Heartbeats must list versions and tickets."""
+    """Make permits wait by not sending the first one's weights. Heartbeats must list versions and tickets meanwhile."""
     session = yield from collecting(learner)
     session.order(session.permit(), version=1)
     for version in (2, 3):
@@ -423,7 +423,7 @@ def keeps_listed_weights(learner: Learner) -> Script[None]:
 
 
 def keeps_its_weights(learner: Learner) -> Script[None]:
-    """Send new weights while the client collects a rollout. The watch checks log_prob with the weights of the rollout."""
+    """Send new weights while the client collects a rollout. The watch checks log_prob with the rollout's own weights."""
     session = yield from collecting_at_length(learner)
     permit = session.permit()
     session.deal(permit)
@@ -594,7 +594,7 @@ def continues_a_lane(learner: Learner) -> Script[None]:
 
 
 def releases_a_lane(learner: Learner) -> Script[None]:
-    """Release a lane while one of its tickets waits for weights, as if the lane went to another worker."""
+    """Release a lane while one of its tickets waits for weights, as if the lane were moving to another worker."""
     session = yield from collecting(learner)
     yield from session.collect(session.permit(0))
     lost = session.permit(0)
@@ -645,7 +645,7 @@ def ignores_a_late_reply(learner: Learner) -> Script[None]:
 
 
 def forgets_the_session_before(learner: Learner) -> Script[None]:
-    """Send Rejoin during a rollout. The client must send nothing more of the old session, and forget its weights."""
+    """Send Rejoin during a rollout. The client must send nothing more from the old session, and forget its weights."""
     session = yield from collecting_at_length(learner)
     yield from session.begin(session.permit(0), session.permit(1))
     again = yield from collecting(learner, net=LONG_NET)

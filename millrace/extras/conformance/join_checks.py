@@ -1,7 +1,7 @@
 """The checks that both profiles share: joining, leaving, and describing the environment.
 
-Each check is a function that `profiles.py` lists; see `script.py`. Its docstring says what the learner does to the client.
-The checks follow the order of states and messages in the section "The worker's half" of the wire document.
+Each check is a function listed in `profiles.py`, written as `script.py` explains. Its docstring says what the learner does
+to the client. The checks follow the order of states and messages in the section "The worker's half" of the wire document.
 """
 
 from __future__ import annotations
@@ -209,7 +209,7 @@ def in_any_session(learner: Learner, heartbeat_s: float = 0.0, learner_timeout_s
 
 
 def keeps_the_rhythm(learner: Learner) -> Script[None]:
-    """Count Heartbeats, which must come as often as the session asks for."""
+    """Count Heartbeats, which must come as often as the session requires."""
     yield from in_any_session(learner, heartbeat_s=0.5)
     yield from heartbeats(learner, 1)
     began_s = learner.now
@@ -220,7 +220,7 @@ def keeps_the_rhythm(learner: Learner) -> Script[None]:
 
 
 def joins_again(learner: Learner) -> Script[None]:
-    """Send a Rejoin of another session, then one of this session."""
+    """Send a Rejoin for another session, then one for this session."""
     yield from in_any_session(learner)
     learner.send(Rejoin(learner.session + 1000))
     yield from learner.quiet(Hello, Rule.OTHER_SESSION, "no Hello after a Rejoin of another session", for_s=1.0)

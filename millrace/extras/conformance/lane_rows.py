@@ -141,5 +141,5 @@ def is_return(got: float, total: float) -> bool:
 
 
 def _same(one: list[tuple[float, int]], other: list[tuple[float, int]]) -> bool:
-    """Whether two lists of (return, length) are the same, in this order."""
+    """Whether two lists of (return, length) are equal, with returns within the tolerance."""
     return all(a == b and is_return(y, x) for (x, a), (y, b) in zip(one, other, strict=True))

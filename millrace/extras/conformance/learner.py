@@ -52,7 +52,7 @@ from millrace.protocol.specs import RunSpec, StepSpec, WaitSpec
 from millrace.protocol.wire.codec import Buffer, encode
 
 M = TypeVar("M")
-QUIET_S = 0.7  # default time for which `Learner.quiet` waits
+QUIET_S = 0.7  # how long `Learner.quiet` waits by default
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,7 @@
 """The checks of the environment profile: the learner chooses actions, and the client resets and steps on order.
 
-Each check is a function that `profiles.py` lists; see `script.py`. Its docstring says what the learner does to the client.
+Each check is a function listed in `profiles.py`, written as `script.py` explains. Its docstring says what the learner does
+to the client.
 """
 
 from __future__ import annotations
@@ -500,7 +501,7 @@ def lists_its_tickets(learner: Learner) -> Script[None]:
 
 
 def releases_a_lane(learner: Learner) -> Script[None]:
-    """Release a lane, as if it went to another worker, and give it back later."""
+    """Release a lane, as if it were moving to another worker, and give it back later."""
     steps = yield from stepping(learner, 0, 1)
     learner.send(steps.step(0))  # the client may or may not answer it
     learner.send(Release(learner.session, (LaneIncarnation(0, 0),)))

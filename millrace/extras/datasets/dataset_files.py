@@ -61,7 +61,7 @@ class _Metadata(msgspec.Struct):
 
 
 class DatasetFiles:
-    """A dataset whose metadata was checked against its arrays. Needs h5py, and for JPEG images Pillow."""
+    """A dataset whose metadata was checked against its arrays. Needs h5py, and Pillow for JPEG images."""
 
     def __init__(self, name: str, folder: Path) -> None:
         """`name`: how error messages begin. `folder`: the folder of the two files.

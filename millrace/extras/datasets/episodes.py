@@ -71,8 +71,8 @@ class _LaneState:
     def continued_by(self, rollout: Rollout, fresh: Bools | bool) -> Bools:
         """[N] whether the rollout continues the newest one in each env copy.
 
-        It does if the copy isn't `fresh`, if its first observation is the newest rollout's last one, and if it begins with
-        a reset row exactly when that rollout ended an episode.
+        It does if three conditions hold: the copy isn't `fresh`, its first observation is the newest rollout's last one, and
+        it begins with a reset row exactly when that rollout ended an episode.
         """
         continued: Bools = (rollout.valid[0] != self.ended) & np.logical_not(fresh)
         for last, leaf in zip(self.last_obs, rollout.obs, strict=True):

@@ -16,7 +16,7 @@ from millrace.protocol.errors import UsageError
 
 
 class DashboardFlags(msgspec.Struct, frozen=True, kw_only=True):
-    """Show runs in a browser: curves that grow while they train, workers, who waits for whom, what went wrong."""
+    """Show runs in a browser: curves that grow during training, workers, who waits for whom, what went wrong."""
 
     folders: Annotated[tuple[Path, ...], Flag("RUNS ...", positional=True)] = ()
     """folders of runs, or run folders; if none is given, runs"""

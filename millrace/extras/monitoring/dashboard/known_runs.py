@@ -1,4 +1,4 @@
-"""The runs that the dashboard shows, read from their folders at each request.
+"""The runs that the dashboard shows, reread from their folders when files have changed.
 
 Rule: unchanged files are not read again, and only a bounded number of rows of a long metrics.jsonl is kept. Addresses of
 pages contain a run's key instead of its path.
@@ -68,7 +68,7 @@ class KnownRuns:
         return {key_of(run): run for run in runs}
 
     def line(self, run: Path) -> RunLine:
-        """The line of this run in a list of runs."""
+        """This run's line in a list of runs."""
         now = self._clock()
         changed = _changes(run)
         before, line = self._lines.get(run, (None, None))

@@ -44,7 +44,7 @@ def panels(report: ReportData) -> list[Panel]:
 
 
 def how_it_is_drawn(report: ReportData) -> str:
-    """A text that explains bold and thin lines and bands; empty if no group has a mean."""
+    """Text that explains bold and thin lines and bands; empty if no group has a mean."""
     if not any(group.averaged for group in report.groups):
         return ""
     return "Bold: the mean over seeds, as far as the shortest of them goes. Band: from the worst to the best. Thin: a seed."

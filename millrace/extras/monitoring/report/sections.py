@@ -162,7 +162,7 @@ def videos(report: ReportData, address_of: AddressOf | None = None) -> str:
 
 
 def _shown(path: Path, address: str, before: str, after: str) -> str:
-    """A video or picture as part of the page, or a text that says that it is too large."""
+    """A video or picture as part of the page, or a message that it is too large."""
     if not address:
         return f'<p class="none">{path.stat().st_size / 2**20:.1f} MiB, too large for this page:<br>{escape(str(path))}</p>'
     return f"{before}{escape(address)}{after}"
