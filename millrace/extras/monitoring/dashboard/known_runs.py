@@ -68,7 +68,7 @@ class KnownRuns:
         return {key_of(run): run for run in runs}
 
     def line(self, run: Path) -> RunLine:
-        """This run's line in a list of runs."""
+        """A run's line in a list of runs."""
         now = self._clock()
         changed = _changes(run)
         before, line = self._lines.get(run, (None, None))
