@@ -51,8 +51,7 @@ class WaitingSteps:
         return self._workers < self._lanes and self._looks < MOST_LOOKS and now >= self._look_at_s
 
     def look(self, workers: Sequence[SeenWorker], free_bytes: int | None, began_s: float, ended_s: float) -> str:
-        """Record what the workers do, as seen from `began_s` to `ended_s`. Returns a line for the user, which is usually
-        empty.
+        """Record what the workers do, as seen from `began_s` to `ended_s`. Returns a line for the user, usually empty.
 
         `free_bytes`: the available memory of this machine; None if it isn't known.
         """

@@ -213,11 +213,9 @@ def _session(env: ProbedEnv, workers: int, seconds: float, give_up_at_s: float, 
 
 
 def _step(envs: ZmqVectorEnv, traces: list[list[int]], end_at_s: float, give_up_at_s: float) -> bool:
-    """Step all copies until `end_at_s`; a copy's next step begins as soon as its previous one has ended. Actions that a mask
-    forbids are never
-    taken.
+    """Step all copies until `end_at_s`; a copy's next step begins as soon as its previous one has ended.
 
-    Returns whether the masks are in the infos.
+    Actions that a mask forbids are never taken. Returns whether the masks are in the infos.
     """
     agents = max(1, len(envs.seats))
     space = envs.single_action_space

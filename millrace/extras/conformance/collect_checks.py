@@ -698,8 +698,7 @@ def beats_while_it_collects(learner: Learner) -> Script[None]:
 
 
 def evaluates(learner: Learner) -> Script[None]:
-    """Evaluate two greedy episodes, then again with a low step limit. Repeat the second order, as if its answer had been
-    lost.
+    """Evaluate two greedy episodes, then again with a low step limit. Repeat the second order, as if its answer was lost.
 
     The watch compares the two answers.
     """

@@ -27,8 +27,9 @@ from millrace.protocol.keys.worker_token import read_token
 
 
 def launch(flags: RayFlags, rest: Sequence[str], watch: Watch) -> Path:
-    """Train a policy. Returns the run folder. `rest`: the user's flags for the learner. Raises `UserFacingError` if it
-    fails.
+    """Train a policy. Returns the run folder. Raises `UserFacingError` if that fails.
+
+    `rest`: the user's flags for the learner.
     """
     for name in ("processes", "port"):
         if getattr(flags, name) < 1:

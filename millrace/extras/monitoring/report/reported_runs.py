@@ -155,9 +155,7 @@ class ReportData:
         return list(dict.fromkeys(group.env for group in self.groups))
 
     def short_names(self) -> list[str]:
-        """A unique name for each run, in the order of `runs`. Environment and group are part of it only if there are
-        several.
-        """
+        """A unique name for each run, in the order of `runs`. If there are several environments or groups, it names them."""
         groups_of_env = Counter(group.env for group in self.groups)
         names = []
         for group, run in self.runs:
