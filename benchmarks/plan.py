@@ -32,7 +32,7 @@ ENVS = {
     "uneven, 5 ms": "Uneven",
     "resets of 300 ms": "LongResets",
     "16 KB observations": "LargeObservations",
-    "does not repeat": "DoesNotRepeat",
+    "not deterministic": "NotDeterministic",
     "three agents": "Agents",
 }
 LAGS = (0, 1, 2)

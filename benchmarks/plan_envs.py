@@ -95,7 +95,7 @@ class LargeObservations(_Timed):
     numbers = LARGE
 
 
-class DoesNotRepeat(_Timed):
+class NotDeterministic(_Timed):
     """Observations don't depend on the seed. Actions are discrete, and a step waits for 5 ms."""
 
     def __init__(self) -> None:

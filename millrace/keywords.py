@@ -14,22 +14,22 @@ class RolloutKeywords(TypedDict, total=False):
     """Keywords of `millrace.RolloutService`."""
 
     env_kwargs: Mapping[str, bool | int | float | str]
-    """Keyword arguments for gymnasium.make: NAME VALUE NAME VALUE ... Values are numbers, true, false or text. Texts may
-    use each env copy's number, slot, lane and copy, as in port "{5000 + slot}".
+    """Keyword arguments for gymnasium.make: NAME VALUE NAME VALUE ... Values are numbers, true, false or text. In text,
+    each env copy's number, slot, lane and copy can be used, as in port "{5000 + slot}".
     """
     eval_env_kwargs: Mapping[str, bool | int | float | str]
-    """Keyword arguments for env copies of evaluations, in addition to env_kwargs; they override those of the same name."""
+    """Additional keyword arguments for evaluation copies. They override arguments of the same name in env_kwargs."""
     seat_id: bool
-    """In an environment of several agents, add to each agent's observations which agent it is."""
+    """In a multi-agent environment, add the number of the agent's seat to its observations."""
     critic_keys: Sequence[str]
     """Keys of a Dict observation that only the critic sees: the policy acts without them (ppo, a2c, impala, reinforce).
     For PettingZoo, the key state is the environment's state().
     """
     seed: int
-    """Seed of all random numbers of the run."""
+    """Seed of all the run's random numbers."""
     workers: int | None
     """Number of worker processes on this machine (train only). none: one for each core, but at most one for each lane.
-    Use more if env steps wait for something other than the CPU; a run without this setting says so.
+    Use more if env steps wait for something other than the CPU; a run without this setting tells you when they do.
     """
     envs: int
     """Number of env copies, summed over all workers. Must be a multiple of lanes."""
@@ -39,17 +39,18 @@ class RolloutKeywords(TypedDict, total=False):
     """
     max_lag: int
     """Lag of the rollouts: after the first updates, rollouts are collected with weights that are exactly this many
-    versions older than the learner's. 0: workers and learner take turns. Above 0: both run at the same time, for which
-    impala, dqn, sac and td3 are made. Runs are reproducible with any lag.
+    versions older than the learner's. 0: workers and learner take turns. Above 0: they work at the same time; impala,
+    dqn, sac and td3 are designed for this. Runs are reproducible with any lag.
     """
     vector: str
     """How the env copies of a lane are stepped. loop: one after another. native: by the environment's own vector version.
-    envpool: by envpool (pip install envpool). native and envpool use other random numbers than loop. Packages can add
-    kinds.
+    envpool: by envpool (pip install envpool). native and envpool don't use the same random numbers as loop. Packages
+    can add other kinds.
     """
     acting_dtype: Literal["float32", "bfloat16"]
-    """Precision in which workers act; the learner always computes in float32. bfloat16 halves the size of the weights
-    that are sent. With images it halves the time of acting on CPUs with AMX; on others it is slower.
+    """Precision in which workers compute actions; the learner always computes in float32. bfloat16 halves the size of the
+    weights that are sent. With images, it also halves the time to compute actions on CPUs with AMX; on other CPUs, it
+    is slower than float32.
     """
     info_keys: Sequence[str]
     """Names of numbers that the environment reports in info at the end of an episode, such as is_success distance. Their
@@ -61,24 +62,24 @@ class RolloutKeywords(TypedDict, total=False):
     unless the Dict observation has the key. none: all actions are allowed, and the key is an observation.
     """
     max_env_copies: int
-    """Largest number of env copies of the run on all machines together, for example because of floating licences. It
-    includes the copies for evaluations, which are then played on as few workers as needed. 0: no limit. To limit one
-    machine, set the variable MILLRACE_COPIES_PER_MACHINE.
+    """Largest number of env copies that the run has on all machines together, for example because of floating licences.
+    It includes evaluation copies; evaluations are then played on as few workers as needed. 0: no limit. To limit the
+    env copies on one machine, set the environment variable MILLRACE_COPIES_PER_MACHINE.
     """
     min_workers: int
     """Start training when this many workers have joined. 0: wait for all local workers (train) or one worker (learner)."""
     launched_workers: int
     """Number of workers that a launcher starts for this learner (learner only; `millrace launch` sets it). If this many
-    different workers say that the environment cannot be made, the run ends with their reason. 0: wait for another
-    worker.
+    different workers report that they can't create the environment, the run ends and prints their reason. 0: wait for
+    another worker.
     """
     transport: Literal["inproc", "ipc", "tcp"]
-    """How local workers are connected (train only). inproc: as threads of this process, which then runs the environment.
-    ipc: local sockets. tcp: TCP on 127.0.0.1.
+    """How local workers are connected (train only). inproc: as threads of this process, which then also runs the
+    environment. ipc: by local sockets. tcp: by TCP on 127.0.0.1.
     """
     bind: str
-    """Address at which the learner listens for workers (learner only). With tcp://0.0.0.0:5555 other machines can join;
-    this needs keys.
+    """Address at which the learner listens for workers (learner only). With tcp://0.0.0.0:5555, workers on other machines
+    can join; this needs keys.
     """
     advertise: str
     """Host name or IP address of this machine for workers on other machines (learner only). Default: the name of this
@@ -94,13 +95,14 @@ class RolloutKeywords(TypedDict, total=False):
     """
     metrics_bind: str
     """HOST:PORT at which Prometheus can read the metrics, such as 127.0.0.1:9464 (pip install prometheus-client). With
-    0.0.0.0:9464 anyone in the network can read them. Default: no metrics are served.
+    0.0.0.0:9464, anyone on the network can read them. Default: no metrics are served.
     """
     dashboard: bool
-    """Show the run in a browser while it trains: its page is served on this machine, and the address is printed."""
+    """Show the run in a browser while it trains. This machine serves the page, and the learner prints its address."""
     worker_timeout_s: float
     """A worker that has been silent for this many seconds counts as lost, and other workers take over its lanes. A worker
-    is not silent while its supervisor says that its environment, or your policy, is busy, however long that takes.
+    doesn't count as silent while its supervisor reports that the environment, or your policy, is busy, however long
+    that takes.
     """
     lost_lanes: Literal["continue", "restart"]
     """What happens to running episodes when their worker is lost, when lanes move to another worker, and when the run is
@@ -109,34 +111,34 @@ class RolloutKeywords(TypedDict, total=False):
     were lost. restart: new episodes begin.
     """
     replay_limit: int
-    """Longest episode, in steps, that is replayed so that it can continue. In place of a longer one, a new episode
-    begins. Replaying an episode takes as long as its steps took, without the policy.
+    """Longest episode, in steps, that is replayed so that it can continue. A longer one is replaced by a new episode.
+    Replaying an episode takes as long as its steps took, without the time to compute actions.
     """
     restart_episodes: int
-    """Number of episodes after which each env copy is closed and created again, including in evaluations, for simulators
-    that grow or slow down the longer they run. The new copy continues with the seed and the random numbers of the old
-    one, and with its saved state if it has save_state, so results don't change if the environment is deterministic
-    given its seed. 0: never.
+    """Number of episodes after which each env copy, including evaluation copies, is closed and created again. Use it for
+    simulators that need more memory or slow down the longer they run. The new copy continues with the seed and the
+    random numbers of the old one, and with its saved state if the environment has save_state. If the environment is
+    deterministic given its seed, results don't change. 0: never.
     """
     no_workers_timeout_s: float
-    """Write a checkpoint and end the run if there has been no worker for this many seconds. A run whose workers are all
-    local ends at once when none is left.
+    """Write a checkpoint and end the run if there has been no worker for this many seconds. If all workers are local, the
+    run ends as soon as none is left.
     """
     start_timeout_s: float
-    """A worker process, wherever it was started, is restarted if making or resetting one env copy, or making the policy
-    with all that it imports, takes longer than this many seconds. 0: never.
+    """A worker process, on any machine, is restarted if it takes longer than this many seconds to create or reset one env
+    copy, or to create the policy with everything that it imports. 0: never.
     """
     step_timeout_s: float
-    """A worker process, wherever it was started, is restarted if one step of an env copy, or one call of a policy that
-    you wrote (an `OwnPolicy`, an opponent, an encoder), takes longer than this many seconds. 0: never.
+    """A worker process, on any machine, is restarted if one step of an env copy, or one call to a policy that you wrote
+    (an `OwnPolicy`, an opponent, an encoder), takes longer than this many seconds. 0: never.
     """
     max_env_failures: int
-    """How many failures the run survives. Either of two counts ends it. In a row: more than this, or more than 10, in one
-    lane without a rollout in between (a failure after env steps counts as a quarter). Within an hour: more failures
-    after env steps than this × (1 + env copies × h + w / 30), where h is the hours since the learner began, at most 1,
-    and w the seconds that the failed workers had worked before. A failure is an exception or an unusable result of the
-    environment or of an `OwnPolicy`, or a worker process that ends unexpectedly, because the environment may have
-    ended it.
+    """How many failures the run survives. A failure is an exception or an unusable result from the environment or an
+    `OwnPolicy`. The unexpected end of a worker process counts too, because the environment may have caused it. Either
+    of two counts ends the run. In a row: one lane has more failures than this, or more than 10, without a rollout in
+    between; a failure after env steps counts as a quarter. Within an hour: there are more failures after env steps
+    than this × (1 + env copies × h + w / 30). Here h is the number of hours since the learner began, at most 1, and w
+    is the number of seconds that the failed workers had worked before.
     """
 
 
@@ -148,50 +150,51 @@ class TrainKeywords(RolloutKeywords, total=False):
     settings.
     """
     steps: int | float
-    """Env steps to train for, summed over all env copies. Training ends before an update that would exceed them."""
+    """Env steps to train for, summed over all env copies. Training ends before an update that would exceed this number."""
     start_from: str | PathLike[str]
-    """Start from the policy of this run folder in place of random weights, with its statistics of observations and
-    rewards. A folder with only policy.json and policy.safetensors will do. All other settings are those of the new
-    run, and schedules start from the beginning. A resumed run doesn't read the folder again: see
-    docs/how-to/resume.md.
+    """Start with the policy from this run folder, and its observation and reward statistics, instead of random weights.
+    The folder needs only policy.json and policy.safetensors. All other settings are those of the new run, and
+    schedules start from the beginning. A resumed run doesn't read the folder again: see docs/how-to/resume.md.
     """
     from_parts: Literal["auto", "policy", "best", "critic", "all"]
-    """What `--from` takes over. policy: the newest policy and the statistics. best: the policy of the best evaluation.
-    critic: also the critic, the target networks and the temperature. all: also the optimizers. A replay buffer is
-    never taken over. auto: critic with sac, td3, tqc, crossq and xqc if the run has a checkpoint, because their actors
-    immediately follow the critic; otherwise policy.
+    """What `--from` loads. policy: the newest policy and the statistics. best: the policy with the best evaluation.
+    critic: also the critic, the target networks and the temperature. all: also the optimizers. The replay buffer is
+    never loaded. auto: critic for sac, td3, tqc, crossq and xqc if that run has a checkpoint, because their actors
+    follow the critic from the first update on; otherwise policy.
     """
     device: Literal["auto", "cpu", "cuda"]
     """Device of the learner. auto: cuda if PyTorch finds a GPU, else cpu."""
     run_dir: str | PathLike[str]
-    """Folder in which the run folder is made."""
+    """Folder in which the run folder is created."""
     eval_episodes: int | None
-    """Number of greedy episodes in an evaluation. none: 100. Without eval_every, the evaluation at the end has fewer, but
-    at least 10, if 100 episodes could take more than three quarters of the env steps of training.
+    """Number of greedy episodes in an evaluation. none: 100. If eval_every is 0 and 100 episodes could take more than
+    three quarters as many env steps as training, the final evaluation has fewer, but at least 10.
     """
     eval_every: int | float
     """Env steps between evaluations during training. 0: evaluate only at the end."""
     eval_workers: int
     """Number of workers that only evaluate, so that training continues during evaluations. `millrace train` starts them
-    in addition to workers; `millrace learner` doesn't wait for any, and uses those that `millrace worker --evaluate`
-    starts. The result counts at the next evaluation, or at the end, when the learner waits for it. If no such worker
-    is left by then, the other workers play the episodes. 0: all workers evaluate, and training waits.
+    in addition to the other workers; `millrace learner` waits for none and uses those that `millrace worker
+    --evaluate` starts. The result of an evaluation is used when the next one is due, or at the end of training; the
+    learner waits for it then. If no evaluation worker is left by then, the other workers play the episodes. 0: all
+    workers evaluate, and training waits.
     """
     eval_copies: int
-    """Number of evaluation episodes that a worker plays at the same time, each on its own env copy. The last bits of
-    results may depend on this number. Results do not depend on the number of workers.
+    """Number of evaluation episodes that a worker plays at the same time, each on its own env copy. This number may
+    change the last bits of results. The number of workers doesn't change them.
     """
     eval_max_steps: int | float
-    """Largest number of env steps of one evaluation. Each episode gets an equal share: with 100 episodes, an episode that
-    reaches 10000 steps is cut. Its return up to that step counts, and the result says how many episodes were cut.
+    """Largest number of env steps in one evaluation. Each episode gets an equal share. With the default and 100 episodes,
+    an episode is cut after 10,000 steps. Its return up to that step counts, and the result says how many episodes were
+    cut.
     """
     target_return: float | None
     """Stop as soon as the mean return of an evaluation is at least this. Needs eval_every."""
     target_mean_return: float | None
     """Stop as soon as the mean return of the last 100 training episodes is at least this."""
     self_play: int
-    """Self-play in an environment of several agents: the policy plays one team, and opponents play the others. They are
-    drawn from this many of the policy's newest snapshots. 0: the policy plays all agents, or meets only your own
+    """Self-play in a multi-agent environment: the policy plays one team, and opponents play the others. The opponents are
+    drawn from this many of the policy's newest snapshots. 0: the policy plays all agents, or only against your own
     opponents.
     """
     self_play_save_steps: int
@@ -199,28 +202,28 @@ class TrainKeywords(RolloutKeywords, total=False):
     self_play_latest: float
     """Share of the rollouts in which the policy plays against its newest version instead of a snapshot."""
     opponents: Sequence[str]
-    """Your own opponents. They are drawn like the snapshots, and evaluations are played against them. Without self_play
-    the policy meets only them. docs/how-to/self_play.md shows what the factory returns.
+    """Your own opponents. They are drawn like the snapshots, and evaluations are played against them. Without self_play,
+    the policy plays only against them. docs/how-to/self_play.md shows what the factory returns.
     """
     teams: Sequence[str]
-    """The teams, all of the same size. Give a pattern of its agents' names for each, as in "red_*" "blue_*". Default:
-    each agent is a team. In different env copies, the policy plays different teams.
+    """One pattern for each team, which matches the names of its agents, as in "red_*" "blue_*". All teams must have the
+    same size. Default: each agent is a team of its own. The policy plays different teams in different env copies.
     """
     inference: Literal["workers", "learner"]
-    """Where the policy acts. workers: in each worker. learner: in a thread of the learner's process, for half of the env
-    copies while the other half steps; workers then only step the environments.
+    """Where the policy computes actions. workers: in each worker. learner: in a thread of the learner's process, for half
+    of the env copies while the other half steps; workers then only step the environments.
     """
     torch_threads: int | None
     """Number of PyTorch threads in the learner. none: chosen when the run starts, and kept in its config.toml. The choice
-    is 1; with images, an encoder or a layer of 512 x 512 weights it is one for each 34 million multiply-adds of a
-    minibatch's forward pass, at most one for each core. If max_lag is above 0, each local worker then keeps one core,
-    unless this would leave half of the cores or less to the learner. With shards it is 1. Another number changes the
-    last bits of results.
+    is 1. With images, an encoder or a layer of at least 512 x 512 weights, it is instead one for every 34 million
+    multiply-adds in a minibatch's forward pass, but at most one for each core. If max_lag is above 0, one core is left
+    to each local worker, unless the learner would then get half of the cores or fewer. With shards, the choice is
+    always 1. Another number changes the last bits of results.
     """
     shards: int
-    """Number of parts of a batch whose gradients are computed separately, for several learner processes (ppo, a2c,
-    impala, reinforce). torchrun starts the processes; their number must divide the number of shards, and doesn't
-    change the results. Must divide lanes. See docs/how-to/shards.md.
+    """Number of parts of a batch whose gradients are computed separately, so that several learner processes can share the
+    work (ppo, a2c, impala, reinforce). It must divide lanes. torchrun starts the processes. Their number must divide
+    the number of shards, and doesn't change the results. See docs/how-to/shards.md.
     """
     shard_timeout_s: float
     """Seconds that a learner process waits for the others in an update, or for rank 0 between updates, such as during a
@@ -231,37 +234,38 @@ class TrainKeywords(RolloutKeywords, total=False):
     who can reach their ports can then read, disturb and stop the run.
     """
     grace_s: float
-    """Seconds from SIGTERM, SIGHUP or Ctrl-C to the end of the process. The current update gets at most half of them;
-    then it is undone, and the state before it is saved. 0: wait for the update, however long it takes.
+    """Seconds from SIGTERM, SIGHUP or Ctrl-C to the end of the process. The current update gets at most half of this
+    time; if it takes longer, it is undone, and the state before it is saved. 0: wait for the update, however long it
+    takes.
     """
     checkpoint_every_s: float
-    """Seconds between checkpoints. There is also one after the first update and one before each evaluation. 0: after each
-    update.
+    """Seconds between checkpoints. A checkpoint is also written after the first update and before each evaluation. 0:
+    after each update.
     """
     keep_checkpoints: int
     """Number of newest checkpoints to keep."""
     tensorboard: bool
-    """Also write the metrics as TensorBoard events, to the folder tensorboard of the run folder (pip install
+    """Also write the metrics as TensorBoard events, to the folder tensorboard in the run folder (pip install
     tensorboard).
     """
     record: str
-    """Write all whole training episodes to the Minari dataset with this id, such as cartpole/ppo-v0 (pip install
+    """Write all complete training episodes to the Minari dataset with this id, such as cartpole/ppo-v0 (pip install
     'minari[hdf5]' pillow). A resumed run writes another dataset, with the next free version.
     """
     prior: str
-    """Id of a Minari dataset to learn from in addition, such as cartpole/ppo-v0 (pip install 'minari[hdf5]' pillow). With
+    """Id of a Minari dataset to learn from as well, such as cartpole/ppo-v0 (pip install 'minari[hdf5]' pillow). With
     clone_epochs, the run begins with a policy that imitates the dataset. Algorithms with a replay buffer draw a share
-    of each minibatch from the dataset, which prior_share sets.
+    of each minibatch, set by prior_share, from the dataset.
     """
     rollout_steps: int
     """ppo, a2c, dqn, rainbow, impala, sac, td3, tqc, crossq, xqc: T, the number of steps of each env copy in a rollout.
-    reinforce: T, the steps of each env copy in a rollout. Must be longer than any episode.
+    reinforce: T, the number of steps of each env copy in a rollout. Must be larger than the length of any episode.
     """
     net: Sequence[int]
-    """ppo, a2c, dqn, impala, reinforce: Sizes of the hidden layers of the actor, and likewise of the critic, or of the
+    """ppo, a2c, dqn, impala, reinforce: Sizes of the hidden layers of the actor, and likewise of the critic; or of the
     Q-network.
     rainbow: Sizes of the hidden layers of the Q-network.
-    sac, td3, tqc: Sizes of the hidden layers: of the actor and of each critic.
+    sac, td3, tqc: Sizes of the hidden layers of the actor and of each critic.
     crossq, xqc: Sizes of the hidden layers of the actor.
     """
     activation: Literal["tanh", "relu"]
@@ -272,7 +276,7 @@ class TrainKeywords(RolloutKeywords, total=False):
     """
     normalize_observations: bool
     """ppo: Normalize observations, except images: subtract the running mean, divide by the running standard deviation,
-    clip to ±10. docs/how-to/algorithms.md shows why PPO does by default.
+    clip to ±10. docs/how-to/algorithms.md shows why PPO does this by default.
     a2c, dqn, rainbow, impala, reinforce, sac, td3, tqc, crossq, xqc: Normalize observations, except images: subtract
     the running mean, divide by the running standard deviation, clip to ±10.
     """
@@ -292,11 +296,11 @@ class TrainKeywords(RolloutKeywords, total=False):
     """
     ent_coef: float | None
     """ppo, a2c, impala, reinforce: Weight of the entropy bonus in the loss.
-    sac, tqc, crossq, xqc: Temperature α: the weight of the entropy. none: learned, so that the entropy stays near
+    sac, tqc, crossq, xqc: Temperature α: the weight of the entropy. none: α is learned so that the entropy stays near
     target_entropy.
     """
     vf_coef: float
-    """ppo, a2c, impala, reinforce: Weight of the value loss in the loss."""
+    """ppo, a2c, impala, reinforce: Weight of the value loss in the total loss."""
     max_grad_norm: float | None
     """ppo, a2c, impala, reinforce: Clip the norm of the gradient to this.
     dqn, rainbow: Clip the norm of the gradient to this. none: no clipping.
@@ -305,26 +309,26 @@ class TrainKeywords(RolloutKeywords, total=False):
     """ppo, a2c, impala, reinforce: Initial logarithm of the standard deviation of continuous (Box) actions."""
     normalize_rewards: bool
     """ppo, a2c, impala: Divide rewards by the running standard deviation of the discounted return, and clip them to ±10.
-    dqn, rainbow, sac, td3, tqc, crossq: Divide rewards by the running standard deviation of the discounted return,
-    when they are drawn from the buffer, and clip them to ±10; with n_step, this clips the sum of n rewards.
-    reinforce: Divide rewards by the running standard deviation of the discounted return, and clip them to ±10.
-    Otherwise the loss of the baseline dominates the gradient.
-    xqc: Divide rewards by the running standard deviation of the discounted return, or by more, so that neither a
-    discounted return so far nor the value of going on after a truncated episode exceeds return_bound.
+    dqn, rainbow, sac, td3, tqc, crossq: When rewards are drawn from the buffer, divide them by the running standard
+    deviation of the discounted return, and clip them to ±10. With n_step, the sum of n rewards is clipped.
+    reinforce: Divide rewards by the running standard deviation of the discounted return, and clip them to ±10. Without
+    this, the baseline's loss dominates the gradient.
+    xqc: Divide rewards by the running standard deviation of the discounted return, or by more if necessary, so that
+    neither the discounted return so far nor the value of continuing after a truncated episode exceeds return_bound.
     """
     clone_epochs: int
-    """ppo, a2c, impala, reinforce: Number of epochs of cloning on the dataset of --prior, before the first rollouts are
+    """ppo, a2c, impala, reinforce: Number of epochs of cloning on the --prior dataset, before the first rollouts are
     collected: the actor learns the dataset's actions, the critic its returns. Needs --prior.
-    sac, td3, tqc, crossq, xqc: Number of epochs of cloning on the dataset of --prior, before prior_steps and the first
+    sac, td3, tqc, crossq, xqc: Number of epochs of cloning on the --prior dataset, before prior_steps and the first
     rollouts: the actor learns the dataset's actions. Needs --prior.
     """
     core: Literal["lstm", "gru"] | None
     """ppo, a2c, impala: Recurrent layer in front of the hidden layers. Minibatches then consist of whole sequences: all T
     steps of some env copies.
-    dqn, sac, td3, tqc, crossq, xqc: Recurrent layer in front of the hidden layers. A gradient step then takes whole
-    sequences: the rollout_steps steps of an env copy, preceded by its previous rollout as burn-in. Actor and critics
-    share the layer, and the critics' loss trains it.
-    rainbow: Must be none: Rainbow can't train a recurrent policy, dqn can.
+    dqn, sac, td3, tqc, crossq, xqc: Recurrent layer in front of the hidden layers. A gradient step then uses whole
+    sequences: the rollout_steps steps of an env copy, preceded by the copy's previous rollout as burn-in. Actor and
+    critics share the layer, and the critics' loss trains it.
+    rainbow: Must be none, because rainbow can't train a recurrent policy. dqn can.
     """
     core_size: int
     """ppo, a2c, dqn, rainbow, impala, sac, td3, tqc, crossq, xqc: Number of units of the recurrent layer."""
@@ -348,7 +352,7 @@ class TrainKeywords(RolloutKeywords, total=False):
     clip_range_schedule: Literal["constant", "linear"]
     """ppo: linear: clip_range falls to zero over the run."""
     clip_range_vf: float | None
-    """ppo: Clip the change of a value in an update to this, in units of (normalized) reward. none: no clipping."""
+    """ppo: Clip each value's change in an update to this, in units of (normalized) reward. none: no clipping."""
     target_kl: float | None
     """ppo: End an update when the KL divergence from the old policy exceeds 1.5 times this. none: never."""
     learning_starts: int | float
@@ -357,58 +361,58 @@ class TrainKeywords(RolloutKeywords, total=False):
     uniformly.
     """
     replay_size: int | float
-    """dqn, rainbow, sac, td3, tqc, crossq, xqc: Capacity of the replay buffer in transitions; the newest are kept. The
-    final observation of a truncated episode takes the place of a transition.
+    """dqn, rainbow, sac, td3, tqc, crossq, xqc: Capacity of the replay buffer, in transitions; the newest are kept. The
+    final observation of a truncated episode takes up the space of one transition.
     """
     priority_alpha: float
-    """dqn, sac, td3, tqc, crossq, xqc: α of prioritized replay: how much the probability that a transition is drawn
+    """dqn, sac, td3, tqc, crossq, xqc: α of prioritized replay: how strongly the probability of drawing a transition
     depends on its last TD error. 0: not at all. 1: in proportion. Schaul et al. 2016 use 0.6.
-    rainbow: α of prioritized replay: how much the probability that a transition is drawn depends on its last TD error.
-    0: not at all. 1: in proportion.
+    rainbow: α of prioritized replay: how strongly the probability of drawing a transition depends on its last TD
+    error. 0: not at all. 1: in proportion.
     """
     priority_beta: float
-    """dqn, rainbow, sac, td3, tqc, crossq, xqc: Initial β of prioritized replay: how much importance weights correct the
-    bias. It grows to 1 (fully) over the run.
+    """dqn, rainbow, sac, td3, tqc, crossq, xqc: Initial β of prioritized replay: how much of the bias importance weights
+    correct. It grows to 1 (all) over the run.
     """
     prior_share: float
     """dqn, rainbow, sac, td3, tqc, crossq, xqc: Share of each minibatch that is prior data, in a run with --prior (Ball
     et al. 2023 use 0.5).
     """
     prior_steps: int | float
-    """dqn, rainbow, sac, td3, tqc, crossq, xqc: Number of gradient steps on prior data alone, before the first rollouts
+    """dqn, rainbow, sac, td3, tqc, crossq, xqc: Number of gradient steps on only prior data, before the first rollouts
     are collected. Needs --prior.
     """
     hindsight: float
-    """dqn, rainbow, sac, td3, tqc, crossq, xqc: Hindsight experience replay: the share of the transitions of a minibatch
-    whose goal is replaced by a goal that was achieved later in the episode. 0: off. Andrychowicz et al. 2017 use 0.8.
-    Needs observations with achieved_goal and desired_goal, and goal_reward.
+    """dqn, rainbow, sac, td3, tqc, crossq, xqc: Hindsight experience replay: the share of a minibatch's transitions whose
+    goal is replaced by a goal that was achieved later in the episode. 0: off. Andrychowicz et al. 2017 use 0.8. Needs
+    goal_reward, and observations with achieved_goal and desired_goal.
     """
     goal_reward: str | None
     """dqn, rainbow, sac, td3, tqc, crossq, xqc: How the environment computes rewards from achieved and desired goals, for
     hindsight. sparse:0.05: 0 within this distance of the goal, else -1. success:0.45: 1 within this distance, else 0.
-    dense: minus the distance. Or your own function of two arrays [B, G] that returns an array [B], such as
-    my_module:reward.
+    dense: minus the distance. Or your own function, such as my_module:reward, which takes two arrays [B, G] and
+    returns an array [B].
     """
     goal_ends: float | None
     """dqn, rainbow, sac, td3, tqc, crossq, xqc: The distance from the goal at which an episode terminates, for hindsight.
-    none: it doesn't terminate at its goal.
+    none: reaching the goal doesn't end it.
     """
     n_step: int
     """dqn, rainbow, sac, td3, tqc, crossq, xqc: Number of rewards in a target before it bootstraps. With several agents,
     each agent's own steps count.
     """
     tau: float
-    """dqn: Fraction by which an update moves the target network. 1: it becomes a copy of the network. With a small
-    fraction, such as 0.005, take target_every 1 (polyak averaging).
-    rainbow: Fraction by which an update moves the target network.
-    sac, td3, tqc, crossq, xqc: τ of the polyak update: the fraction by which the target network moves in each gradient
-    step.
+    """dqn: Fraction by which each update of the target network moves it toward the network. 1: it becomes a copy. With a
+    small fraction, such as 0.005, set target_every to 1 (polyak averaging).
+    rainbow: Fraction by which each update of the target network moves it toward the network.
+    sac, td3, tqc, crossq, xqc: τ of the polyak update: the fraction by which each gradient step moves the target
+    network toward the network.
     """
     amsgrad: bool
     """dqn, rainbow: Use the AMSGrad variant of the optimizer."""
     gradient_steps: int
     """dqn, rainbow: Number of gradient steps in an update. There is one update for every envs x rollout_steps env steps,
-    so this sets the replay ratio.
+    so this setting determines the replay ratio.
     """
     double: bool
     """dqn, rainbow: Double Q-learning: the network chooses the next action, and the target network evaluates it."""
@@ -425,76 +429,76 @@ class TrainKeywords(RolloutKeywords, total=False):
     epsilon_schedule: Literal["linear", "exponential"]
     """dqn, rainbow: How ε falls from its initial to its final value."""
     epsilon_steps: int | float
-    """dqn, rainbow: Number of env steps, summed over all env copies, over which ε falls. With exponential, the number
-    after which the distance of ε from its final value is 1/e of what it was.
+    """dqn, rainbow: Number of env steps, summed over all env copies, over which ε falls. With exponential, the number of
+    env steps after which the difference between ε and its final value has fallen to 1/e of what it was.
     """
     max_grad_value: float | None
-    """dqn, rainbow: Clip each entry of the gradient to ± this, before its norm is clipped. none: no clipping."""
+    """dqn, rainbow: Clip each entry of the gradient to ± this value, before the gradient's norm is clipped. none: no
+    clipping.
+    """
     loss: Literal["huber", "squared"]
-    """dqn: Loss of the TD error. huber: squared up to 1 and linear beyond."""
+    """dqn: Loss function of the TD error. huber: squared up to 1 and linear beyond."""
     quantiles: int
     """rainbow: Number of quantiles of the return that are learned for each action.
     tqc: Number of quantiles that each critic learns.
     """
     batch_norm: bool
-    """rainbow: Use batch normalization for the inputs and before each activation of the hidden layers (Bhatt et al.
-    2024).
-    """
+    """rainbow: Use batch normalization on the inputs and before each activation of the hidden layers (Bhatt et al. 2024)."""
     minibatches: int
     """impala: Number of minibatches (gradient steps) in an epoch."""
     vtrace_lambda: float
     """impala: λ of V-trace. 1: as in the paper. 0: one step."""
     rho_bar: float
-    """impala: ρ̄ of V-trace: importance weights of TD errors are clipped to this. The larger it is, the closer the
-    learned values are to those of the newest policy (without clipping, they are exactly those).
+    """impala: ρ̄ of V-trace: importance weights of TD errors are clipped to this. The larger ρ̄ is, the closer the
+    learned values are to the newest policy's values; without clipping, they are the same.
     """
     c_bar: float
     """impala: c̄ of V-trace: importance weights of traces are clipped to this. It determines how far back the effect of a
     TD error reaches.
     """
     baseline: bool
-    """reinforce: Subtract the value that the critic predicts from the return."""
+    """reinforce: Subtract the critic's value estimate from the return."""
     normalize_returns: bool
     """reinforce: Normalize the returns of each batch (minus the baseline) to mean 0 and standard deviation 1."""
     updates_per_step: float
-    """sac, td3, tqc, crossq, xqc: Replay ratio: gradient steps for each env step after learning_starts. It is exact,
-    whatever the size of the rollouts.
+    """sac, td3, tqc, crossq, xqc: Replay ratio: gradient steps per env step after learning_starts. It is exact for any
+    size of rollouts.
     """
     random_shift: int
-    """sac, td3, tqc, crossq, xqc: Largest random shift, in pixels, by which images are moved each time they are in a
-    minibatch (DrQ-v2). It has no effect on observations without images.
+    """sac, td3, tqc, crossq, xqc: Largest random shift, in pixels, of an image each time it is in a minibatch (DrQ-v2).
+    It has no effect on observations without images.
     """
     target_entropy: float | None
-    """sac, tqc, crossq, xqc: The entropy at which a learned temperature aims. none: minus the dimension of the action."""
+    """sac, tqc, crossq, xqc: The entropy that a learned temperature aims for. none: minus the dimension of the action."""
     exploration_noise: float
     """td3: Standard deviation of the noise that workers add to actions, which are in [-1, 1]."""
     policy_delay: int
-    """td3: Number of gradient steps of the critics for each step of the actor and of the target networks.
-    crossq, xqc: Number of gradient steps of the critics for each step of the actor and of the temperature.
+    """td3: Number of the critics' gradient steps for each step of the actor and the target networks.
+    crossq, xqc: Number of the critics' gradient steps for each step of the actor and the temperature.
     """
     target_noise: float
-    """td3: Standard deviation of the noise that is added to the actions of targets."""
+    """td3: Standard deviation of the noise that is added to the target actor's actions."""
     target_noise_clip: float
-    """td3: Clip the noise of targets to ± this."""
+    """td3: Clip target_noise to ± this value."""
     critics: int
     """tqc: Number of critics."""
     dropped_quantiles: int
-    """tqc: How many of the highest quantiles targets leave out for each critic, so that values are not overestimated."""
+    """tqc: Number of each critic's highest quantiles that are left out of targets, so that values are not overestimated."""
     critic_net: Sequence[int]
     """crossq, xqc: Sizes of the hidden layers of each critic."""
     renormalize_after: int
     """crossq: Number of gradient steps after which batch normalization becomes batch renormalization."""
     atoms: int
-    """xqc: Number of returns whose probabilities a critic learns, equally spaced from -return_bound to return_bound."""
+    """xqc: Number of returns, equally spaced from -return_bound to return_bound, whose probabilities a critic learns."""
     return_bound: float
-    """xqc: Largest return, in units of scaled reward, that a critic can learn."""
+    """xqc: Largest absolute return, in units of scaled reward, that a critic can learn."""
 
 
 class PlayKeywords(TypedDict, total=False):
     """Keywords of `millrace.evaluate` and `millrace.record`."""
 
     best: bool
-    """use the policy with the best evaluation during the run (--eval-every), instead of the newest"""
+    """use the policy with the best evaluation during the run (--eval-every) instead of the newest policy"""
     workers: int
     """number of worker processes that play the episodes; the result does not depend on it"""
     transport: Literal["inproc", "ipc", "tcp"]
@@ -502,9 +506,9 @@ class PlayKeywords(TypedDict, total=False):
     bind: str
     """address at which workers from elsewhere can join, such as tcp://0.0.0.0:5555; no workers are then started here"""
     inference: Literal["workers", "learner"]
-    """where the policy acts: in each worker, or in this process; workers that only step the environment need learner"""
+    """where the policy acts: in each worker, or in this process; workers that only step the environment require learner"""
     max_env_failures: int
-    """give up after more failures than this: an exception of the environment, or a worker process that was killed"""
+    """give up after more failures than this; an exception in the environment or a killed worker process is a failure"""
 
 
 class EvaluateKeywords(PlayKeywords, total=False):
@@ -517,9 +521,9 @@ class EvaluateKeywords(PlayKeywords, total=False):
     copies: int
     """number of episodes that a worker plays at the same time"""
     max_steps: int
-    """largest number of env steps of all episodes together; each episode gets an equal share, and is cut at that step"""
+    """limit on the env steps of all episodes together; each episode gets an equal share, and is cut when it is used up"""
     video: bool
-    """film the episodes: an mp4 of each in the folder videos of the run (pip install moviepy pygame-ce)"""
+    """record each episode as an mp4 file in the run's folder videos (pip install moviepy pygame-ce)"""
 
 
 class RecordKeywords(PlayKeywords, total=False):

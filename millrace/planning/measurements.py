@@ -87,7 +87,7 @@ class Measurements(msgspec.Struct, frozen=True, kw_only=True):
     """time from the start of a worker until its env copy is made"""
     worker_bytes: int = 0
     """memory of a worker with one copy, including the processes that the copy has started"""
-    repeats: bool | None = None
+    deterministic: bool | None = None
     """whether another copy returns the same results for the same seed and actions; None if it isn't known"""
     findings: tuple[str, ...] = ()
     """problems that were found, such as a crash or a step that hung; one line each"""

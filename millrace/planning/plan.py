@@ -204,10 +204,10 @@ def _advice(sizes: Sizes, situation: Situation, rate: float) -> list[str]:
             f"other programs use the {counted(machine.cores, 'core')} (load average {number_in_words(machine.load)}): "
             "beside them, runs are slower than expected here"
         )
-    if measured.repeats is False:
+    if measured.deterministic is False:
         lines.append(
-            "it does not repeat itself for the same seed and actions: if a worker is lost, its episodes begin anew, and two "
-            "runs with the same seed differ"
+            "it isn't deterministic: the same seed and actions gave other results; so if a worker is lost, new episodes "
+            "begin, and two runs with the same seed differ"
         )
     ahead = msgspec.structs.replace(situation, resets_ahead=True)
     faster = steps_per_s(sizes, ahead, generator(1, Purpose.ROUNDS))

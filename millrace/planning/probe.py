@@ -291,7 +291,7 @@ def _digest(arrays: Sequence[Array]) -> int:
     return number
 
 
-def _repeats(traces: Sequence[Sequence[int]]) -> bool | None:
+def _deterministic(traces: Sequence[Sequence[int]]) -> bool | None:
     """Whether all copies returned the same results in the steps that all took; None if fewer than two were stepped."""
     traces = [trace for trace in traces if trace]
     if len(traces) < 2:
@@ -338,7 +338,7 @@ def _with_all(measured: Measurements, sessions: Sequence[_SteppedCopies]) -> Mea
         resets=len(resets),
         copies_worked=max((len(each.traces) for each in sessions if each.is_whole), default=1),
         episode_steps=steps / sum(map(len, later)) if later else sessions[0].time_limit,
-        repeats=_repeats([trace for session in sessions for trace in session.traces]),
+        deterministic=_deterministic([trace for session in sessions for trace in session.traces]),
         findings=tuple(session.finding for session in sessions if session.wrong),
     )
 

@@ -182,5 +182,5 @@ def _found(measured: Measurements) -> Iterator[tuple[str, str]]:
         f"{measured.worker_bytes / 2**20:,.0f} MB for a worker with a copy; an observation takes "
         f"{measured.observation_bytes:,} bytes",
     )
-    yield "repeats itself", {True: "yes", False: "no", None: "not known"}[measured.repeats]
+    yield "deterministic", {True: "yes", False: "no", None: "not known"}[measured.deterministic]
     yield "start", f"{time_in_words(measured.start_s)} for a worker with a copy"

@@ -28,8 +28,8 @@ from millrace.workers.copies.row_writers import write_numbers
 from millrace.workers.copies.saved_state import SavedCopy, unpacked
 from millrace.workers.lanes.lane import Lane
 
-NOT_REPEATED = (
-    "the environment does not repeat itself: when a lost episode was begun again with the same seed and its actions were "
+NOT_DETERMINISTIC = (
+    "the environment isn't deterministic: when a lost episode was begun again with the same seed and its actions were "
     "replayed, or its saved state was loaded, {}; so a new episode began instead, and results depend on who was lost"
 )
 
@@ -65,7 +65,7 @@ def bring_back(
         repeated.compare()
         repeated.start_others()
     repeated.hand_over()
-    return NOT_REPEATED.format(repeated.why) if repeated.why else ""
+    return NOT_DETERMINISTIC.format(repeated.why) if repeated.why else ""
 
 
 class _Repeated:

@@ -583,7 +583,7 @@ def continues_a_lane(learner: Learner) -> Script[None]:
         if not rollout.memory:
             raise Broken(Rule.PAST, "memory in each rollout of a client that continues lanes", "none")
         if not _repeats(earlier, rollout):
-            raise Skipped("the environment does not repeat itself")
+            raise Skipped("the environment isn't deterministic")
         collected.append(rollout)
     past = _past_of(collected)
     if past.new_episodes:

@@ -60,7 +60,7 @@ def test_the_command_measures_an_environment_that_waits_and_names_a_command_that
     alone = found["measured"]["side_by_side"][0]
     assert alone["mean_s"] >= step_s
     assert alone["cpu_s"] < 0.2 * alone["mean_s"]
-    assert found["measured"]["repeats"] is True
+    assert found["measured"]["deterministic"] is True
     assert found["measured"]["episode_steps"] == 5
     assert found["measured"]["worker_bytes"] > 20 << 20
     chosen = {each["name"]: each["value"] for each in found["chosen"]}
@@ -82,8 +82,8 @@ def test_the_command_measures_an_environment_that_waits_and_names_a_command_that
 
 def test_an_environment_of_the_script_that_does_not_repeat_itself_is_found_out_from_python() -> None:
     plan = millrace.plan(Forgets, seconds=BRIEF_S)
-    assert plan.measured.repeats is False
-    assert any("does not repeat itself" in line for line in plan.advice)
+    assert plan.measured.deterministic is False
+    assert any("isn't deterministic" in line for line in plan.advice)
     assert plan.measured.alone.computes
     assert plan.settings["algo"] == "ppo"
     text = str(plan)

@@ -229,7 +229,7 @@ def assert_goes_on(
             collector = random_collector(run)
             past = past_of(run, found, attributes, resumes=resumes)
         found.append(rollout_of(collector, run, number, attributes, past))
-        assert "repeat itself" not in collector.note, f"round {number}: {collector.note}"
+        assert "deterministic" not in collector.note, f"round {number}: {collector.note}"
         assert all_bits(found[-1]) == all_bits(expected[number]), f"round {number}"
     undisturbed.lanes.close_all()
     collector.lanes.close_all()
@@ -443,7 +443,7 @@ def test_a_copy_that_does_not_repeat_itself_starts_anew(
     collector, past, rollout, run = continued(make, T, rounds)
     assert past.new_episodes == (0 if why else 2)  # the learner says how many cannot be repeated
     assert why in collector.note
-    assert bool(why) == ("repeat itself" in collector.note)
+    assert bool(why) == ("deterministic" in collector.note)
     assert collector.lanes[0].starts == [1, 1]
     assert started_anew(rollout) == {0: 1, 1: 1}
     for number in range(rounds + 1, rounds + 4):
