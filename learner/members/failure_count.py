@@ -45,7 +45,7 @@ class FailureCount:
     def failed(self, lanes: Collection[int | str], worked_s: float | None, now: float) -> str:
         """Count one failure that stopped these lanes. Returns why the run ends, or an empty string.
 
-        `worked_s` is the number of seconds for which the worker had been making env steps; None if its process is not known
+        `worked_s` is the number of seconds for which the worker had been taking env steps; None if its process is not known
         to have made one.
         """
         stepped = worked_s is not None

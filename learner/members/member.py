@@ -96,7 +96,7 @@ class Member:
     speed: Speed | None = None
     """The worker's speed; None before its first heartbeat."""
     first_step_s: float | None = None
-    """Time when its process was first known to have made an env step, because it reported one or sent a rollout."""
+    """Time when its process was first known to have taken an env step, because it reported one or sent a rollout."""
     activity: WorkerActivity | None = None
     """What the worker is doing, according to its supervisor's last statement."""
     activity_s: float = 0.0
@@ -141,7 +141,7 @@ class Member:
         return None if self.first_step_s is None else max(0.0, self.alive_s - self.first_step_s)
 
     def has_stepped(self) -> None:
-        """Record that its process has made an env step."""
+        """Record that its process has taken an env step."""
         if self.first_step_s is None:
             self.first_step_s = self.heard_s
 
