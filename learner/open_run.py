@@ -116,7 +116,7 @@ def open_run(setup: RunSetup, lobby: Lobby, watch: Watch, observer: HubObserver)
 
 
 def _why_no_attributes(vector: str) -> str:
-    """Why attributes of the env copies can't be set; empty if they can."""
+    """Why attributes of the env copies can't be set, or an empty string if they can."""
     if has_attributes(vector):
         return ""
     return f"the env copies of vector {vector} have no attributes"

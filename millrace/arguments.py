@@ -115,7 +115,7 @@ def plain(value: Any) -> Any:
 
 
 def unusable(value: Any) -> str:
-    """Why a value can't be written to messages and files, worded as `expected …`; empty if it can."""
+    """Why a value can't be written to messages and files, worded as `expected …`, or an empty string if it can."""
     try:
         match value:
             case os.PathLike():

@@ -201,7 +201,7 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return msgspec.structs.replace(self, kwargs=self.kwargs | self.eval_kwargs, eval_kwargs={})
 
     def rejection_reason(self, code: AllowedCode) -> str:
-        """Why a worker that allows only this code cannot make the environment; empty if it can."""
+        """Why a worker that allows only this code cannot make the environment, or an empty string if it can."""
         if self.factory is not None and code is not AllowedCode.CALLABLES:
             return (
                 f"environment {self.id} is a callable, which this worker does not unpickle; it may come over ipc, inproc or "
@@ -282,7 +282,7 @@ class EnvSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def _why_not(env_id: str) -> str:
-    """Why a registered environment that the user may have meant can't be made; empty if it can.
+    """Why a registered environment that the user may have meant can't be made, or an empty string if it can.
 
     For an id with a module, returns an empty string, so that no function is called.
     """

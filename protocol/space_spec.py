@@ -17,7 +17,7 @@ from millrace.protocol.arrays import Array
 from millrace.protocol.bounds import Count, Line, Name, Natural, Text, Whole
 from millrace.protocol.errors import BadMessage
 
-MAX_LEAVES = 48  # arrays of an observation; a rollout sends each in its own frame
+MAX_LEAVES = 48  # arrays in an observation; a rollout sends each one in a frame of its own
 MAX_DEPTH = 8
 MAX_WRAPPERS = 1 << 8  # classes of an environment's wrappers
 MAX_SPACES = 1 << 12  # spaces of an environment, including nested ones, whose random generators are sent

@@ -363,7 +363,7 @@ class RunSpec(msgspec.Struct, frozen=True, tag=True):
         return (*factories, *(f"opponent {factory}" for factory in self.scripted))
 
     def rejection_reason(self, code: AllowedCode) -> str:
-        """Why a worker that allows only this code cannot take part; empty if it can."""
+        """Why a worker that allows only this code cannot take part, or an empty string if it can."""
         for what in self.policy_code:
             if why := code.refuses_to_call(what):
                 return why
@@ -448,5 +448,5 @@ class StepSpec(msgspec.Struct, frozen=True, tag=True):
         return slice(first * A, (first + self.lanes[lane]) * A)
 
     def rejection_reason(self, code: AllowedCode) -> str:
-        """Why a worker that allows only this code cannot take part; empty if it can."""
+        """Why a worker that allows only this code cannot take part, or an empty string if it can."""
         return next((why for env in self.envs if (why := env.rejection_reason(code))), "")

@@ -27,7 +27,7 @@ SESSIONS = 1 << 24  # a learner has fewer sessions than this; the number of its 
 
 
 def is_of_learner(session: int, first_session: int) -> bool:  # rule SHARED_OF_LEARNER
-    """Whether this session belongs to the learner with this first session."""
+    """Whether this session belongs to the learner whose first session was `first_session`."""
     return 0 <= session - first_session < SESSIONS
 
 

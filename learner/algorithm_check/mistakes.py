@@ -47,7 +47,7 @@ from millrace.protocol.specs import PolicySpec
 MOST_STEPS = 64  # rollouts in this check have at most this many steps
 MOST_WARM_UP = 24  # limit on updates before the first gradient step, because a replay buffer may have to be filled first
 MORE_UPDATES = 3  # number of updates that follow the first gradient step
-TOTAL_STEPS = 20_000  # env steps of the toy run, for schedules
+TOTAL_STEPS = 20_000  # total env steps of the toy run; schedules are computed from it
 LEARNING_STEPS = 40_000  # env steps within which the identity environment must be learned
 LEARNED = 0.5  # the mean reward to reach, on a scale from 0 (random actions) to 1 (perfect actions)
 MEASURED_BATCHES = 5  # number of batches over which the mean reward is measured

@@ -39,7 +39,7 @@ class RunningMoments:
     """Mean and variance [*shape] of all rows so far, updated batch by batch (Chan, Golub and LeVeque 1979)."""
 
     def __init__(self, shape: tuple[int, ...] = (), rounding: float | Doubles = ROUNDING_32) -> None:
-        """`rounding`, a number or [*shape], is the relative rounding error of the values' dtype."""
+        """`rounding` is the relative rounding error of the values' dtype: one number, or an array [*shape]."""
         self.count = 0
         self._rounding = rounding
         self.mean: Doubles = np.zeros(shape)

@@ -177,7 +177,7 @@ def _what_is_wrong_with_settings(record: type[AlgorithmConfig]) -> str:
 
 
 def _why_not_plain(record: type[AlgorithmConfig], setting: str) -> str:
-    """Why config.toml can't hold the default of a setting; empty if it can."""
+    """Why config.toml can't hold the default of a setting, or an empty string if it can."""
     default = getattr(record(), setting)
     try:
         plain: Mapping[str, Any] = {} if default is None else {setting: msgspec.to_builtins(default)}

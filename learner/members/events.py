@@ -75,7 +75,7 @@ class Failed:
     lanes: tuple[int, ...] = ()
     """The lane that failed if it is known; otherwise all lanes that the worker held."""
     worked_s: float | None = None
-    """Seconds from the worker's first env step to the failure; None if its process is not known to have taken an env step."""
+    """Seconds from the worker's first env step to the failure; None if no env step of its process is known."""
     spare: bool = False
     """Whether the run didn't need the worker, because every lane had another worker. Such a failure doesn't count."""
 

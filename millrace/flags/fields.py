@@ -1,7 +1,8 @@
 """Turns the fields of a record into flags.
 
-Rule: a field becomes a flag of the same name, with dashes. The field's type determines which values are allowed.
-`Annotated[..., Flag(...)]` adds what neither name nor type can express. A field that is itself a record isn't a flag.
+Rule: a field becomes a flag of the same name, with dashes instead of underscores. The field's type determines which values
+are allowed. `Annotated[..., Flag(...)]` adds what neither name nor type can express. A field that is itself a record isn't a
+flag.
 """
 
 from __future__ import annotations

@@ -187,7 +187,7 @@ class Keyring:
         self.read_error = error_text
 
     def rejection_reason(self, public: bytes) -> str:
-        """Why a handshake with this public key is refused; empty if it is accepted."""
+        """Why a handshake with this public key is refused, or an empty string if it is accepted."""
         return self.allowed.rejection_reason(public) or (
             f"its key cannot be looked up: {self.read_error}" if self.read_error else ""
         )

@@ -89,7 +89,7 @@ class Token:
         except ValueError:
             raw = b""
         body = raw[: 2 * KEY_BYTES]
-        if Token(body[:KEY_BYTES], Key(b"", body[KEY_BYTES:])).to_text() != text:  # compares the checksum and the spelling
+        if Token(body[:KEY_BYTES], Key(b"", body[KEY_BYTES:])).to_text() != text:  # compares checksum and text
             raise UsageError(f"{where}: the join token is damaged (its checksum does not fit); copy it again")
         return Token(body[:KEY_BYTES], Key.from_secret(body[KEY_BYTES:]))
 
@@ -115,7 +115,7 @@ class ClientList:
     clients: tuple[Client, ...] = ()
 
     def rejection_reason(self, public: bytes) -> str:
-        """Why messages and handshakes with this key are refused; empty if they are not."""
+        """Why messages and handshakes with this key are refused, or an empty string if they are not."""
         client = self._known.get(public)
         if client is None:
             return f"its key {fingerprint(public)} is not allowed here"

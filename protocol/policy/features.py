@@ -61,7 +61,7 @@ def _features_of_leaf(leaf: Leaf, array: Array, keep_float64: bool) -> Array:
 
 @lru_cache(maxsize=64)
 def _one_hot_values(leaf: Leaf) -> Array:
-    """[features] the discrete value that each one-hot feature of this leaf stands for."""
+    """The discrete value that each one-hot feature of this leaf stands for: [features]."""
     return np.concatenate([np.arange(start, start + n) for start, n in zip(leaf.start, leaf.sizes, strict=True)])
 
 

@@ -20,7 +20,7 @@ MOST_LAYERS = 64
 
 
 def why_impossible(spec: PolicySpec) -> str:
-    """Why no policy can be made from this spec, in one line; empty if one can."""
+    """Why no policy can be made from this spec, in one line, or an empty string if one can."""
     leaves = spec.observation
     action = spec.action
     paths = {leaf.path for leaf in leaves}

@@ -124,7 +124,7 @@ class LearnerLink:
                 yield peer, error
 
     def rejection_reason(self, peer: bytes) -> str:
-        """Why this peer is no longer allowed to connect; empty if it still is."""
+        """Why this peer is no longer allowed to connect, or an empty string if it still is."""
         return "" if self.keyring is None else self.keyring.allowed.rejection_reason(_key_of(peer))
 
     def name_for_log(self, peer: bytes) -> str:

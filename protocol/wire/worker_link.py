@@ -36,7 +36,7 @@ log = logging.getLogger("millrace.link")
 
 
 class WorkerLink:
-    """A worker's end: one connection to the learner."""
+    """The worker's end of its connection to the learner."""
 
     def __init__(
         self,

@@ -267,7 +267,7 @@ class EnvLoop:
         return set_state(self._inner[copy], packed)
 
     def _check_numbers(self, copies: Iterable[int]) -> None:
-        """Raise `CopyFailed` for text, or a reward of None, which numpy would silently read as True, 1 or NaN."""
+        """Raise `CopyFailed` for text, which numpy would silently convert to True or 1, and for a reward of None (NaN)."""
         for n in copies:
             if why := self._rewards_of_agents(n):
                 raise CopyFailed(n, f"step {self.steps}", why)

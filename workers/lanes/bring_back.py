@@ -172,7 +172,7 @@ class _Repeated:
         return last.is_repeated and last.random == b""
 
     def _follows(self, n: int) -> bool:
-        """Whether the episode of copy n began in a step, with a reset without a seed."""
+        """Whether the episode of copy n began with the automatic reset in a step, which has no seed."""
         last = self._past.copies[n]
         return bool(last.random) and last.is_repeated
 

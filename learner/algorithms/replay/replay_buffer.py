@@ -92,7 +92,7 @@ class Content(NamedTuple):
 
     @property
     def bytes(self) -> int:
-        """Memory of the replay buffer, in bytes."""
+        """Size of the replay buffer in bytes."""
         leaves = sum(int(np.prod(leaf.shape)) * np.dtype(leaf.dtype).itemsize for leaf in self.observation)
         slots = self.size * (leaves + self.choices + row_dtype(self.action).itemsize)
         tree = SumTree.memory_bytes(self.size) if self.prioritized else 0

@@ -1,4 +1,4 @@
-"""What to do if no policy supports the observations of an environment: a wrapper that makes them arrays. Pure."""
+"""Suggests a wrapper that converts an environment's observations to arrays, if no policy supports them. Pure."""
 
 from __future__ import annotations
 

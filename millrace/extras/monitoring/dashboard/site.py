@@ -127,7 +127,7 @@ class Site:
         return "\n".join(filter(None, parts))
 
     def _file(self, key: str, parts: Sequence[str]) -> PageAnswer:
-        """A file of a run, if the run's page shows it; otherwise status 404."""
+        """One of a run's files, if the run's page shows it; otherwise status 404."""
         run = self._runs.find().get(key)
         try:
             shown = self._runs.content(run).report if run is not None else None
