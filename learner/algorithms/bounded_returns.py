@@ -33,10 +33,13 @@ class BoundedReturns(RewardScaler):
         divided: Floats = (reward / max(self.std, self._largest / self._bound)).astype(np.float32)
         return divided
 
-    def may_last(self, reward: Floats) -> None:
-        """Record that the largest of these rewards may be earned at every step, forever. Without a discount, do nothing."""
-        if self._gamma < 1:
-            self._largest = max(self._largest, float(abs(reward).max(initial=0)) / (1 - self._gamma))
+    def may_last(self, reward: Floats, steps: int = 1) -> None:
+        """Record that the largest of these rewards may be earned forever. Without a discount, do nothing.
+
+        `reward`: discounted sums of the rewards of `steps` steps.
+        """
+        if self._gamma < 1:  # Σ γⁱ over these steps is (1 − γⁿ) / (1 − γ), and the value is that of 1 / (1 − γ) steps
+            self._largest = max(self._largest, float(abs(reward).max(initial=0)) / (1 - self._gamma**steps))
 
     def counted(self, returns: Doubles, reward: Floats, ends: EpisodeEnds, lane: int, fresh: Bools) -> None:
         """See `RewardScaler`."""

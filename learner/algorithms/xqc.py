@@ -62,7 +62,7 @@ class XQC(NormalizedSAC):
         With hindsight, an agent that stays at a goal gets the goal's reward at every step, which no collected return shows.
         """
         if self.config.hindsight and self.config.goal_ends is None:
-            self.rewards.may_last(reward)
+            self.rewards.may_last(reward, self.config.n_step)
         return super().scaled(reward)
 
     def target_distribution(self, rows: Transitions, next_logits: Tensor, next_log_prob: Tensor) -> Tensor:

@@ -137,6 +137,12 @@ def test_a_reward_that_may_last_is_worth_what_it_is_for_ever() -> None:
     assert divisor(scaler) == pytest.approx(2 / (1 - GAMMA) / BOUND)
 
 
+def test_a_sum_of_rewards_that_may_last_counts_as_its_mean() -> None:
+    scaler = BoundedReturns(GAMMA, BOUND)
+    scaler.may_last(np.array([2 * (1 + GAMMA + GAMMA**2)], np.float32), steps=3)
+    assert divisor(scaler) == pytest.approx(2 / (1 - GAMMA) / BOUND)
+
+
 def test_a_saved_state_goes_on() -> None:
     lived, cut = random_life(24, 3), 11
     scaler, again = BoundedReturns(GAMMA, 0.1), BoundedReturns(GAMMA, 0.1)
