@@ -42,9 +42,10 @@ from millrace.learner.members.events import (
 from millrace.learner.members.held_up import what_they_do
 from millrace.learner.members.join_limiter import JoinLimiter
 from millrace.learner.members.key_revocation import KeyRevocation
+from millrace.learner.members.member import Member
 from millrace.learner.members.member_log import MemberLog
 from millrace.learner.members.member_states import SentUnusable
-from millrace.learner.members.membership import Outgoing
+from millrace.learner.members.membership import Membership, Outgoing
 from millrace.learner.members.worker_processes import WorkerProcesses
 from millrace.protocol.address import advertised_address, name_for_people
 from millrace.protocol.bounds import one_line
@@ -119,6 +120,7 @@ class MemberServer:
         self._remove_silent_from_s = self.listened_s
         self._ask_processes_s = self.listened_s
         self._no_members_since_s = math.inf
+        self._describing_until_s = -math.inf  # until then, `wait_for` also waits for workers that describe the environment
         self._last_turned_away = ""  # why the last worker that left unexpectedly, or was refused, is gone
         self._encoded: tuple[ToWorker, Sequence[Buffer]] | None = None
         self._joins = JoinLimiter()
@@ -169,12 +171,22 @@ class MemberServer:
         if self._membership.events:
             self._log_events(cause)
 
-    def wait_for(self, workers: int, timeout_s: float, turn: Callable[[], None], *, describing_until_s: float = 0.0) -> None:
-        """Call `turn`, which must listen, until this many `workers` have joined.
+    def take_over(self, waiting: Membership[Member], described_in_s: float) -> None:
+        """Begin the run for the workers waiting for it. `described_in_s`: how long the environment's description took.
+
+        If the description took long, other workers may still be describing the environment. `wait_for` waits for them until
+        `described_in_s` more seconds have passed, which is enough for a worker that doesn't hang. If the run began without
+        such a worker, other workers would have to open its lanes, one after another.
+        """
+        now = self._clock()
+        self._describing_until_s = now + described_in_s
+        self.send(self._coordinator.take_over(waiting, now))
+
+    def wait_for(self, workers: int, timeout_s: float, turn: Callable[[], None]) -> None:
+        """Call `turn`, which must listen, until this many `workers` have joined, and none still describes the environment.
 
         Raises `NoWorkers` after `timeout_s`, or at once if that many can no longer join. Workers that only evaluate don't
-        count. Until the clock reaches `describing_until_s`, it also waits for workers that are still describing the
-        environment.
+        count. For how long it waits for descriptions, see `take_over`.
         """
         deadline_s = self._clock() + timeout_s
         wait = LongWait(self._clock())
@@ -186,7 +198,7 @@ class MemberServer:
                 self.check_left(workers, collecting=True)
                 if now > deadline_s:
                     raise self.no_workers(workers, timeout_s)
-            elif now >= describing_until_s or not any(member.describes for member in collectors):
+            elif now >= self._describing_until_s or not any(member.describes for member in collectors):
                 return
             if wait.due(now):
                 told = self.what_workers_do()

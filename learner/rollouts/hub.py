@@ -132,7 +132,6 @@ class Hub:
         self._check_interrupt = check_interrupt
         self._observer = observer
         self._clock = clock
-        self._describing_until_s = 0.0  # until then, the run waits for workers that are still describing the environment
         self._lags: list[int] = []  # the lag of each rollout of the last `gather`
         self.lag_statistics = LagStatistics()
         self._progress = Progress()
@@ -142,23 +141,15 @@ class Hub:
         self._server = MemberServer(link, coordinator, self, self._processes, clock=clock)
         self._time = LearnerTime(coordinator, clock(), self._server.awaited, self._processes)
 
-    def take_over(self, waiting: Membership[Member], described_in_s: float = 0.0) -> None:
-        """Begin the run for the workers waiting for it. `described_in_s`: how long the environment's description took.
-
-        If the description took long, other workers may still be describing the environment. The run waits for them for
-        `described_in_s` more seconds, which is enough for a worker that doesn't hang. If the run began without it, other
-        workers would have to open its lanes, one after another.
-        """
-        self._describing_until_s = self._clock() + described_in_s
-        self._server.send(self.coordinator.take_over(waiting, self._clock()))
+    def take_over(self, waiting: Membership[Member], described_in_s: float) -> None:
+        """Begin the run for the workers waiting for it. `described_in_s`: how long the environment's description took."""
+        self._server.take_over(waiting, described_in_s)
 
     # ---------------------------------------------------------------- what the loop calls
 
     def wait_for(self, workers: int) -> None:
         """Wait until this many `workers` have joined. Raises `NoWorkers` after `no_workers_timeout_s`."""
-        timeout_s = self.settings.no_workers_timeout_s
-        until_s = self._describing_until_s
-        self._server.wait_for(workers, timeout_s, lambda: self._turn(POLL_S), describing_until_s=until_s)
+        self._server.wait_for(workers, self.settings.no_workers_timeout_s, lambda: self._turn(POLL_S))
 
     def publish(
         self,

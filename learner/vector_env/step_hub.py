@@ -79,9 +79,12 @@ class StepHub:
         settings = ServerSettings(grace_s=worker_timeout_s, log_tracebacks=False)
         self._server = MemberServer(link, self.coordinator, self, processes, settings, clock)
 
-    def take_over(self, waiting: Membership[Member]) -> None:
-        """Begin the vector environment for the workers waiting for it."""
-        self._server.send(self.coordinator.take_over(waiting, self.now()))
+    def take_over(self, waiting: Membership[Member], described_in_s: float) -> None:
+        """Begin the vector environment for the workers waiting for it.
+
+        `described_in_s`: how long the environment's description took.
+        """
+        self._server.take_over(waiting, described_in_s)
 
     @property
     def address(self) -> str:

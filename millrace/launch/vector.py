@@ -232,7 +232,7 @@ class VectorEnvPool:
             worker_timeout_s=settings.worker_timeout_s if settings.listen.bind else math.inf,
         )
         self._resources.callback(hub.close, CLOSE_TIMEOUT_S)
-        hub.take_over(lobby.hand_over())
+        hub.take_over(lobby.hand_over(), lobby.described_in_s)
         return ZmqVectorEnv(
             description,
             hub,

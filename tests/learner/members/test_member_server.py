@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-import itertools
 import logging
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from types import SimpleNamespace
 from typing import cast
 
 import pytest
 
+from millrace.learner.members.describe_coordinator import DescribeCoordinator, Unknown
 from millrace.learner.members.events import Event
+from millrace.learner.members.member import Member
 from millrace.learner.members.member_server import (
     ASK_PROCESSES_S,
     AWAY_S,
@@ -21,16 +22,24 @@ from millrace.learner.members.member_server import (
     MemberServer,
     ServerSettings,
 )
+from millrace.learner.members.membership import Membership
 from millrace.learner.members.worker_processes import WorkerProcesses
+from millrace.learner.rollouts.hub import Hub, HubSettings
+from millrace.learner.rollouts.lag_rule import Rounds
+from millrace.learner.rollouts.rollout_dealer import RolloutDealer
+from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
 from millrace.learner.vector_env.order_coordinator import OrderCoordinator
 from millrace.learner.vector_env.step_hub import StepHub
 from millrace.learner.vector_env.vector_env_status import status
 from millrace.protocol.alive import StartFailed, WorkerActivity, WorkerExit
+from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.errors import EnvironmentFailed, NoWorkers
 from millrace.protocol.messages import PROTOCOL_VERSION, Failure, Goodbye, Heartbeat, Hello, Status, ToLearner
+from millrace.protocol.specs import WaitSpec
 from millrace.protocol.wire.learner_link import LearnerLink
 from tests.learner.vector_env.test_order_coordinator import SPEC
 from tests.support.conversation.example_messages import example
+from tests.support.conversation.fake_ends import run_spec
 from tests.support.conversation.fake_link import FakeLink
 from tests.support.in_process.fake_processes import FakeProcesses
 
@@ -356,23 +365,52 @@ def test_whoever_waits_for_workers_is_told_how_many_came_and_how_to_start_one() 
     served.server.wait_for(1, 1.0, lambda: served.server.listen(POLL_S))
 
 
-@pytest.mark.parametrize(("describes_for", "expected_s"), [(10, 10 * POLL_S), (10**6, 2.0)])
-def test_a_run_waits_for_workers_that_still_describe_the_environment_but_not_longer_than_said(
-    describes_for: int, expected_s: float
+def members_of_a_lobby() -> Membership[Member]:
+    """A worker that was asked to describe the environment, and has not answered yet."""
+    made = DescribeCoordinator(WaitSpec(), 1, worker_timeout_s=TIMEOUT_S, decliners_to_end=0)
+    made.ask(Unknown(EnvSpec("Fake-v0")))
+    made.receive(b"w0", example(Hello), 0.0)
+    return made.membership
+
+
+def begin_run(link: FakeLink, described_in_s: float) -> Callable[[], None]:
+    """Begin a run for this worker. Returns the wait for its workers."""
+    rollouts = RolloutDealer(1, Rounds(0))
+    coordinator = TicketCoordinator(run_spec(1), rollouts, worker_timeout_s=TIMEOUT_S, first_session=1)
+    settings = HubSettings(no_workers_timeout_s=TIMEOUT_S, stall_timeout_s=600.0, max_env_failures=0)
+    hub = Hub(cast(LearnerLink, link), coordinator, settings, clock=lambda: link.now)
+    hub.take_over(members_of_a_lobby(), described_in_s)
+    return lambda: hub.wait_for(1)
+
+
+def begin_vector_env(link: FakeLink, described_in_s: float) -> Callable[[], None]:
+    """Begin a vector environment for this worker. Returns the wait for its workers."""
+    hub = step_hub(link)
+    hub.take_over(members_of_a_lobby(), described_in_s)
+    return lambda: hub.wait_for(1, TIMEOUT_S)
+
+
+@pytest.mark.parametrize(("begins_after_s", "expected_s"), [(1.0, 1.0), (math.inf, 2.0)])
+@pytest.mark.parametrize("begin", [begin_run, begin_vector_env])
+def test_a_learner_waits_for_a_worker_that_still_describes_the_environment_but_no_longer_than_the_description_took(
+    begin: Callable[[FakeLink, float], Callable[[], None]], begins_after_s: float, expected_s: float
 ) -> None:
-    """`describes_for`: number of turns until the worker has described the environment."""
-    served = Served()
-    member = served.coordinator.members[b"w0"]
-    member.describes = True
-    turns = itertools.count(1)
+    """`begins_after_s`: when the worker reports that it has begun the run."""
+    link = FakeLink()
+    wait = begin(link, 2.0)
+    began_s = link.now
+    poll = link.poll
 
-    def turn() -> None:
-        served.server.listen(POLL_S)
-        member.describes = next(turns) < describes_for
+    def poll_and_begin(timeout_s: float) -> bool:
+        if link.now >= began_s + begins_after_s:
+            link.inbox.append((b"w0", example(Heartbeat, session=1, waits=False)))
+        return poll(timeout_s)
 
-    began_s = served.link.now
-    served.server.wait_for(1, TIMEOUT_S, turn, describing_until_s=began_s + 2.0)
-    assert served.link.now - began_s == pytest.approx(expected_s, abs=POLL_S)
+    link.poll = poll_and_begin  # type: ignore[method-assign]
+    wait()
+    assert link.now - began_s == pytest.approx(expected_s, abs=1.5 * POLL_S)
+    wait()
+    assert link.now - began_s == pytest.approx(expected_s, abs=1.5 * POLL_S), "it waits only once"
 
 
 def test_a_run_that_has_what_it_needs_does_not_wait() -> None:

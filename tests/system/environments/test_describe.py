@@ -17,7 +17,9 @@ import numpy as np
 import pytest
 
 import millrace
+from millrace.learner.vector_env import step_hub
 from millrace.protocol.errors import EnvironmentFailed
+from millrace.protocol.logs import long_wait
 from millrace.protocol.messages import Describe, Described, Hello, Refuse
 from millrace.protocol.space_spec import MAX_ELEMENTS, BoxSpace, DiscreteSpace, EnvDescription
 from millrace.protocol.wire.codec import encode
@@ -279,6 +281,30 @@ def test_a_vector_environment_makes_no_copy_here(tmp_path: Path) -> None:
         envs.reset(seed=1)
         assert str(os.getpid()) not in pids.read_text().split()
         assert len(set(pids.read_text().split())) == 2
+
+
+class SlowToMake(Countdown):
+    """Takes seconds to make, and longer in the process that begins second. `first`: a file that the first one creates."""
+
+    def __init__(self, first: str) -> None:
+        super().__init__()
+        self.pid = os.getpid()
+        try:
+            Path(first).touch(exist_ok=False)
+            time.sleep(2.0)
+        except FileExistsError:
+            time.sleep(3.5)
+
+
+def test_a_vector_environment_waits_for_a_worker_that_is_still_describing_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The lanes of a vector environment don't move, so a worker that came too late would never get one."""
+    monkeypatch.setattr(long_wait, "FIRST_S", 0.0)  # so that both workers are asked to describe it
+    monkeypatch.setattr(step_hub, "PATIENCE_S", 0.0)
+    with millrace.make_vec(SlowToMake, 2, workers=2, first=str(tmp_path / "first")) as envs:
+        envs.reset(seed=1)
+        assert len(set(envs.get_attr("pid"))) == 2
 
 
 def test_the_spec_and_metadata_of_a_vector_environment_are_as_described() -> None:
