@@ -68,7 +68,7 @@ class Lobby:
         self.first_session = int.from_bytes(os.urandom(6), "little")
         """the number of the first session; the run continues to count from here"""
         self.described_in_s = 0.0
-        """seconds that the last `describe` took"""
+        """seconds that the longest `describe` took. A later one may end while another worker is still busy with this one."""
         self._settings = settings
         self._clock = clock
         coordinator = self._coordinator = DescribeCoordinator(
@@ -109,7 +109,7 @@ class Lobby:
             if wait.due(now):
                 log.warning("no env steps for %.0f s: %s", wait.seconds(now), server.what_workers_do())
                 server.send(coordinator.ask_more())
-        self.described_in_s = self._clock() - began_s
+        self.described_in_s = max(self.described_in_s, self._clock() - began_s)
         return coordinator.described
 
     def status(self, now: float) -> Status:

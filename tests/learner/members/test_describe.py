@@ -475,6 +475,23 @@ def test_the_lobby_returns_the_description_and_answers_the_workers_until_the_run
     assert lobby.hand_over().members.keys() == {A}
 
 
+def test_of_two_descriptions_the_one_that_took_longer_counts() -> None:
+    """A worker may still be making the first environment when the second one, which is made faster, is described."""
+    link = FakeLink()
+    lobby = Lobby(cast(LearnerLink, link), FakeProcesses(expected=1), SETTINGS, lambda: link.now)
+    link.inbox.append((A, hello(A)))
+    for seconds in (3.0, 1.0):
+        at_s = link.now + seconds
+
+        def describe_in_time(at_s: float = at_s) -> None:
+            for member in lobby._coordinator.members.values():
+                if member.tickets and link.now >= at_s:
+                    link.inbox.append((A, Described(member.session, max(member.tickets), DESCRIPTION)))
+
+        lobby.describe(Unknown(ENV), describe_in_time)
+    assert lobby.described_in_s == pytest.approx(3.0, abs=0.2)
+
+
 def test_a_start_whose_workers_all_die_after_the_description_ends_at_once() -> None:
     """The learner imports PyTorch meanwhile, and answers them."""
     link = FakeLink()
