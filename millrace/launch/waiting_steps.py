@@ -1,11 +1,14 @@
-"""Tells the user if env steps mostly wait for something other than this machine's cores: a timer, a GPU or a server. Pure.
+"""Tells the user if env steps mostly wait for a timer, a GPU or another machine, instead of this machine's cores. Pure.
 
 By default there is one worker for each core. If steps wait, the cores are idle, and a run collects faster if each lane has a
 worker of its own. This can't be known before the run, so the workers are watched while they collect.
 
 Rule: a worker counts as computing if any of its threads or processes is running or ready to run, so a worker that lacks a
-core isn't taken for one that waits. Rule: more workers are only suggested. If some joined during the run, lanes would move
-to them, and episodes that can't be replayed would end, so results would depend on the time of joining.
+core isn't taken for one that waits. A simulator may compute outside of its worker's session, as a server on this machine or
+in a container. Therefore, the cores must have been idle as well.
+
+Rule: more workers are only suggested. If some joined during the run, lanes would move to them, and episodes that can't be
+replayed would end, so results would depend on the time of joining.
 """
 
 from __future__ import annotations
@@ -15,13 +18,16 @@ from typing import NamedTuple
 
 from millrace.learner.config.local_workers import enough_workers
 from millrace.protocol.call_timeouts import Doing
+from millrace.protocol.machine.core_times import CoreTimes, idle_share
 from millrace.workers.supervise.process_group import SessionUse
 
 LOOK_EVERY_S = 0.1
 MOST_TIME = 0.05  # share of the time that looks may take, because each reads all of /proc
-LOOKS = 50  # this many looks are judged together
-MOST_LOOKS = 1000  # after this many looks, steps are unlikely to begin to wait
-ENOUGH = 0.5  # if workers wait for this share of the time, a core has time for a second worker
+LOOKS = 50  # this many looks at which workers collected are judged together
+# Steps are unlikely to begin to wait after this many looks, counted from the first one at which a worker collected. Earlier
+# looks don't count, because simulators that take long to construct may also have slow steps.
+MOST_LOOKS = 1000
+ENOUGH = 0.5  # if workers wait, and cores are idle, for this share of the time, a core has time for a second worker
 OF_MEMORY = 0.8  # share of the available memory that additional workers may take
 COLLECTING: frozenset[Doing] = frozenset({"resetting", "stepping", "repeating", "acting"})
 
@@ -42,31 +48,38 @@ class WaitingSteps:
         self._lanes = lanes
         self._envs = envs
         self._look_at_s = 0.0
-        self._looks = 0
-        self._collecting = 0
-        self._waiting = 0
+        self._looks = 0  # from the first one at which a worker collected
+        self._to_judge = 0  # looks at which workers collected, since the last judgement
+        self._collecting = 0  # workers seen collecting at these looks, in total
+        self._waiting = 0  # how often these workers waited
+        self._cores_before = CoreTimes()  # at the first of these looks
 
     def is_due(self, now: float) -> bool:
         """Whether to look at the workers now."""
         return self._workers < self._lanes and self._looks < MOST_LOOKS and now >= self._look_at_s
 
-    def look(self, workers: Sequence[SeenWorker], free_bytes: int | None, began_s: float, ended_s: float) -> str:
+    def look(
+        self, workers: Sequence[SeenWorker], cores: CoreTimes, free_bytes: int | None, began_s: float, ended_s: float
+    ) -> str:
         """Record what the workers do, as seen from `began_s` to `ended_s`. Returns a line for the user, usually empty.
 
-        `free_bytes`: the available memory of this machine; None if it isn't known.
+        `cores`: the times of this machine's cores. `free_bytes`: its available memory; None if it isn't known.
         """
         self._look_at_s = ended_s + max(LOOK_EVERY_S, (ended_s - began_s) / MOST_TIME)
         collecting = [worker for worker in workers if worker.doing in COLLECTING]
+        self._looks += bool(collecting or self._looks)
         if not collecting:
             return ""
-        self._looks += 1
+        if not self._to_judge:
+            self._cores_before = cores
+        self._to_judge += 1
         self._collecting += len(collecting)
         self._waiting += sum(not worker.uses.computes for worker in collecting)
-        if self._looks % LOOKS:
+        if self._to_judge < LOOKS:
             return ""
         share = self._waiting / self._collecting
-        self._collecting = self._waiting = 0
-        if share < ENOUGH:
+        self._to_judge = self._collecting = self._waiting = 0
+        if min(share, idle_share(self._cores_before, cores)) < ENOUGH:
             return ""
         self._looks = MOST_LOOKS
         return self._line(share, max(worker.uses.resident for worker in collecting), free_bytes)

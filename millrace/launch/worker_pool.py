@@ -33,6 +33,7 @@ from millrace.protocol.keys.key_folder import Keyring, chosen_key_folder
 from millrace.protocol.keys.keys import Token
 from millrace.protocol.logs.notices import log_notice
 from millrace.protocol.machine.available_memory import available_bytes
+from millrace.protocol.machine.core_times import core_times
 from millrace.protocol.messages import Status
 from millrace.workers.machine_slots import copies_per_machine
 from millrace.workers.supervise.supervisor import Running, Supervisor
@@ -168,7 +169,8 @@ class _LocalProcesses(WorkerProcesses):
         used = self._supervisor.used()
         running = (each for each in self._supervisor.activities() if each.worker in used)
         seen = [SeenWorker(each.doing, used[each.worker]) for each in running]
-        if line := self._waiting_steps.look(seen, available_bytes(), began_s, time.monotonic()):
+        cores = core_times()
+        if line := self._waiting_steps.look(seen, cores, available_bytes(), began_s, time.monotonic()):
             log_notice(log, line)
 
     def activities(self) -> Sequence[WorkerActivity]:

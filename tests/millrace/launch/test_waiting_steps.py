@@ -6,6 +6,7 @@ import pytest
 
 from millrace.launch.waiting_steps import LOOK_EVERY_S, LOOKS, MOST_LOOKS, SeenWorker, WaitingSteps
 from millrace.protocol.call_timeouts import Doing
+from millrace.protocol.machine.core_times import CoreTimes
 from millrace.workers.supervise.process_group import SessionUse
 
 MIB = 1 << 20
@@ -13,15 +14,35 @@ WAITS = SessionUse(computes=False, resident=50 * MIB)
 COMPUTES = SessionUse(computes=True, resident=60 * MIB)
 
 
-def lines(waiting: WaitingSteps, *looks: list[SeenWorker], free_bytes: int | None = None, times: int = 1) -> list[str]:
+class Machine:
+    """Its clock, and the times of its cores."""
+
+    def __init__(self) -> None:
+        self.now = 0.0
+        self.cores = CoreTimes()
+
+    def passes(self, idle: float) -> None:
+        """Time passes until the next look. The cores are idle for this share of it."""
+        self.now += LOOK_EVERY_S
+        self.cores = CoreTimes(self.cores.idle + round(100 * idle), self.cores.total + 100)
+
+
+def lines(
+    waiting: WaitingSteps,
+    *looks: list[SeenWorker],
+    free_bytes: int | None = None,
+    times: int = 1,
+    idle: float = 1.0,
+    machine: Machine | None = None,
+) -> list[str]:
     """What `times` rounds of these looks return, one after another."""
+    machine = machine or Machine()
     results: list[str] = []
-    now = 0.0
     for _ in range(times):
         for look in looks:
-            assert waiting.is_due(now)
-            results.append(waiting.look(look, free_bytes, now, now))
-            now += LOOK_EVERY_S
+            machine.passes(idle)
+            assert waiting.is_due(machine.now)
+            results.append(waiting.look(look, machine.cores, free_bytes, machine.now, machine.now))
     return results
 
 
@@ -47,6 +68,21 @@ def test_half_of_the_time_is_enough() -> None:
     assert lines(WaitingSteps(2, 4, 4), seen(WAITS), seen(COMPUTES), times=LOOKS // 2)[-1]
 
 
+@pytest.mark.parametrize(("idle", "suggested"), [(0.49, False), (0.5, True)])
+def test_nothing_is_suggested_if_the_cores_are_busy_while_the_workers_wait(idle: float, suggested: bool) -> None:
+    """Their simulators may compute as servers, in containers or in sessions of their own."""
+    assert bool(lines(WaitingSteps(2, 8, 8), seen(WAITS), times=LOOKS, idle=idle)[-1]) == suggested
+
+
+@pytest.mark.parametrize("doing", ["making", "stepping"])
+def test_what_the_cores_did_before_does_not_count(doing: Doing) -> None:
+    """A start or the first steps may compute, such as if they compile the simulator."""
+    waiting = WaitingSteps(2, 8, 8)
+    machine = Machine()
+    assert not any(lines(waiting, seen(WAITS, doing), times=2 * LOOKS, idle=0.0, machine=machine))
+    assert lines(waiting, seen(WAITS), times=LOOKS, machine=machine)[-1]
+
+
 @pytest.mark.parametrize("doing", ["starting", "waiting", "describing", "making", "preparing", "evaluating", "closing"])
 def test_only_workers_that_collect_count(doing: Doing) -> None:
     """A worker that waits for a ticket says nothing about its steps."""
@@ -67,6 +103,17 @@ def test_a_run_is_not_watched_for_ever() -> None:
     assert not waiting.is_due(1e9)
 
 
+def test_nor_is_a_run_whose_workers_mostly_wait_for_weights() -> None:
+    waiting = WaitingSteps(2, 8, 8)
+    lines(waiting, seen(COMPUTES), *[seen(WAITS, "waiting")] * 9, times=MOST_LOOKS // 10)
+    assert not waiting.is_due(1e9)
+
+
+def test_a_start_may_take_any_time() -> None:
+    looks = [*[seen(WAITS, "making")] * (2 * MOST_LOOKS), *[seen(WAITS)] * LOOKS]
+    assert lines(WaitingSteps(2, 8, 8), *looks)[-1]
+
+
 @pytest.mark.parametrize(("workers", "lanes"), [(8, 8), (0, 0), (2, 0)])
 def test_nobody_looks_if_no_lane_could_get_a_worker(workers: int, lanes: int) -> None:
     assert not WaitingSteps(workers, lanes, lanes).is_due(1e9)
@@ -74,7 +121,7 @@ def test_nobody_looks_if_no_lane_could_get_a_worker(workers: int, lanes: int) ->
 
 def test_looking_takes_a_twentieth_of_the_time_at_most() -> None:
     waiting = WaitingSteps(2, 8, 8)
-    waiting.look(seen(WAITS), None, 10.0, 10.1)
+    waiting.look(seen(WAITS), CoreTimes(), None, 10.0, 10.1)
     assert not waiting.is_due(12.0)
     assert waiting.is_due(12.11)
 

@@ -5,16 +5,21 @@ Each test runs a learner and its workers as real processes.
 
 from __future__ import annotations
 
+import itertools
 import json
 import re
 import sys
 import time
 from collections.abc import Mapping
 from pathlib import Path
+from unittest import mock
 
 import psutil
 import pytest
 
+from millrace.launch import worker_pool
+from millrace.learner.callbacks.callback import Callback
+from millrace.protocol.machine.core_times import CoreTimes
 from millrace.protocol.machine.cpu_cores import usable_cores
 from tests.system.stage import preloaded
 from tests.system.stage.preloaded import workers_of
@@ -54,9 +59,23 @@ def served(stage: Stage, env: str, settings: Mapping[str, object], *worker_flags
     return learner, stage.worker(address, "w0", *worker_flags)
 
 
+class IdleCores(Callback):
+    """Makes a learner believe that its machine's cores are idle. The tests that run at the same time may keep them busy."""
+
+    def __init__(self) -> None:
+        ticks = itertools.count(1)
+
+        def core_times() -> CoreTimes:
+            now = next(ticks)
+            return CoreTimes(idle=now, total=now)
+
+        mock.patch.object(worker_pool, "core_times", core_times).start()
+
+
 def test_if_steps_wait_a_worker_for_each_lane_is_suggested(stage: Stage) -> None:
     lanes = 2 * usable_cores()
-    learner = trained(stage, "Slow-v0", {"env-kwargs": "step_s 0.1 k 30", "envs": lanes, "lanes": lanes})
+    settings = {"env-kwargs": "step_s 0.1 k 30", "envs": lanes, "lanes": lanes, "callbacks": f"{__name__}:IdleCores"}
+    learner = trained(stage, "Slow-v0", settings)
     learner.hears(
         rf"env steps wait for \d+% of their time: --workers {lanes}, one for each lane, would be faster", RUN_ENDS_S
     )
