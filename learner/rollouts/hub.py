@@ -176,12 +176,16 @@ class Hub:
             self._server.send(self.coordinator.begin_update())
 
     def keep_opponents(self, parameters: Array, buffers: Array) -> None:
-        """Restore the weights [n, P] and buffers [n, B] of the n snapshots of a resumed run."""
+        """Restore the weights [n, P] and buffers [n, B] of the n snapshots of a resumed run.
+
+        Snapshots that act in an open round are already restored, along with the attributes of env copies.
+        """
+        kept = self.coordinator.weights.kept
         pool = self.coordinator.rollouts.opponents
         versions = [] if pool is None else pool.versions
         for version, of_version, its_buffers in zip(versions, parameters, buffers, strict=True):
-            sent = to_wire_dtype(of_version, self.settings.acting_dtype)
-            self.coordinator.weights.kept[version] = Weights(version, sent, its_buffers)
+            if version not in kept:
+                kept[version] = Weights(version, to_wire_dtype(of_version, self.settings.acting_dtype), its_buffers)
 
     def opponent_policies(self) -> tuple[Floats, Floats] | None:
         """The weights [n, P] and buffers [n, B] of all n snapshots, float32; None if there are none."""

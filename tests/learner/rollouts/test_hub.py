@@ -15,6 +15,7 @@ from millrace.learner.members.worker_processes import WorkerProcesses
 from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan
 from millrace.learner.rollouts.hub import PULSE_S, Hub, HubSettings
 from millrace.learner.rollouts.lag_rule import Rounds
+from millrace.learner.rollouts.opponent_pool import OpponentPool, PoolSettings, PoolState, Snapshot
 from millrace.learner.rollouts.rollout_dealer import RolloutDealer
 from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
 from millrace.protocol.errors import RunError
@@ -81,6 +82,23 @@ def test_weights_that_do_not_fit_are_not_published() -> None:
     with pytest.raises(RunError, match="acting_dtype bfloat16: parameter 1: expected an absolute value below"):
         hub.publish(0, np.array([1, -3.4e38], np.float32), np.zeros(0, np.float32))
     assert (hub.coordinator.version, link.sent) == (-1, [])
+
+
+def test_in_a_resumed_run_weights_that_still_act_keep_their_attributes_though_they_are_a_snapshot() -> None:
+    """In self-play, the weights 0 are always a snapshot. They act in the first open round, and the weights 1 do not."""
+    _, hub, _ = hub_with_a_worker()
+    coordinator = hub.coordinator
+    snapshots = [Snapshot(0, 0, 1200.0), Snapshot(1, 9, 1200.0)]
+    coordinator.rollouts.opponents = OpponentPool(PoolSettings(1, 2, 1, 0.0, 1), PoolState(snapshots=snapshots))
+    parameters, buffers = np.array([[1.0], [2.0]], np.float32), np.zeros((2, 0), np.float32)
+    coordinator.keep(Weights(0, parameters[0], buffers[0], np.array([7], np.uint8)))
+    hub.keep_opponents(parameters, buffers)
+    kept = coordinator.weights.kept
+    assert {version: each.parameters.tolist() for version, each in kept.items()} == {0: [1.0], 1: [2.0]}
+    assert [None if each is None else each.tolist() for each in (kept[0].env_attributes, kept[1].env_attributes)] == [
+        [7],
+        None,
+    ]
 
 
 def test_a_flood_of_an_ended_session_is_one_line(caplog: pytest.LogCaptureFixture) -> None:
