@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 
 from millrace.learner.algorithms import Algorithm
 from millrace.learner.algorithms.algorithm import acting_weights, numbers
@@ -118,11 +118,13 @@ def train(run: OpenRun, workers: int, cores: CrowdedCores) -> str:
 
 @contextmanager
 def _whole_update(algorithm: Algorithm, hub: Hub, arrived: list[AcceptedRollout]) -> Iterator[None]:
-    """A context for an update that uses the rollouts in `arrived`. If the body raises, the update is undone."""
-    algorithm.remember()
-    try:
+    """A context for an update that uses the rollouts in `arrived`. If the body raises, the update is undone.
+
+    The rollouts wait again even if a second Ctrl-C ends `remember` or `roll_back`.
+    """
+    with ExitStack() as undo:
+        undo.callback(hub.not_used, arrived)
+        algorithm.remember()
+        undo.callback(algorithm.roll_back)
         yield
-    except BaseException:
-        algorithm.roll_back()
-        hub.not_used(arrived)
-        raise
+        undo.pop_all()

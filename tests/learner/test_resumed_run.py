@@ -75,6 +75,7 @@ def test_an_update_gets_what_the_coordinator_says_of_each_rollout() -> None:
         weights=lambda: random_weights(policy),
         update=update,
         remember=lambda: None,
+        roll_back=lambda: None,
         is_finite=lambda: True,
     )
     service = MagicMock(gather=lambda show: arrived)
@@ -85,6 +86,38 @@ def test_an_update_gets_what_the_coordinator_says_of_each_rollout() -> None:
     assert batch.lane.tolist() == [0, 1, 2]
     assert batch.fresh.tolist() == [True, False, True]
     assert stack_rollouts([one.rollout for one in arrived]).fresh.tolist() == [False, False, True]
+
+
+@pytest.mark.parametrize(
+    ("raises", "called"),
+    [
+        ("remember", ["remember", "not_used"]),
+        ("update", ["remember", "update", "roll_back", "not_used"]),
+        ("update roll_back", ["remember", "update", "roll_back", "not_used"]),
+    ],
+)
+def test_the_rollouts_of_an_update_that_was_not_made_wait_again_wherever_it_ended(raises: str, called: list[str]) -> None:
+    """A second Ctrl-C raises anywhere. Until `remember` has returned, there is nothing to roll back to."""
+    calls: list[str] = []
+
+    def does(name: str) -> None:
+        calls.append(name)
+        if name in raises.split():
+            raise KeyboardInterrupt(name)
+
+    algorithm = SimpleNamespace(
+        weights=lambda: random_weights(fake_run_spec().policy),
+        remember=lambda: does("remember"),
+        update=lambda batch, pulse: does("update"),
+        roll_back=lambda: does("roll_back"),
+    )
+    arrived = [AcceptedRollout(fake_rollout(1, 0, 0, 0, 0), 0)]
+    service = MagicMock(gather=lambda show: arrived, not_used=lambda taken: does("not_used"))
+    tally = MagicMock(stop_reason=lambda: None)
+    run = MagicMock(parts=SimpleNamespace(algorithm=algorithm, spec=fake_run_spec(), hub=service, tally=tally))
+    with pytest.raises(KeyboardInterrupt, match=raises.split()[-1]):
+        train(run, 1, CrowdedCores(0))
+    assert calls == called
 
 
 def test_tickets_of_the_learner_that_died_are_lost_and_the_ledger_balances(tmp_path: Path) -> None:
