@@ -187,8 +187,10 @@ def settings_of_run(lower: LowerLayers, given: SettingsLayer) -> Config:
     try:
         validate(config)
     except UsageError as error:
-        if lower.file.settings and _is_wrong_alone(lower.algo, [*below, SettingsLayer("", {"env": config.env})], error):
-            raise UsageError(f"{lower.over_run.where or lower.file.where}: {error}") from error
+        env = SettingsLayer("", {"env": config.env})
+        for file, layers in ((lower.file, below[:-1]), (lower.over_run, below)):  # the last layer of `below` is `over_run`
+            if file.settings and _is_wrong_alone(lower.algo, [*layers, env], error):
+                raise UsageError(f"{file.where}: {error}") from error
         raise
     return config
 

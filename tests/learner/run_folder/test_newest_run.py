@@ -86,6 +86,31 @@ def test_the_first_time_it_starts_and_then_it_goes_on_with_the_settings_of_the_r
         read_config("learner", flags)
 
 
+@pytest.mark.parametrize(
+    ("envs", "edited", "wrong"),
+    [
+        (7, None, "{run}/config.toml: 7 envs cannot be shared evenly among 2 lanes"),
+        (7, "steps = 30\n", "{run}/config.toml: 7 envs cannot be shared evenly among 2 lanes"),
+        (6, "lanes = 4\n", "{file}: 6 envs cannot be shared evenly among 4 lanes"),
+    ],
+)
+def test_what_is_wrong_together_is_said_of_the_file_that_makes_it_wrong(
+    tmp_path: Path, envs: int, edited: str | None, wrong: str
+) -> None:
+    """The user may edit both the run's config.toml and the file that is given in addition."""
+    run = a_run(resolve("CartPole-v1", run_dir=str(tmp_path), envs=4, lanes=2), HOURS)
+    settings = run / "config.toml"
+    settings.write_text(settings.read_text().replace("envs = 4\n", f"envs = {envs}\n"))
+    flags = ["CartPole-v1", "--run-dir", str(tmp_path), "--resume", "auto"]
+    file = tmp_path / "my.toml"
+    if edited is not None:
+        file.write_text(edited)
+        flags += ["--config", str(file)]
+    with pytest.raises(UsageError) as caught:
+        read_config("train", flags)
+    assert str(caught.value).startswith(wrong.format(run=run, file=file))
+
+
 def test_the_file_of_the_settings_may_be_a_pipe(tmp_path: Path) -> None:
     a_run(resolve("CartPole-v1", run_dir=str(tmp_path)), HOURS)
     reading, writing = os.pipe()
