@@ -1,7 +1,8 @@
 """The settings of `--resume auto`, which continues the newest run with these settings, or starts a new run.
 
-Rule: settings from the file, and from flags or keyword arguments, override those in the run's config.toml. An edited file
-therefore takes effect, and a change that a resumed run can't make is refused wherever it comes from. The file is read once,
+Rule: settings from the file, and from flags or keyword arguments, override those in the run's config.toml. An edited value
+therefore takes effect, and a change that a resumed run can't make is refused wherever it comes from. A setting that is no
+longer given keeps the run's value, because config.toml doesn't say where its values came from. The file is read once,
 because it may be a pipe.
 """
 
