@@ -43,9 +43,9 @@ def as_text(word: str) -> str:
 
 
 def written(value: object) -> str:
-    """The word that `read_word` reads as this value."""
+    """The word that `read_word` reads as this value. A command line doesn't take the word for a flag."""
     try:
-        if isinstance(value, str) and read_word(value) == value:
+        if isinstance(value, str) and not value.startswith("-") and read_word(value) == value:
             return value
     except UsageError:
         pass

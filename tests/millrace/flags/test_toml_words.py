@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from millrace.flags.fields import fields_of
+from millrace.flags.parse import typed_flags
 from millrace.flags.toml_words import as_text, read_word, written
 from millrace.flags.values import read_words
 from millrace.learner.config.config import Config
@@ -88,6 +89,12 @@ def test_so_it_is_in_a_file(value: str, tmp_path: Any) -> None:
 def test_what_is_written_is_read_again(value: object) -> None:
     read = read_word(written(value))
     assert (read, type(read)) == (value, type(value))
+
+
+@pytest.mark.parametrize("value", ["-x", "--help", "--debug", "--", "-", "-1", "-inf", -1, -0.5, -math.inf])
+def test_what_is_written_is_no_flag_even_if_it_begins_with_a_dash(value: object) -> None:
+    (_, flag) = typed_flags(["--env-kwargs", "a", written(value)])
+    assert read_words(FIELD, flag.words) == {"a": value}
 
 
 def test_a_text_and_the_value_that_it_looks_like_name_two_environments() -> None:

@@ -180,6 +180,7 @@ def test_each_setting_has_a_reason_and_the_command_is_one_that_train_takes(wait_
         "render_mode": "rgb array",
         "number": "8",
         "port": "{5000 + slot}",
+        "option": "-x",
         "wind": False,
         "g": 9.8,
     }
