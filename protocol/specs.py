@@ -72,6 +72,11 @@ class ActionPart(msgspec.Struct, frozen=True):
     """dtype that the environment expects"""
 
 
+def no_bound(dtype: str) -> float:
+    """The size from which a bound of floats means "no bound"."""
+    return min(float(np.finfo(kind).max) for kind in (dtype, "float32"))
+
+
 class ActionSpec(msgspec.Struct, frozen=True):
     """The action space of the policy."""
 
@@ -126,8 +131,8 @@ class ActionSpec(msgspec.Struct, frozen=True):
         """The first pair of bounds (box) with one so large that it means "no bound"; None if there is no such pair."""
         if self.kind != "box":
             return None
-        largest = min(float(np.finfo(kind).max) for kind in (self.dtype, "float32"))
-        return next(((low, high) for low, high in zip(self.low, self.high, strict=True) if max(-low, high) >= largest), None)
+        none = no_bound(self.dtype)
+        return next(((low, high) for low, high in zip(self.low, self.high, strict=True) if max(-low, high) >= none), None)
 
 
 class NamedShape(msgspec.Struct, frozen=True, array_like=True):

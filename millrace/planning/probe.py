@@ -25,22 +25,17 @@ from millrace.launch.vector import call_timeouts_of, start_vector_env
 from millrace.learner.vector_env.env import ZmqVectorEnv
 from millrace.learner.vector_env.settings import VectorEnvSettings
 from millrace.planning.measurements import WORKER_BYTES, ActionKind, Machine, Measurements, StepCosts
+from millrace.planning.random_actions import SEED, RandomActions
 from millrace.planning.stopwatch import CopyTimes, read_notes
-from millrace.protocol.arrays import Array, Bools
+from millrace.protocol.arrays import Array
 from millrace.protocol.bounds import one_line
 from millrace.protocol.env_spec import EnvLike, EnvSpec, Scalar
-from millrace.protocol.envs.action_masks import has_mask
 from millrace.protocol.envs.spaces import action_spec, observation_leaves
 from millrace.protocol.envs.wrappers import WrapperLike
 from millrace.protocol.errors import MillraceError, RunError, UsageError, first_line
-from millrace.protocol.policy.masks import MASK
 from millrace.protocol.specs import ActionSpec
-from millrace.workers.copies.env_errors import CopyFailed
-from millrace.workers.copies.mask_reader import MaskReader
 
 LEAST_STEPS = 8  # number of steps that each copy takes, even if they last longer than planned
-SCRIPT = 1009  # number of random actions, which all copies take in the same order, in a loop
-SEED = 1
 WARM_UP = 2  # this many steps at the beginning of a copy aren't counted
 OF_ALONE = 0.15  # share of the time in which one copy steps alone
 OF_SIDE_BY_SIDE = 0.9  # share of the time after which no more copies are started
@@ -215,61 +210,28 @@ def _session(env: ProbedEnv, workers: int, seconds: float, give_up_at_s: float, 
 def _step(envs: ZmqVectorEnv, traces: list[list[int]], end_at_s: float, give_up_at_s: float) -> bool:
     """Step all copies until `end_at_s`; a copy's next step begins as soon as its previous one has ended.
 
-    Actions that a mask forbids are never taken. Returns whether the masks are in the infos.
+    Returns whether the masks are in the infos.
     """
     agents = max(1, len(envs.seats))
     space = envs.single_action_space
-    space.seed(SEED)
-    script = [space.sample() for _ in range(SCRIPT)]
-    masks = MaskReader(envs.single_observation_space, space)
-    spec = action_spec(space)
-    starts = np.cumsum(spec.sizes)[:-1].tolist()  # of the entries of an action, except for the first one
-    in_observation = has_mask(envs.single_observation_space, space)
-    masks_in_info = False
+    random_actions = RandomActions(envs.single_observation_space, space)
     envs.reset_async(seed=[SEED] * len(traces))
     while envs.outstanding:
         observation, reward, terminated, truncated, infos = envs.recv(timeout=max(1.0, give_up_at_s - time.monotonic()))
         ready = infos["env_id"].tolist()
-        over = np.ones(len(ready) * agents, bool)  # so that no row needs a mask
-        try:
-            allowed = masks.read_all(observation, infos, terminated=~over, truncated=over)
-            masks_in_info |= bool(spec.choices) and not in_observation and MASK in infos
-        except CopyFailed:  # what the environment calls a mask isn't one
-            allowed = np.broadcast_to(masks.everything, (len(over), spec.choices))
-        actions = []
+        numbers = []
         for i, copy in enumerate(ready):
             rows = slice(i * agents, (i + 1) * agents)
             shown = [array[rows] for array in _arrays(observation)]
             traces[copy].append(_digest([*shown, reward[rows], terminated[rows], truncated[rows]]))
-            for seat, mask in enumerate(allowed[rows]):
-                action = script[(len(traces[copy]) * agents + seat) % SCRIPT]
-                actions.append(action if mask.all() else _allowed(space, action, iter(np.split(mask, starts))))
+            numbers += [len(traces[copy]) * agents + seat for seat in range(agents)]
+        actions = random_actions.choose(numbers, observation, infos)
         now_s = time.monotonic()
         if now_s < give_up_at_s and (now_s < end_at_s or min(map(len, traces)) <= LEAST_STEPS):
             into: Any = create_empty_array(space, len(actions))
             batch = concatenate(space, actions, into)
             envs.send(batch, ready)
-    return masks_in_info
-
-
-def _allowed(space: gymnasium.Space[Any], action: Any, masks: Iterator[Bools]) -> Any:
-    """The action with an allowed choice in each entry. `masks` are the masks of the entries, in the order of the space."""
-    match space:
-        case spaces.Dict():
-            return {key: _allowed(inner, action[key], masks) for key, inner in space.spaces.items()}
-        case spaces.Tuple():
-            return tuple(_allowed(inner, part, masks) for inner, part in zip(space.spaces, action, strict=True))
-        case spaces.Discrete() | spaces.MultiDiscrete():
-            chosen = [_allowed_choice(choice, next(masks)) for choice in np.ravel(action - space.start).tolist()]
-            return space.start + np.reshape(chosen, space.shape or ()).astype(space.dtype)
-        case _:
-            return action
-
-
-def _allowed_choice(choice: int, mask: Bools) -> int:
-    """An allowed choice that depends only on the given one and on the mask [choices]."""
-    allowed = np.flatnonzero(mask)
-    return int(allowed[choice % len(allowed)])
+    return random_actions.masks_in_info
 
 
 def _arrays(observation: Any) -> Iterator[Array]:

@@ -8,6 +8,7 @@ the CPU time in seconds that the worker has used since the previous step.
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from typing import Any
 
 import gymnasium
@@ -105,25 +106,30 @@ def shown(space: gymnasium.Space[Any]) -> Any:
 
     Its floats are as close to 0 as a typical environment's, because bounds may be too large to be informative.
     """
-    observation = _with_small_floats(space).sample()
+    observation = with_float_boxes(space, _with_small_floats).sample()
     if isinstance(space, spaces.Dict) and MASK in space.spaces:
         observation[MASK] = _ones(space.spaces[MASK])
     return observation
 
 
-def _with_small_floats(space: gymnasium.Space[Any]) -> gymnasium.Space[Any]:
-    """The part of the space whose floats differ by at most 1 from 0, or from the bound that is nearest to 0."""
+def with_float_boxes(space: gymnasium.Space[Any], change: Callable[[spaces.Box], spaces.Box]) -> gymnasium.Space[Any]:
+    """The space with each Box of floats changed."""
     match space:
         case spaces.Dict():
-            return spaces.Dict([(key, _with_small_floats(inner)) for key, inner in space.spaces.items()])
+            return spaces.Dict([(key, with_float_boxes(inner, change)) for key, inner in space.spaces.items()])
         case spaces.Tuple():
-            return spaces.Tuple(map(_with_small_floats, space.spaces))
+            return spaces.Tuple([with_float_boxes(inner, change) for inner in space.spaces])
         case spaces.Box() if space.dtype.kind == "f":
-            nearest = np.clip(np.zeros_like(space.low), space.low, space.high)
-            kind: Any = space.dtype.type
-            return spaces.Box(np.maximum(space.low, nearest - 1), np.minimum(space.high, nearest + 1), dtype=kind)
+            return change(space)
         case _:
             return space
+
+
+def _with_small_floats(box: spaces.Box) -> spaces.Box:
+    """The part of the space whose floats differ by at most 1 from 0, or from the bound that is nearest to 0."""
+    nearest = np.clip(np.zeros_like(box.low), box.low, box.high)
+    kind: Any = box.dtype.type
+    return spaces.Box(np.maximum(box.low, nearest - 1), np.minimum(box.high, nearest + 1), dtype=kind)
 
 
 def _ones(mask: gymnasium.Space[Any]) -> Any:

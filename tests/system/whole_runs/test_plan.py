@@ -165,25 +165,34 @@ def test_an_environment_with_a_tuple_of_masks_gets_a_plan_that_trains(tmp_path: 
 
 
 class Boundless(gymnasium.Env[Any, Any]):
-    """Waits for 20 ms in each step. Its bounds are float32's largest numbers, which say nothing."""
+    """Waits for 20 ms in each step. Its bounds are the largest numbers of their dtype, which say nothing.
+
+    `actions`: `discrete`, or the dtype of continuous actions. A large action is an error.
+    """
 
     observation_space = gymnasium.spaces.Box(-LARGEST, LARGEST, (4,), np.float32)
 
-    def __init__(self, continuous: bool) -> None:
-        box = gymnasium.spaces.Box(-LARGEST, LARGEST, (1,), np.float32)
-        self.action_space: gymnasium.Space[Any] = box if continuous else gymnasium.spaces.Discrete(2)
+    def __init__(self, actions: str) -> None:
+        if actions == "discrete":
+            self.action_space: gymnasium.Space[Any] = gymnasium.spaces.Discrete(2)
+        else:
+            largest = np.finfo(actions).max
+            self.action_space = gymnasium.spaces.Box(-largest, largest, (1,), np.dtype(actions).type)
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
         super().reset(seed=seed)
         return np.zeros(4, np.float32), {}
 
     def step(self, action: Any) -> Any:
+        if np.abs(action).max() > 1e6:
+            raise ValueError(f"the motor breaks at {action}")
         time.sleep(0.02)
         return np.zeros(4, np.float32), 0.0, False, False, {}
 
 
-@pytest.mark.parametrize(("continuous", "algo"), [(False, "rainbow"), (True, "ppo")])
-def test_bounds_that_say_nothing_fit_a_plan(continuous: bool, algo: str) -> None:
-    plan = millrace.plan(Boundless, env_kwargs={"continuous": continuous}, max_env_copies=2, seconds=BRIEF_S)
+@pytest.mark.parametrize(("actions", "algo"), [("discrete", "rainbow"), ("float32", "ppo"), ("float64", "ppo")])
+def test_bounds_that_say_nothing_fit_a_plan(actions: str, algo: str) -> None:
+    plan = millrace.plan(Boundless, env_kwargs={"actions": actions}, max_env_copies=2, seconds=BRIEF_S)
     assert plan.settings["algo"] == algo, "those for continuous actions need bounds"
     assert plan.steps_per_s > 0
+    assert not plan.measured.findings
