@@ -70,7 +70,9 @@ class Measurements(msgspec.Struct, frozen=True, kw_only=True):
     goals: bool = False
     """whether its observations contain goals, as hindsight replay needs them"""
     masks_in_info: bool = False
-    """whether its infos contain masks of the allowed actions"""
+    """whether its infos contain masks of the allowed actions, as a run needs them"""
+    wrong_masks: str = ""
+    """why a run could not use its masks, and when that was found; empty if it could, or if there are none"""
     observation_bytes: int = 0
     side_by_side: tuple[StepCosts, ...]
     """costs of a step for each number of workers that was tried, in ascending order; never empty"""

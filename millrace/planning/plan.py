@@ -209,6 +209,8 @@ def _advice(sizes: Sizes, situation: Situation, rate: float) -> list[str]:
             "it isn't deterministic: the same seed and actions gave other results; so if a worker is lost, new episodes "
             "begin, and two runs with the same seed differ"
         )
+    if measured.wrong_masks:
+        lines.append(f"its action masks aren't as a run needs them: {measured.wrong_masks}")
     ahead = msgspec.structs.replace(situation, resets_ahead=True)
     faster = steps_per_s(sizes, ahead, generator(1, Purpose.ROUNDS))
     if faster > RESETS_COUNT * rate:

@@ -25,7 +25,7 @@ from millrace.launch.vector import call_timeouts_of, start_vector_env
 from millrace.learner.vector_env.env import ZmqVectorEnv
 from millrace.learner.vector_env.settings import VectorEnvSettings
 from millrace.planning.measurements import WORKER_BYTES, ActionKind, Machine, Measurements, StepCosts
-from millrace.planning.random_actions import SEED, RandomActions
+from millrace.planning.random_actions import SEED, RandomActions, SeenMasks
 from millrace.planning.stopwatch import CopyTimes, read_notes
 from millrace.protocol.arrays import Array
 from millrace.protocol.bounds import one_line
@@ -142,7 +142,7 @@ class _SteppedCopies(NamedTuple):
     start_s: float
     wrong: str
     """what went wrong, as one line; empty if nothing did"""
-    masks_in_info: bool
+    masks: SeenMasks
     observation_space: gymnasium.Space[Any]
     action_space: gymnasium.Space[Any]
     seats: tuple[str, ...]
@@ -178,7 +178,7 @@ def _session(env: ProbedEnv, workers: int, seconds: float, give_up_at_s: float, 
         traces: list[list[int]] = [[] for _ in range(copies)]
         wrong = ""
         known: tuple[Any, ...] = (None, None, (), None)
-        masks_in_info = False
+        masks = SeenMasks(False, "")
         start_s = 0.0
         try:
             timeout_s = max(1.0, give_up_at_s - began_s)
@@ -196,7 +196,11 @@ def _session(env: ProbedEnv, workers: int, seconds: float, give_up_at_s: float, 
                 start_s = time.monotonic() - began_s
                 limit = None if envs.spec is None else envs.spec.max_episode_steps
                 known = (envs.single_observation_space, envs.single_action_space, envs.seats, limit)
-                masks_in_info = _step(envs, traces, time.monotonic() + seconds, give_up_at_s)
+                random_actions = RandomActions(*known[:2], max(1, len(envs.seats)))
+                try:
+                    _step(envs, random_actions, traces, time.monotonic() + seconds, give_up_at_s)
+                finally:
+                    masks = random_actions.masks
         except UsageError:
             raise
         except MillraceError as error:
@@ -204,34 +208,31 @@ def _session(env: ProbedEnv, workers: int, seconds: float, give_up_at_s: float, 
                 raise
             wrong = one_line(first_line(error, type(error).__name__))
         times = [each for each in read_notes(notes) if len(each.resets)]
-        return _SteppedCopies(times, traces, start_s, wrong, masks_in_info, *known)
+        return _SteppedCopies(times, traces, start_s, wrong, masks, *known)
 
 
-def _step(envs: ZmqVectorEnv, traces: list[list[int]], end_at_s: float, give_up_at_s: float) -> bool:
-    """Step all copies until `end_at_s`; a copy's next step begins as soon as its previous one has ended.
-
-    Returns whether the masks are in the infos.
-    """
+def _step(
+    envs: ZmqVectorEnv, random_actions: RandomActions, traces: list[list[int]], end_at_s: float, give_up_at_s: float
+) -> None:
+    """Step all copies until `end_at_s`; a copy's next step begins as soon as its previous one has ended."""
     agents = max(1, len(envs.seats))
     space = envs.single_action_space
-    random_actions = RandomActions(envs.single_observation_space, space)
     envs.reset_async(seed=[SEED] * len(traces))
     while envs.outstanding:
         observation, reward, terminated, truncated, infos = envs.recv(timeout=max(1.0, give_up_at_s - time.monotonic()))
         ready = infos["env_id"].tolist()
-        numbers = []
         for i, copy in enumerate(ready):
             rows = slice(i * agents, (i + 1) * agents)
             shown = [array[rows] for array in _arrays(observation)]
             traces[copy].append(_digest([*shown, reward[rows], terminated[rows], truncated[rows]]))
-            numbers += [len(traces[copy]) * agents + seat for seat in range(agents)]
-        actions = random_actions.choose(numbers, observation, infos)
+        if envs.seats:  # only the action of an agent that acts is taken
+            terminated = ~infos["acts"]
+        actions = random_actions.choose([len(traces[copy]) for copy in ready], observation, infos, terminated, truncated)
         now_s = time.monotonic()
         if now_s < give_up_at_s and (now_s < end_at_s or min(map(len, traces)) <= LEAST_STEPS):
             into: Any = create_empty_array(space, len(actions))
             batch = concatenate(space, actions, into)
             envs.send(batch, ready)
-    return random_actions.masks_in_info
 
 
 def _arrays(observation: Any) -> Iterator[Array]:
@@ -274,7 +275,6 @@ def _measured_alone(env: ProbedEnv, session: _SteppedCopies) -> Measurements:
         agents=max(1, len(session.seats)),
         action=_kind(action_spec(session.action_space)),
         images=any(leaf.is_image for leaf in leaves),
-        masks_in_info=session.masks_in_info,
         goals={"achieved_goal", "desired_goal"} <= {*keys},
         observation_bytes=sum(math.prod(leaf.shape) * np.dtype(leaf.dtype).itemsize for leaf in leaves),
         side_by_side=(_costs(1, session.times),),
@@ -293,8 +293,11 @@ def _with_all(measured: Measurements, sessions: Sequence[_SteppedCopies]) -> Mea
     resets = np.concatenate(later or [each.resets for each in times])
     steps = sum(int(np.count_nonzero(each.steps[:, 0] < each.resets[-1, 0])) for each in times)  # steps of complete episodes
     share = max(each.others_cpu_share for each in times)
+    wrong_masks = next((each.masks.wrong for each in sessions if each.masks.wrong), "")
     return msgspec.structs.replace(
         measured,
+        masks_in_info=any(each.masks.in_info for each in sessions) and not wrong_masks,
+        wrong_masks=wrong_masks,
         reset_s=float((resets[:, 1] - resets[:, 3]).mean()),
         reset_cpu_s=float((resets[:, 2] + share * resets[:, 1]).mean()),
         resets=len(resets),

@@ -164,6 +164,29 @@ def test_an_environment_with_a_tuple_of_masks_gets_a_plan_that_trains(tmp_path: 
     millrace.train(plan.env, progress=False, **plan.settings, **settings)
 
 
+class MasksOfSteps(gymnasium.Env[Any, Any]):
+    """Reports masks in the infos of steps, but not of resets."""
+
+    observation_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
+    action_space = gymnasium.spaces.Discrete(3)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action: Any) -> Any:
+        return np.zeros(1, np.float32), 0.0, False, False, {"action_mask": np.ones(3, np.int8)}
+
+
+def test_masks_that_a_run_would_refuse_are_not_recommended_and_the_plan_says_why() -> None:
+    plan = millrace.plan(MasksOfSteps, seconds=BRIEF_S)
+    assert "action_masks" not in plan.settings
+    (line,) = (line for line in plan.advice if "masks" in line)
+    assert line.startswith(
+        "its action masks aren't as a run needs them: after a copy's first reset, action_mask: expected 3 "
+    )
+
+
 class Boundless(gymnasium.Env[Any, Any]):
     """Waits for 20 ms in each step. Its bounds are the largest numbers of their dtype, which say nothing.
 
