@@ -78,6 +78,8 @@ class Measurements(msgspec.Struct, frozen=True, kw_only=True):
     """costs of a step for each number of workers that was tried, in ascending order; never empty"""
     copies_worked: int = 1
     """the largest number of copies that were stepped side by side without a problem"""
+    copies_failed: int = 0
+    """the smallest number of copies, more than `copies_worked`, that had a problem side by side; 0 if there is none"""
     reset_s: float = 0.0
     """mean wall time of a reset"""
     reset_cpu_s: float = 0.0
@@ -121,7 +123,7 @@ class Machine(msgspec.Struct, frozen=True, kw_only=True):
     free_bytes: int | None = None
     """free memory; None if the system doesn't report it"""
     most_copies: int = 0
-    """maximum number of env copies that may run at the same time, for example because of licences; 0: no limit"""
+    """maximum number of env copies that may train at the same time, for example because of licences; 0: no limit"""
     load: float = 0.0
     """load average over the preceding minute: the number of other processes that used a core or waited for one"""
 

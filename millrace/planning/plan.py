@@ -12,6 +12,7 @@ from millrace.arguments import checked
 from millrace.learner.config.config import Config
 from millrace.learner.config.hyperparameters import OffPolicyConfig
 from millrace.learner.config.layers import resolve
+from millrace.planning.allowed_copies import AllowedCopies
 from millrace.planning.expected_rate import Situation, Sizes, steps_per_s
 from millrace.planning.in_words import counted, number_in_words, time_in_words
 from millrace.planning.measurements import Machine
@@ -40,7 +41,6 @@ from millrace.workers.machine_slots import copies_per_machine
 SECONDS = 30.0
 OF_PROBE = 0.7  # share of the time in which the environment is measured; millrace's own part is measured in the rest
 LEAST_S = 5.0
-EVALUATION_COPIES = Config().eval_copies
 MACHINES = (1, 2, 10)
 BUSY = 0.5  # if the load average per core is above this, the machine counts as busy
 RESETS_COUNT = 1.1  # resets in the background are advised if they make a run faster by at least this factor
@@ -89,21 +89,23 @@ def plan_of(env: ProbedEnv, *, max_env_copies: int, seconds: float, say: Callabl
         raise UsageError(f"plan: seconds: expected at least {LEAST_S:g}, got {seconds:g}")
     if max_env_copies < 0:
         raise UsageError(f"plan: max_env_copies: expected at least 0, got {max_env_copies}")
-    allowed = min([number for number in (max_env_copies, copies_per_machine()) if number], default=0)
-    if allowed == 1:
+    allowed = AllowedCopies.of(max_env_copies, copies_per_machine())
+    if allowed.here == 1:
         raise UsageError("plan: expected at least 2 env copies that may run, of which one plays evaluations, got 1")
     machine = Machine(
         cores=usable_cores(),
         free_bytes=available_bytes(),
-        most_copies=allowed - _evaluation_copies(allowed) if allowed else 0,
+        most_copies=allowed.training,
         load=os.getloadavg()[0],
     )
     say(f"stepping {env.name}, with random actions")
     probed = probe(env, machine, OF_PROBE * seconds)
     measured = probed.measured
+    allowed = allowed.after(measured)
+    machine = msgspec.structs.replace(machine, most_copies=allowed.training)
     algorithm = choose_algorithm(measured, machine)
     config = resolve(env.name, algo=algorithm.value)
-    others = _limits(max_env_copies, allowed)
+    others = allowed.settings
     if measured.masks_in_info:
         others.append(ChosenSetting("action_masks", "info", "the infos contain masks of the allowed actions"))
     if isinstance(config.algorithm, OffPolicyConfig):
@@ -113,22 +115,6 @@ def plan_of(env: ProbedEnv, *, max_env_copies: int, seconds: float, say: Callabl
     stood_for = StoodFor(probed.observation_space, probed.action_space, probed.seats, measured.alone.wait_s)
     situation = Situation(measured=measured, overheads=overheads(config, stood_for), machine=machine)
     return _decided(env, config, situation, [algorithm], others)
-
-
-def _limits(max_env_copies: int, allowed: int) -> list[ChosenSetting]:
-    """The settings that limit a run to the allowed number of env copies."""
-    found = []
-    if max_env_copies:
-        found.append(ChosenSetting("max_env_copies", max_env_copies, "with those of evaluations"))
-    if allowed and (evaluating := _evaluation_copies(allowed)) < EVALUATION_COPIES:
-        why = f"so that {allowed - evaluating} of {counted(allowed, 'copy', 'copies')} train"
-        found.append(ChosenSetting("eval_copies", evaluating, why))
-    return found
-
-
-def _evaluation_copies(allowed: int) -> int:
-    """How many of the allowed copies play evaluations: the default number, or 1 if that is more than a third of them."""
-    return EVALUATION_COPIES if not allowed or allowed >= 3 * EVALUATION_COPIES else 1
 
 
 def _decided(
@@ -199,6 +185,11 @@ def _advice(sizes: Sizes, situation: Situation, rate: float) -> list[str]:
     measured = situation.measured
     machine = situation.machine
     lines = list(measured.findings)
+    if measured.copies_failed and measured.copies_worked == 1:
+        lines.append(
+            f"evaluations need a second copy, but {measured.copies_failed} did not work side by side: the evaluation of "
+            "this command fails unless a second copy works"
+        )
     if machine.load > BUSY * machine.cores:
         lines.append(
             f"other programs use the {counted(machine.cores, 'core')} (load average {number_in_words(machine.load)}): "

@@ -293,6 +293,7 @@ def _with_all(measured: Measurements, sessions: Sequence[_SteppedCopies]) -> Mea
     resets = np.concatenate(later or [each.resets for each in times])
     steps = sum(int(np.count_nonzero(each.steps[:, 0] < each.resets[-1, 0])) for each in times)  # steps of complete episodes
     share = max(each.others_cpu_share for each in times)
+    worked = max((len(each.traces) for each in sessions if each.is_whole), default=1)
     wrong_masks = next((each.masks.wrong for each in sessions if each.masks.wrong), "")
     return msgspec.structs.replace(
         measured,
@@ -301,7 +302,8 @@ def _with_all(measured: Measurements, sessions: Sequence[_SteppedCopies]) -> Mea
         reset_s=float((resets[:, 1] - resets[:, 3]).mean()),
         reset_cpu_s=float((resets[:, 2] + share * resets[:, 1]).mean()),
         resets=len(resets),
-        copies_worked=max((len(each.traces) for each in sessions if each.is_whole), default=1),
+        copies_worked=worked,
+        copies_failed=min((len(each.traces) for each in sessions if each.wrong and len(each.traces) > worked), default=0),
         episode_steps=steps / sum(map(len, later)) if later else sessions[0].time_limit,
         deterministic=_deterministic([trace for session in sessions for trace in session.traces]),
         findings=tuple(session.finding for session in sessions if session.wrong),

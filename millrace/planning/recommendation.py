@@ -27,7 +27,6 @@ REPLAY_SIZES = (1_000_000, 500_000, 200_000, 100_000, 50_000, 20_000, 10_000)
 OF_MEMORY = 0.8  # share of the free memory that a run may use
 OF_MEMORY_FOR_REPLAY = 0.4  # share of the free memory that the replay buffer may use
 LAGS = (0, 1, 2)
-MORE_FAILED = "more copies did not work side by side"
 NEEDED_STEPS = {"xqc": 100_000, "rainbow": 100_000, "sac": 300_000, "ppo": 1_000_000}
 """About how many env steps tasks such as MuJoCo's took with each algorithm. Other tasks may take more or fewer."""
 
@@ -77,10 +76,8 @@ def copies_at_once(measured: Measurements, machine: Machine, acting_bytes: int =
         if measured.alone.computes
         else Limit(tried.workers, made if tried.workers > 1 else "no more could be tried side by side")
     ]
-    if measured.findings:
-        limits.insert(0, Limit(measured.copies_worked, MORE_FAILED))
     if machine.most_copies:
-        limits.append(Limit(machine.most_copies, f"at most {counted(machine.most_copies, 'copy', 'copies')} may run here"))
+        limits.append(Limit(machine.most_copies, _at_most(machine)))
     if machine.free_bytes is not None:
         size = max(measured.worker_bytes, WORKER_BYTES) + acting_bytes
         fit = max(1, int((OF_MEMORY * machine.free_bytes - LEARNER_BYTES) / size))
@@ -88,6 +85,10 @@ def copies_at_once(measured: Measurements, machine: Machine, acting_bytes: int =
             Limit(fit, f"a worker with a copy takes {size / 2**20:,.0f} MB, and no more of them fit into the memory")
         )
     return min(limits, key=lambda limit: limit.number)
+
+
+def _at_most(machine: Machine) -> str:
+    return f"at most {counted(machine.most_copies, 'copy', 'copies')} may train here"
 
 
 # ------------------------------------------------------------------------------------------------------------ the algorithm
@@ -159,8 +160,6 @@ def _numbers_of_envs(measured: Measurements, machine: Machine, learning: Learnin
     if not measured.alone.computes:
         return sorted({min(learning.envs * 2**n, at_once) for n in range(at_once.bit_length() + 1)})
     most = machine.most_copies or max(MOST_ENVS, learning.envs)
-    if measured.findings:
-        most = min(most, measured.copies_worked)
     if machine.free_bytes is not None:
         of_copy = max(1, measured.worker_bytes - WORKER_BYTES)
         of_workers = LEARNER_BYTES + at_once * (WORKER_BYTES + learning.acting_bytes)
@@ -218,8 +217,8 @@ def _why_workers(sizes: Sizes, measured: Measurements, machine: Machine) -> str:
 def _why_envs(sizes: Sizes, learning: Learning, situation: Situation) -> str:
     measured = situation.measured
     at_once = copies_at_once(measured, situation.machine, situation.overheads.acting_bytes)
-    if measured.findings and sizes.envs == measured.copies_worked:
-        return MORE_FAILED
+    if sizes.envs == situation.machine.most_copies:
+        return _at_most(situation.machine)
     if not measured.alone.computes:
         return at_once.why if sizes.envs == at_once.number else "more would hardly be faster, because of the updates"
     if sizes.envs > max(learning.envs, situation.machine.cores):

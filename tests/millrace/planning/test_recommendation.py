@@ -10,6 +10,9 @@ import msgspec
 import pytest
 
 from millrace.learner.config.command_line import read_config
+from millrace.learner.config.layers import resolve
+from millrace.learner.config.validation import check_copies
+from millrace.planning.allowed_copies import AllowedCopies
 from millrace.planning.measurements import ActionKind, Machine, Overheads
 from millrace.planning.recommendation import (
     ChosenSetting,
@@ -78,17 +81,41 @@ def test_licences_bound_copies(wait_s: float, cpu_s: float, licences: int) -> No
 
 @pytest.mark.parametrize("learning", [PPO, REPLAY])
 @pytest.mark.parametrize(("wait_s", "cpu_s"), [(0.01, 1e-4), (0.0, 0.003), (0.0, 1e-5)])
-@pytest.mark.parametrize("worked", [1, 3])
-def test_after_a_failure_no_more_copies_are_chosen_than_have_worked(
+@pytest.mark.parametrize("worked", [2, 3, 16])
+def test_after_a_failure_a_run_needs_no_more_copies_than_have_worked_even_when_it_evaluates(
     worked: int, wait_s: float, cpu_s: float, learning: Learning
 ) -> None:
-    found = measured(wait_s=wait_s, cpu_s=cpu_s, tried=worked, copies_worked=worked, findings=("2 copies: no licence",))
-    where = situation(found, machine=Machine(cores=16, free_bytes=64 << 30))
+    found = measured(wait_s=wait_s, cpu_s=cpu_s, tried=worked, copies_worked=worked, copies_failed=worked + 1)
+    allowed = AllowedCopies.of(0, 0).after(found)
+    where = situation(found, machine=Machine(cores=32, free_bytes=64 << 30, most_copies=allowed.training))
     sizes = chosen(where, learning)
-    assert sizes.envs <= worked
-    assert sizes.workers <= sizes.lanes <= sizes.envs
-    why = {each.name: each.why for each in reasons(sizes, learning, where, lambda sizes: rate(sizes, where))}
-    assert why["envs"] == "more copies did not work side by side" or sizes.envs < worked
+    settings = (*reasons(sizes, learning, where, lambda sizes: rate(sizes, where)), *allowed.settings)
+    values: dict[str, Any] = {each.name: each.value for each in settings}
+    config = resolve("CartPole-v1", algo="ppo", **values)
+    check_copies(config, "worked", worked)
+    assert config.max_env_copies == worked
+    assert config.workers is not None
+    assert config.workers <= config.lanes <= config.envs
+    why = {each.name: each.why for each in settings}
+    assert why["max_env_copies"].startswith("more copies did not work side by side")
+    assert "may train here" in why["envs"] or config.envs < allowed.training
+
+
+def test_if_only_one_copy_has_worked_it_trains_and_evaluations_have_as_few_as_possible() -> None:
+    allowed = AllowedCopies.of(0, 0).after(measured(copies_worked=1, copies_failed=2))
+    assert allowed.training == 1
+    assert [(each.name, each.value) for each in allowed.settings] == [("eval_copies", 1)]
+
+
+def test_a_failure_limits_copies_only_if_there_were_more_of_them_than_worked_and_are_allowed() -> None:
+    one_failed = measured(copies_worked=16, findings=("one copy, after 400 calls: it raised",))
+    assert AllowedCopies.of(0, 0).after(one_failed) == AllowedCopies.of(0, 0)
+    assert AllowedCopies.of(0, 0).training == 0
+    assert AllowedCopies.of(0, 0).settings == []
+    failed = measured(copies_worked=4, copies_failed=16)
+    assert AllowedCopies.of(3, 0).after(failed) == AllowedCopies.of(3, 0)
+    assert AllowedCopies.of(8, 6).after(failed).settings[0].value == 4
+    assert AllowedCopies.of(8, 6).after(failed).training == 3
 
 
 def test_if_the_learner_is_the_limit_no_more_copies_are_chosen_than_it_can_use() -> None:
@@ -162,7 +189,7 @@ def test_a_replay_buffer_that_takes_too_much_memory_is_smaller() -> None:
 def test_what_sets_the_number_of_copies_is_said() -> None:
     assert "side by side" in copies_at_once(measured(wait_s=0.01), MACHINE).why
     assert "2 cores" in copies_at_once(measured(cpu_s=0.01), MACHINE).why
-    assert "may run" in copies_at_once(measured(wait_s=0.01), Machine(cores=2, most_copies=4)).why
+    assert "may train" in copies_at_once(measured(wait_s=0.01), Machine(cores=2, most_copies=4)).why
     assert "memory" in copies_at_once(measured(wait_s=0.01), Machine(cores=2, free_bytes=1 << 30)).why
 
 

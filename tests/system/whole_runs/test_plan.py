@@ -98,7 +98,15 @@ def test_a_crash_is_a_line_and_not_the_end(name: str, after: int) -> None:
     assert all("\n" not in line for line in plan.measured.findings)
     assert plan.measured.findings[0] in plan.advice
     assert plan.measured.alone.steps >= after // 2
-    assert plan.settings["envs"] <= plan.measured.copies_worked
+    if plan.measured.copies_failed:
+        assert plan.settings["envs"] <= plan.measured.copies_worked
+
+
+def test_a_single_copy_that_fails_does_not_count_as_a_failure_of_more_copies(tmp_path: Path) -> None:
+    env = ProbedEnv(f"{TOY}:Raises", {"after": 20, "once": str(tmp_path / "failed")}, ())
+    measured = probe(env, Machine(cores=2), seconds=BRIEF_S).measured
+    assert [line.partition(",")[0] for line in measured.findings] == ["one copy"]
+    assert measured.copies_failed == 0
 
 
 class Licensed(gymnasium.Env[Any, Any]):
@@ -133,6 +141,8 @@ def test_a_plan_for_an_environment_of_which_a_second_copy_fails_has_one_copy(
     assert plan.measured.copies_worked == 1
     assert any(line.startswith("2 copies side by side: ") for line in plan.advice)
     assert (plan.settings["envs"], plan.settings["workers"], plan.settings["lanes"]) == (1, 1, 1)
+    assert plan.settings["eval_copies"] == 1
+    assert any(line.startswith("evaluations need a second copy, but 2 did not work side by side") for line in plan.advice)
 
 
 def test_if_no_step_can_be_made_the_error_says_why() -> None:

@@ -1,0 +1,59 @@
+"""How many env copies may run at the same time, because of licences or because more have failed, and how many train. Pure.
+
+Rule: copies that play evaluations count, because training copies stay open during evaluations.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from millrace.learner.config.config import Config
+from millrace.planning.in_words import counted
+from millrace.planning.measurements import Measurements
+from millrace.planning.recommendation import ChosenSetting
+
+EVALUATION_COPIES = Config().eval_copies
+MORE_FAILED = "more copies did not work side by side, and evaluations need copies too"
+
+
+class AllowedCopies(NamedTuple):
+    """The numbers of env copies that may run at the same time. 0: any number."""
+
+    here: int
+    """on this machine"""
+    of_run: int
+    """on all machines together"""
+    why: str = "with those of evaluations"
+    """the reason for `of_run`"""
+
+    @classmethod
+    def of(cls, max_env_copies: int, per_machine: int) -> AllowedCopies:
+        """What the setting `max_env_copies` and this machine's limit allow; 0 is no limit."""
+        return cls(min([number for number in (max_env_copies, per_machine) if number], default=0), max_env_copies)
+
+    def after(self, measured: Measurements) -> AllowedCopies:
+        """No more copies than have worked side by side, if more have failed."""
+        if not measured.copies_failed or 0 < self.here <= measured.copies_worked:
+            return self
+        return AllowedCopies(measured.copies_worked, measured.copies_worked, MORE_FAILED)
+
+    @property
+    def training(self) -> int:
+        """How many copies may train on this machine; 0: any number. One trains even if none is left for evaluations."""
+        return max(1, self.here - self._evaluating) if self.here else 0
+
+    @property
+    def settings(self) -> list[ChosenSetting]:
+        """The settings that limit a run to these copies."""
+        found = []
+        if self.of_run > 1:  # evaluations need a second one
+            found.append(ChosenSetting("max_env_copies", self.of_run, self.why))
+        if self._evaluating < EVALUATION_COPIES:
+            train = f"so that {self.training} of {counted(self.here, 'copy', 'copies')} train"
+            found.append(ChosenSetting("eval_copies", self._evaluating, train if self.here > 1 else "as few as possible"))
+        return found
+
+    @property
+    def _evaluating(self) -> int:
+        """How many copies play evaluations: the default number, or 1 if that is more than a third of the allowed ones."""
+        return EVALUATION_COPIES if not self.here or self.here >= 3 * EVALUATION_COPIES else 1
