@@ -29,7 +29,7 @@ from millrace.planning.recommendation import (
     on_machines,
     reasons,
 )
-from millrace.planning.run_plan import ExpectedSpeed, RunPlan, train_command
+from millrace.planning.run_plan import ExpectedSpeed, RunPlan, added_by_preset, train_command
 from millrace.protocol.env_spec import EnvLike
 from millrace.protocol.envs.wrappers import WrapperLike, wrapper_names
 from millrace.protocol.errors import UsageError
@@ -145,12 +145,15 @@ def _decided(
         chosen.append(ChosenSetting("rollout_steps", sizes.rollout_steps, why))
     chosen += others
     needed = NEEDED_STEPS[config.algo]
+    advice = _advice(sizes, situation, rate(sizes))
+    if line := added_by_preset(env.name, env.kwargs, config.algo):
+        advice.append(line)
     return RunPlan(
         env=env.name,
         chosen=tuple(chosen),
         expected=tuple(_expected(sizes, learning, situation, needed)),
         needed_steps=needed,
-        advice=tuple(_advice(sizes, situation, rate(sizes))),
+        advice=tuple(advice),
         command=train_command(env.name, env.kwargs, wrapper_names(env.wrappers), tuple(chosen)),
         measured=situation.measured,
         overheads=situation.overheads,

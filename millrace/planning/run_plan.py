@@ -16,7 +16,7 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from millrace.learner.config.presets import added
+from millrace.learner.config.presets import added, environment_presets
 from millrace.planning.in_words import counted, number_in_words, time_in_words
 from millrace.planning.measurements import Machine, Measurements, Overheads
 from millrace.planning.recommendation import ChosenSetting
@@ -101,6 +101,18 @@ def train_command(
     for each in chosen:
         words += [f"--{each.name.replace('_', '-')}", str(each.value)]
     return shlex.join(words)
+
+
+def added_by_preset(env: str, env_kwargs: Mapping[str, Scalar], algo: str) -> str:
+    """A line if the command trains with keyword arguments of a preset that the environment was measured without."""
+    preset: dict[str, Scalar] = environment_presets(algo).get(env, {}).get("env_kwargs", {})
+    words = added({name: value for name, value in preset.items() if name not in env_kwargs}, {})
+    if not words:
+        return ""
+    return (
+        f"the command also uses keyword arguments of the preset of {algo}, without which the environment was measured; "
+        f"to measure it with them, plan with --env-kwargs {shlex.join([*added(env_kwargs, {}), *words])}"
+    )
 
 
 # ------------------------------------------------------------------------------------------------------------------ as text

@@ -9,6 +9,8 @@ from typing import Any
 import msgspec
 import pytest
 
+from millrace.cli.plan import PlanFlags
+from millrace.flags.parse import parse_flags
 from millrace.learner.config.command_line import read_config
 from millrace.learner.config.layers import resolve
 from millrace.learner.config.validation import check_copies
@@ -23,7 +25,7 @@ from millrace.planning.recommendation import (
     on_machines,
     reasons,
 )
-from millrace.planning.run_plan import train_command
+from millrace.planning.run_plan import added_by_preset, train_command
 from millrace.protocol.env_spec import Scalar
 from tests.millrace.planning.made_up import MACHINE, OVERHEADS, PPO, REPLAY, TRIED, chosen, measured, rate, situation
 
@@ -219,6 +221,16 @@ def test_each_setting_has_a_reason_and_the_command_is_one_that_train_takes(wait_
     assert (config.workers, config.envs, config.lanes) == (found.workers, found.envs, found.lanes)
     assert config.env_kwargs == env_kwargs
     assert config.env_kwargs["wind"] is False
+
+
+def test_a_line_names_the_arguments_of_a_preset_that_were_not_measured() -> None:
+    env_kwargs: dict[str, Scalar] = {"game": "Pong", "clip_rewards": False}
+    line = added_by_preset("millrace/Atari-v0", env_kwargs, "ppo")
+    planned = parse_flags(PlanFlags, ["millrace/Atari-v0", *shlex.split(line[line.index("--env-kwargs") :])], "plan")
+    trained, _ = read_config("train", shlex.split(train_command("millrace/Atari-v0", env_kwargs, (), ()))[2:])
+    assert planned.env_kwargs == trained.env_kwargs != env_kwargs
+    assert added_by_preset("millrace/Atari-v0", trained.env_kwargs, "ppo") == ""
+    assert added_by_preset("CartPole-v1", {"x": 1}, "ppo") == ""
 
 
 def test_more_machines_have_as_many_of_all_and_updates_as_often_as_they_can() -> None:
