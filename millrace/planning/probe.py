@@ -90,13 +90,14 @@ def probe(env: ProbedEnv, machine: Machine, seconds: float) -> Probed:
     sessions = [first]
     measured = _measured_alone(env, first)
     each = 1
-    if measured.alone.own_s < SHORT_S and not first.wrong:
-        several = _session(env, 1, OF_ALONE * seconds, give_up_at_s, each=COPIES_OF_SHORT)
+    most_each = min(COPIES_OF_SHORT, machine.most_copies // machine.cores) if machine.most_copies else COPIES_OF_SHORT
+    if measured.alone.own_s < SHORT_S and not first.wrong and most_each > 1:
+        several = _session(env, 1, OF_ALONE * seconds, give_up_at_s, each=most_each)
         sessions.append(several)
         if several.is_whole:
-            each = COPIES_OF_SHORT
+            each = most_each
             measured = msgspec.structs.replace(measured, side_by_side=(_costs(1, several.times),))
-    for workers in _ladder(measured, machine):
+    for workers in _ladder(measured, machine, each):
         if time.monotonic() - began_s + 1.5 * sessions[-1].start_s > OF_SIDE_BY_SIDE * seconds:
             break
         session = _session(env, workers, EACH_S, give_up_at_s, each=each)
@@ -112,14 +113,14 @@ def probe(env: ProbedEnv, machine: Machine, seconds: float) -> Probed:
     return Probed(_with_all(measured, sessions), first.observation_space, first.action_space, first.seats)
 
 
-def _ladder(measured: Measurements, machine: Machine) -> Iterator[int]:
-    """The numbers of workers to try, ascending."""
+def _ladder(measured: Measurements, machine: Machine, each: int) -> Iterator[int]:
+    """The numbers of workers to try, ascending. `each`: the number of copies of each worker."""
     alone = measured.alone
     limit = max(MOST_AT_LEAST, MOST_PER_CORE * machine.cores)
     if machine.free_bytes is not None:
         limit = min(limit, int(OF_MEMORY * machine.free_bytes / max(measured.worker_bytes, WORKER_BYTES)))
     if machine.most_copies:
-        limit = min(limit, machine.most_copies)
+        limit = min(limit, machine.most_copies // each)
     # Try more copies than cores only if steps spend time waiting rather than computing.
     limit = min(limit, machine.cores if alone.computes else math.ceil(machine.cores / max(alone.cpu_share, 1e-3)))
     workers = max(2, machine.cores)

@@ -109,6 +109,12 @@ def test_a_single_copy_that_fails_does_not_count_as_a_failure_of_more_copies(tmp
     assert measured.copies_failed == 0
 
 
+@pytest.mark.parametrize("most_copies", [3, 5])
+def test_no_more_copies_are_tried_than_are_allowed_even_if_steps_are_short(most_copies: int) -> None:
+    measured = probe(ProbedEnv("CartPole-v1", {}, ()), Machine(cores=2, most_copies=most_copies), seconds=BRIEF_S).measured
+    assert measured.copies_worked <= most_copies
+
+
 class Licensed(gymnasium.Env[Any, Any]):
     """Computes for 3 ms in each step. Only one copy may exist on this machine."""
 
