@@ -20,6 +20,7 @@ from contextlib import ExitStack, contextmanager
 from millrace.learner.algorithms import Algorithm
 from millrace.learner.algorithms.algorithm import acting_weights, numbers
 from millrace.learner.between_updates.crowded_cores import CrowdedCores
+from millrace.learner.between_updates.run_files import RunFiles
 from millrace.learner.rollouts.hub import Hub
 from millrace.learner.rollouts.rollout_dealer import AcceptedRollout
 from millrace.learner.run import OpenRun
@@ -81,7 +82,7 @@ def train(run: OpenRun, workers: int, cores: CrowdedCores) -> str:
         while (reason := tally.stop_reason()) is None:
             arrived = hub.gather(audience.show_now)
             began_s = time.monotonic()
-            with _whole_update(algorithm, hub, arrived):
+            with _whole_update(algorithm, hub, files, arrived):
                 if not audience.gathered(arrived):
                     hub.not_used(arrived)
                     continue
@@ -117,14 +118,22 @@ def train(run: OpenRun, workers: int, cores: CrowdedCores) -> str:
 
 
 @contextmanager
-def _whole_update(algorithm: Algorithm, hub: Hub, arrived: list[AcceptedRollout]) -> Iterator[None]:
+def _whole_update(algorithm: Algorithm, hub: Hub, files: RunFiles, arrived: list[AcceptedRollout]) -> Iterator[None]:
     """A context for an update that uses the rollouts in `arrived`. If the body raises, the update is undone.
 
-    The rollouts wait again even if a second Ctrl-C ends `remember` or `roll_back`.
+    A second or third Ctrl-C may end `remember` or `roll_back`. The rollouts wait again nevertheless, and an algorithm that
+    is neither updated nor rolled back is not saved.
     """
+
+    def roll_back() -> None:
+        algorithm.roll_back()
+        files.is_whole = True
+
     with ExitStack() as undo:
         undo.callback(hub.not_used, arrived)
         algorithm.remember()
-        undo.callback(algorithm.roll_back)
+        undo.callback(roll_back)
+        files.is_whole = False
         yield
+        files.is_whole = True
         undo.pop_all()

@@ -45,6 +45,8 @@ class RunFiles:
         self.path = one_line(str(run.folder.shown))
         self.checkpoint = ""
         """Path of the newest checkpoint that this process has written; empty if there is none."""
+        self.is_whole = True
+        """Whether the algorithm is between two updates; False while it learns. Only a whole algorithm is saved."""
         self.longest_save_s = 0.0
         """The longest time, in seconds, that this process has taken to write a checkpoint."""
         self.on_saved: Callable[[], None] = lambda: None
@@ -99,8 +101,12 @@ class RunFiles:
     def save_after_error(self, error: BaseException) -> None:
         """Like `save_unless_saved` and `confirm_saved`, but only logs callbacks' errors, because `error` has ended the run.
 
-        If the state can't be written, raises `RunError` only if `error` isn't a failure (but, for example, Ctrl-C).
+        If the state can't be written, raises `RunError` only if `error` isn't a failure (but, for example, Ctrl-C). Writes
+        nothing if an update was neither completed nor undone.
         """
+        if not self.is_whole:
+            log.warning("update %d was neither completed nor undone, so nothing more is saved", self._state.version + 1)
+            return
         try:
             self.save_unless_saved()
         except Exception as raised:

@@ -12,6 +12,7 @@ import torch
 
 from millrace.learner.algorithms.ppo import PPO
 from millrace.learner.between_updates.crowded_cores import CrowdedCores
+from millrace.learner.between_updates.run_files import RunFiles
 from millrace.learner.between_updates.tally import Tally
 from millrace.learner.config.config import Config
 from millrace.learner.config.hyperparameters import PPOConfig
@@ -115,9 +116,18 @@ def test_the_rollouts_of_an_update_that_was_not_made_wait_again_wherever_it_ende
     service = MagicMock(gather=lambda show: arrived, not_used=lambda taken: does("not_used"))
     tally = MagicMock(stop_reason=lambda: None)
     run = MagicMock(parts=SimpleNamespace(algorithm=algorithm, spec=fake_run_spec(), hub=service, tally=tally))
+    run.files.is_whole = True
     with pytest.raises(KeyboardInterrupt, match=raises.split()[-1]):
         train(run, 1, CrowdedCores(0))
     assert calls == called
+    assert run.files.is_whole == ("roll_back" not in raises)
+
+
+@pytest.mark.parametrize("is_whole", [True, False])
+def test_only_a_whole_algorithm_is_saved_after_an_error(is_whole: bool) -> None:
+    files = MagicMock(is_whole=is_whole)
+    RunFiles.save_after_error(files, KeyboardInterrupt())
+    assert files.save_unless_saved.called == files.confirm_saved.called == is_whole
 
 
 def test_tickets_of_the_learner_that_died_are_lost_and_the_ledger_balances(tmp_path: Path) -> None:
