@@ -91,14 +91,19 @@ def probe(env: ProbedEnv, machine: Machine, seconds: float) -> Probed:
     measured = _measured_alone(env, first)
     each = 1
     most_each = min(COPIES_OF_SHORT, machine.most_copies // machine.cores) if machine.most_copies else COPIES_OF_SHORT
-    if measured.alone.own_s < SHORT_S and not first.wrong and most_each > 1:
+
+    def has_time() -> bool:
+        """Whether another session can start and step; otherwise its timeout would count as a failure of its copies."""
+        return time.monotonic() - began_s + 1.5 * sessions[-1].start_s <= OF_SIDE_BY_SIDE * seconds
+
+    if measured.alone.own_s < SHORT_S and not first.wrong and most_each > 1 and has_time():
         several = _session(env, 1, OF_ALONE * seconds, give_up_at_s, each=most_each)
         sessions.append(several)
         if several.is_whole:
             each = most_each
             measured = msgspec.structs.replace(measured, side_by_side=(_costs(1, several.times),))
     for workers in _ladder(measured, machine, each):
-        if time.monotonic() - began_s + 1.5 * sessions[-1].start_s > OF_SIDE_BY_SIDE * seconds:
+        if not has_time():
             break
         session = _session(env, workers, EACH_S, give_up_at_s, each=each)
         sessions.append(session)
