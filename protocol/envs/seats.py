@@ -176,13 +176,13 @@ class SeatedEnv(gymnasium.Env[SeatStep, Sequence[Any]]):
     def _advance(self, actions: Sequence[Any], step: SeatStep) -> bool:
         """Step the environment, and write the result into `step`. Returns whether the episode is over."""
 
-    def owner(self, name: str, last: tuple[type, ...] = ()) -> Any:
+    def owner(self, name: str) -> Any:
         """The outermost PettingZoo wrapper that itself has this attribute; the environment if no wrapper has it.
 
-        Wrappers inside an object of one of the types in `last` aren't searched.
+        The search ends at a gymnasium environment, because its own methods search the wrappers inside it.
         """
         owner = self.env
-        while name not in dir(owner) and not isinstance(owner, last):
+        while name not in dir(owner) and not isinstance(owner, gymnasium.Env):
             inner = getattr(owner, "env", None) or getattr(owner, "aec_env", None)  # the latter after `parallel_wrapper_fn`
             if inner is None:
                 break
@@ -191,20 +191,25 @@ class SeatedEnv(gymnasium.Env[SeatStep, Sequence[Any]]):
 
     def has_wrapper_attr(self, name: str) -> bool:
         """Whether PettingZoo's environment, one of its wrappers or this object has the attribute."""
-        return hasattr(self.owner(name), name) or hasattr(self, name)
+        return _has(self.owner(name), name) or hasattr(self, name)
 
     def get_wrapper_attr(self, name: str) -> Any:
         """The attribute of PettingZoo's environment or of one of its wrappers; if they lack it, of this object."""
         owner = self.owner(name)
-        return getattr(owner if hasattr(owner, name) else self, name)
+        if not _has(owner, name):
+            return getattr(self, name)
+        return owner.get_wrapper_attr(name) if isinstance(owner, gymnasium.Env) else getattr(owner, name)
 
     def set_wrapper_attr(self, name: str, value: Any, *, force: bool = True) -> bool:
         """Set the attribute of PettingZoo's environment or of one of its wrappers; without `force`, only if it exists.
 
         Returns whether it was set.
         """
-        if there := force or hasattr(self.owner(name), name):
-            setattr(self.owner(name), name, value)
+        owner = self.owner(name)
+        if isinstance(owner, gymnasium.Env):
+            return owner.set_wrapper_attr(name, value, force=force)
+        if there := force or hasattr(owner, name):
+            setattr(owner, name, value)
         return there
 
     def render(self) -> Any:
@@ -388,6 +393,11 @@ def _check_numbers(agent: Any, **numbers: Any) -> None:
             float(value) if what == "reward" else bool(value)
         except RETURNED_WRONGLY as error:
             raise WrongAnswer(f"{what} of agent {agent}: expected a number, got {one_line(safe_repr(value), 80)}") from error
+
+
+def _has(owner: Any, name: str) -> bool:
+    """Whether the owner of an attribute (see `SeatedEnv.owner`) has it."""
+    return owner.has_wrapper_attr(name) if isinstance(owner, gymnasium.Env) else hasattr(owner, name)
 
 
 def has_seats(made: object) -> bool:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from copy import deepcopy
 from typing import Any, NamedTuple, Protocol
 
 import gymnasium
@@ -18,7 +17,6 @@ from gymnasium.wrappers import OrderEnforcing
 from millrace.protocol.arrays import Array, Bools, Doubles
 from millrace.protocol.envs.action_masks import seen_space
 from millrace.protocol.envs.description import agents_in_words, agents_of
-from millrace.protocol.envs.seats import SeatedEnv
 from millrace.protocol.envs.spaces import action_spec, make_flatten, observation_leaves
 from millrace.protocol.envs.which_copy import FIRST_COPY, EnvCopy
 from millrace.protocol.errors import UsageError, first_line
@@ -31,7 +29,6 @@ from millrace.workers.copies.env_loop import Autoreset, CopyInfos, EnvLoop, Puls
 from millrace.workers.copies.episode_facts import Facts, facts_of_info
 from millrace.workers.copies.mask_reader import MaskReader, unused_mask
 from millrace.workers.copies.random_state import pack as pack_random_state
-from millrace.workers.copies.reset_ahead import ResetAhead
 from millrace.workers.copies.row_writers import read_leaves
 from millrace.workers.copies.saved_state import CannotSave, SavedCopy, load, save, saver
 
@@ -364,17 +361,25 @@ def without_order_check(env: gymnasium.Env[Any, Any], which: EnvCopy = FIRST_COP
 
 def set_attribute(copy: int | None, env: Any, name: str, value: Any) -> None:
     """Set a public attribute of the environment or of one of its wrappers. Raises `CopyFailed` if none has it."""
-    owner = env.owner(name, last=(ResetAhead,)) if isinstance(env, SeatedEnv) else env
-    while not hasattr(owner, name) and isinstance(owner, gymnasium.Wrapper | VectorWrapper):
-        if isinstance(owner, ResetAhead):
-            for instance in owner.instances():
-                set_attribute(copy, instance, name, deepcopy(value))  # its own value, because it may change the value
-            return
-        owner = owner.env
-    if name.startswith("_") or not hasattr(owner, name) or callable(getattr(owner, name)):
-        what = "a private one" if name.startswith("_") else "a method" if hasattr(owner, name) else "none"
-        raise CopyFailed(copy, line=f"expected an attribute of the environment that is called {name}, got {what}")
+    while isinstance(env, VectorWrapper) and not hasattr(env, name):
+        env = env.env
+    if isinstance(env, gymnasium.Env):
+        found = env.get_wrapper_attr(name) if env.has_wrapper_attr(name) else None
+    else:
+        found = getattr(env, name, None)
     try:
-        setattr(owner, name, value)
+        there = not name.startswith("_") and not callable(found) and _assign_existing(env, name, value)
     except BaseException as error:
         raise CopyFailed(copy, f"set_env_attr {name}") from error
+    if not there:
+        what = "a private one" if name.startswith("_") else "a method" if callable(found) else "none"
+        raise CopyFailed(copy, line=f"expected an attribute of the environment that is called {name}, got {what}")
+
+
+def _assign_existing(env: Any, name: str, value: Any) -> bool:
+    """Set the attribute if it exists. Returns whether it does."""
+    if isinstance(env, gymnasium.Env):
+        return env.set_wrapper_attr(name, value, force=False)
+    if there := hasattr(env, name):
+        setattr(env, name, value)
+    return there

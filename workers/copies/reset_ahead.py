@@ -10,6 +10,7 @@ from __future__ import annotations
 import threading
 from concurrent.futures import Future
 from contextlib import suppress
+from copy import deepcopy
 from typing import Any
 
 import gymnasium
@@ -31,8 +32,8 @@ class ResetAhead(gymnasium.Wrapper[Any, Any, Any, Any]):
     Both instances are made with the same arguments. If the constructor needs a port or a folder, let it call
     `millrace.env_copy()`, because the second instance has its own slot.
 
-    Attributes that a run sets on its environment are set on both instances, but by then the next episode's reset may already
-    be done.
+    Attributes that a run or a vector environment sets on its environment are set on both instances, but by then the next
+    episode's reset may already be done.
 
     >>> import gymnasium, millrace
     >>> env = millrace.ResetAhead(gymnasium.make("CartPole-v1"))
@@ -92,6 +93,17 @@ class ResetAhead(gymnasium.Wrapper[Any, Any, Any, Any]):
 
         self._prepared = prepared
         threading.Thread(target=prepare, name="reset-ahead", daemon=True).start()
+
+    def set_wrapper_attr(self, name: str, value: Any, *, force: bool = True) -> bool:
+        """See `gymnasium.Wrapper.set_wrapper_attr`. An attribute of the environment is set on both instances.
+
+        Waits for a reset in progress. The other instance gets a copy of the value, because an instance may change its value.
+        """
+        if hasattr(self, name) or not self.env.has_wrapper_attr(name):
+            return super().set_wrapper_attr(name, value, force=force)
+        playing, other = self.instances()
+        other.set_wrapper_attr(name, deepcopy(value))
+        return playing.set_wrapper_attr(name, value)
 
     def instances(self) -> tuple[gymnasium.Env[Any, Any], gymnasium.Env[Any, Any]]:
         """The instance that plays, and the other one. Waits for a reset of the other one to end."""

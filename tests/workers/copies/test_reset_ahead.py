@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from typing import Any
 
 import gymnasium
@@ -155,6 +156,11 @@ def test_what_the_prepared_reset_raises_arrives_at_the_next_reset() -> None:
     env.close()
 
 
+def pair() -> gymnasium.Env[Any, Any]:
+    """A copy with two agents that resets ahead."""
+    return seated(TupleOfAgents(ResetAhead(gymnasium.make("tests/TracedPair-v0"))), "two")
+
+
 def copies_of(agents: int, restart_episodes: int = 0) -> LoopedCopies:
     """One copy that resets ahead, with one agent or with two in tuples."""
     if agents == 1:
@@ -162,10 +168,7 @@ def copies_of(agents: int, restart_episodes: int = 0) -> LoopedCopies:
             [lambda: ResetAhead(gymnasium.make("tests/Traced-v0"))], no_pulse, restart_episodes=restart_episodes
         )
 
-    def make() -> gymnasium.Env[Any, Any]:
-        return seated(TupleOfAgents(ResetAhead(gymnasium.make("tests/TracedPair-v0"))), "two")
-
-    return SeatedCopies([make], no_pulse, ("agent_0", "agent_1"), restart_episodes=restart_episodes)
+    return SeatedCopies([pair], no_pulse, ("agent_0", "agent_1"), restart_episodes=restart_episodes)
 
 
 @pytest.mark.parametrize("agents", [1, 2])
@@ -179,6 +182,24 @@ def test_attributes_reach_both_instances_and_the_prepared_episode_has_the_old_on
     copies.close()
     assert [each.level for each in Traced.made] == [2, 2]
     assert [each.levels for each in Traced.made] == [[0, 1, 1, 2], [1, 2]]  # of each reset
+
+
+@pytest.mark.parametrize("make", [lambda: ResetAhead(gymnasium.make("tests/Traced-v0")), pair], ids=["one agent", "two"])
+def test_the_method_of_gymnasium_sets_attributes_on_both_instances_too(make: Callable[[], gymnasium.Env[Any, Any]]) -> None:
+    """Vector environments call it, and with them `--inference learner`."""
+    env = make()
+    env.reset(seed=1)
+    assert not env.set_wrapper_attr("absent", 1, force=False)
+    assert len(Traced.made) == 1, "a second instance was made for an attribute that neither has"
+    env.set_wrapper_attr("absent", 1)
+    assert env.get_wrapper_attr("absent") == 1
+    values = [1, 2]
+    assert env.set_wrapper_attr("levels", values)
+    assert env.set_wrapper_attr("level", 3, force=False)
+    env.close()
+    assert [each.level for each in Traced.made] == [3, 3]
+    assert [each.levels for each in Traced.made] == [[1, 2], [1, 2]]
+    assert Traced.made[0].levels is not Traced.made[1].levels, "an instance may change its value"
 
 
 @pytest.mark.parametrize("agents", [1, 2])
