@@ -372,11 +372,17 @@ class TurnSeats(SeatedEnv):
     def pending(self) -> list[float]:
         """[A] rewards that agents without the move have earned since their last move, as PettingZoo's base class sums them.
 
-        They are 0 if the environment doesn't use that sum.
+        They are 0 if the environment doesn't use that sum. Raises `WrongAnswer` for a sum that isn't a number.
         """
         earned = getattr(self.env, "_cumulative_rewards", {})
         waits = set(self.env.agents) - self._gone - {self.env.agent_selection}
-        return [float(earned.get(agent, 0.0)) if agent in waits else 0.0 for agent in self.agents]
+        of_waiting = {agent: earned[agent] for agent in waits if agent in earned}
+        try:
+            return [_number(of_waiting.get(agent, 0.0)) for agent in self.agents]
+        except RETURNED_WRONGLY:
+            for agent, reward in of_waiting.items():
+                _check_numbers(agent, reward=reward)
+            raise
 
 
 def _info(agent: Any, info: Any) -> Mapping[str, Any]:
@@ -390,7 +396,7 @@ def _check_numbers(agent: Any, **numbers: Any) -> None:
     """Raise `WrongAnswer` for a value that isn't a number."""
     for what, value in numbers.items():
         try:
-            float(value) if what == "reward" else bool(value)
+            _number(value) if what == "reward" else bool(value)
         except RETURNED_WRONGLY as error:
             raise WrongAnswer(f"{what} of agent {agent}: expected a number, got {one_line(safe_repr(value), 80)}") from error
 

@@ -13,6 +13,7 @@ import gymnasium
 import numpy as np
 
 from millrace.protocol.arrays import Array, Bools
+from millrace.protocol.envs.answers import WrongAnswer
 from millrace.protocol.envs.seats import SeatedEnv, SeatStep, side_by_side
 from millrace.protocol.envs.which_copy import FIRST_COPY, EnvCopy
 from millrace.workers.copies.env_copies import Leaves, LoopedCopies, SeatColumns, StepResult
@@ -118,10 +119,13 @@ class SeatedCopies(LoopedCopies):
         return StepResult(leaves, columns.reward, columns.terminated, columns.truncated, facts=facts, columns=self.columns)
 
     def pending(self, copy: int) -> Array:
-        """[A] rewards that this copy's seats have earned, and that no step has returned yet."""
+        """[A] rewards that this copy's seats have earned, and that no step has returned yet. Raises `CopyFailed`."""
         env = self.envs[copy]
         assert isinstance(env, SeatedEnv)
-        return np.array(env.pending(), np.float64)
+        try:
+            return np.array(env.pending(), np.float64)
+        except WrongAnswer as error:
+            raise CopyFailed(copy, "step") from error
 
     def _facts_of(self, last: SeatStep) -> tuple[float, ...]:
         """For each fact, the mean over the seats that report it in the last step of a copy's episode; NaN if none does."""

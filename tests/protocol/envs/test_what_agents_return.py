@@ -142,6 +142,13 @@ def test_a_reward_may_be_an_array_of_one_number() -> None:
     assert env.step([0, 0])[0].reward == [2.5, 2.5]
 
 
+def test_a_wrong_reward_is_named_although_those_before_it_are_arrays_of_one_number() -> None:
+    env = seated(Wrong("rewards", {"left": np.full(1, 2.5), "right": "much"}), "game")
+    env.reset(seed=1)
+    with pytest.raises(WrongAnswer, match=r"^reward of agent right: expected a number, got 'much'$"):
+        env.step([0, 0])
+
+
 class InsideOut:
     """A parallel view of an environment, as PettingZoo's `parallel_wrapper_fn` makes it: it forwards nothing."""
 

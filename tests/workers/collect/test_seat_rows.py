@@ -399,6 +399,22 @@ class Summing(RandomGame):
         return self._cumulative
 
 
+class SummingArrays(Summing):
+    """Its sums are arrays of one number."""
+
+    @property
+    def _cumulative_rewards(self) -> dict[str, Any]:
+        return {agent: np.full(1, total) for agent, total in self._cumulative.items()}
+
+
+class SummingWords(Summing):
+    """Its sums are no numbers."""
+
+    @property
+    def _cumulative_rewards(self) -> dict[str, Any]:
+        return dict.fromkeys(self._cumulative, "much")
+
+
 class SummingInWrapper(BaseWrapper):  # type: ignore[misc]
     def __init__(self) -> None:
         super().__init__(Summing())
@@ -407,7 +423,7 @@ class SummingInWrapper(BaseWrapper):  # type: ignore[misc]
         return self.env.last(observe)
 
 
-@pytest.mark.parametrize("made", [Summing, SummingInWrapper])
+@pytest.mark.parametrize("made", [Summing, SummingArrays, SummingInWrapper])
 def test_an_evaluation_that_is_cut_counts_what_waiting_seats_have_got(made: Any) -> None:
     run = msgspec.structs.replace(seated_run("turns", T=4, N=1), env=EnvSpec(f"{__name__}:{made.__name__}"))
     cut = 0
@@ -429,3 +445,12 @@ def test_an_evaluation_that_is_cut_counts_what_waiting_seats_have_got(made: Any)
         cut += sum(answer.cut)
         evaluator.close()
     assert cut > 20
+
+
+def test_what_a_waiting_seat_has_got_must_be_a_number() -> None:
+    run = msgspec.structs.replace(seated_run("turns", T=4, N=1), env=EnvSpec(f"{__name__}:{SummingWords.__name__}"))
+    evaluator = Evaluator(run, random_policy(run.policy))
+    order = example(Evaluate, session=1, ticket=1, seeds=episode_seeds(0, 12), greedy=True, most_steps=1)
+    says = r"^while the policy was evaluated: copy \d+, step: reward of agent [abc]: expected a number, got 'much'$"
+    with pytest.raises(EnvironmentFailed, match=says):
+        evaluator.play(order, lambda rows: None, no_pulse)
