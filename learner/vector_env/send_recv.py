@@ -17,7 +17,7 @@ from gymnasium.error import AlreadyPendingCallError, NoAsyncCallError
 from millrace.learner.vector_env.batch_arrays import BatchArrays
 from millrace.learner.vector_env.batch_layout import BatchLayout
 from millrace.learner.vector_env.lane_orders import packed, step_order
-from millrace.learner.vector_env.lost_lanes import LostLanes, replacement_seeds, worker_lost
+from millrace.learner.vector_env.lost_lanes import UNKNOWN_REASON, LostLanes, replacement_seeds, worker_lost
 from millrace.learner.vector_env.order_coordinator import MakeOrder
 from millrace.learner.vector_env.sent_lanes import (
     AfterLoss,
@@ -211,17 +211,29 @@ class SendRecv:
             self._handle_losses()
 
     def abandon(self, lanes: Sequence[int]) -> None:
-        """Stop waiting for these lanes. Those whose step was under way count as reported if they were lost meanwhile."""
+        """Stop waiting for these lanes. Those whose step was under way count as reported if they were lost meanwhile.
+
+        If a lane was lost, and no worker has got its reset, the next step reports the loss.
+        """
         sent = self._sent
-        steps = [lane for lane in sent.under_way if lane in lanes and sent.sent[lane].asked is Asked.STEP]
+        under_way = [lane for lane in sent.under_way if lane in lanes]
+        steps = [lane for lane in under_way if sent.sent[lane].asked is Asked.STEP]
+        hidden = [lane for lane in under_way if isinstance(sent.sent[lane].asked, AskedReset) and self._is_hidden(lane)]
         for lane in lanes:
             self._to_raise.pop(lane, None)
         self._parts.hub.forget(sent.give_up(lanes))
         lost_lanes = self._parts.lost_lanes
+        lost_lanes.add(dict.fromkeys(hidden, UNKNOWN_REASON))
         lost_lanes.add(self._parts.hub.coordinator.take_lost())
         lost_lanes.report([lane for lane in steps if lane in lost_lanes.unreported])
 
     # ---------------------------------------------------------------- inside
+
+    def _is_hidden(self, lane: int) -> bool:
+        """Whether this lane, which was to be reset, is lost, no result has reported it, and no worker has got the reset."""
+        parts = self._parts
+        began = bool(parts.ever_reset[parts.layout.copies(lane)].any())
+        return began and not parts.hub.coordinator.lanes[lane].started and lane not in parts.lost_lanes.awaiting_reset
 
     def _order_steps(
         self,

@@ -702,6 +702,77 @@ def test_a_loss_of_which_an_interrupted_step_did_not_tell_is_over_when_all_are_r
         assert env.step(zeros([0, 1]))[1].tolist() == [1.0, 1.0]
 
 
+@contextmanager
+def interrupted_reset_of_lost_copies(lost: str, **changes: Any) -> Iterator[ZmqVectorEnv]:
+    """Two lanes of one copy, which are lost before a reset or during it. The reset was interrupted while it waited for
+    workers; now there are two.
+    """
+    with made(copies=2, lanes=2, workers=2, **changes) as (env, link):
+        env.reset(seed=1), env.step(zeros([0, 1]))
+        link.frozen = {"w0", "w1"}
+        leave = [lambda: link.leave("w0"), lambda: link.leave("w1")]
+        if lost == "before":
+            while leave:
+                leave.pop()()
+        if lost == "reported":
+            interrupt_after(env, *leave, lambda: None)
+            assert env.step(zeros([0, 1]))[3].all()
+            leave.clear()
+        interrupt_after(env, *leave, lambda: None, lambda: None)
+        with pytest.raises(InterruptedError):
+            env.reset(seed=2)
+        env.hub.while_waiting = lambda: None
+        link.frozen = set()
+        link.join("w2"), link.join("w3")
+        env.hub.wait_for(2, 1.0)
+        yield env
+
+
+@pytest.mark.parametrize("lost", ["before", "during"])
+@pytest.mark.parametrize("mode", [NEXT, SAME, DISABLED])
+def test_a_loss_is_reported_if_the_reset_that_would_have_ended_it_was_interrupted(mode: str, lost: str) -> None:
+    with interrupted_reset_of_lost_copies(lost, autoreset_mode=mode) as env:
+        observation, reward, _, truncated, infos = env.step(zeros([0, 1]))
+        assert (reward.tolist(), truncated.tolist()) == ([0.0, 0.0], [True, True])
+        assert infos["worker_lost"].tolist() == [True, True]
+        if mode == NEXT:
+            observation = env.step(zeros([0, 1]))[0]
+        if mode == DISABLED:
+            observation = env.reset(seed=3)[0]
+        assert observation.tolist() == [[1.0], [1.0]], "the first observations of new episodes"
+        assert env.step(zeros([0, 1]))[1].tolist() == [1.0, 1.0]
+
+
+def test_with_raise_it_is_raised_if_the_reset_that_would_have_ended_it_was_interrupted() -> None:
+    says = r"^its worker is gone: lane 0 \(copies 0 to 0\) is lost; its worker is gone: lane 1 \(copies 1 to 1\) is lost$"
+    with interrupted_reset_of_lost_copies("before", on_worker_loss="raise") as env:
+        with pytest.raises(WorkerLost, match=says):
+            env.step(zeros([0, 1]))
+        assert env.reset(seed=3)[0].tolist() == [[1.0], [1.0]]
+        assert env.step(zeros([0, 1]))[1].tolist() == [1.0, 1.0]
+
+
+def test_a_loss_that_a_step_has_reported_is_not_reported_again_if_the_reset_after_it_was_interrupted() -> None:
+    with interrupted_reset_of_lost_copies("reported") as env:
+        observation, _, _, truncated, _ = env.step(zeros([0, 1]))
+        assert (observation.tolist(), truncated.tolist()) == ([[1.0], [1.0]], [False, False])
+
+
+@pytest.mark.parametrize("mode", [NEXT, SAME, DISABLED])
+def test_no_loss_is_reported_if_no_worker_had_the_copies(mode: str) -> None:
+    with made(copies=2, lanes=1, workers=1, autoreset_mode=mode) as (env, link):
+        link.leave("w0")
+        interrupt_after(env, lambda: None)
+        with pytest.raises(InterruptedError):
+            env.reset(seed=1)
+        env.hub.while_waiting = lambda: None
+        link.join("w9")
+        for copy in (0, 1):
+            env.reset_async(env_ids=[copy])
+            assert received(env)[copy].observation == 1.0
+        assert env.step(zeros([0, 1]))[1].tolist() == [1.0, 1.0]
+
+
 def test_a_loss_between_two_calls_is_over_when_all_are_reset() -> None:
     with made(on_worker_loss="raise") as (env, link):
         env.reset(seed=1)
