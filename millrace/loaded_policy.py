@@ -19,7 +19,9 @@ from millrace.arguments import checked
 from millrace.learner.run_folder.run_folder import RunFolder
 from millrace.protocol.action_parts import make_nest
 from millrace.protocol.arrays import Array, Bools, Floats
+from millrace.protocol.bounds import one_line
 from millrace.protocol.envs.env_actions import action_leaves_of
+from millrace.protocol.envs.mask_forms import mask_array, masks_of_copies
 from millrace.protocol.errors import UsageError, check_at_least
 from millrace.protocol.policy.distributions import distribution
 from millrace.protocol.policy.masks import MASK, forbid, masked_distribution, no_choice
@@ -112,9 +114,9 @@ class LoadedPolicy:
                 observation is a dict or tuple of such arrays. The policy normalizes it if it was trained with normalization.
             first: For a recurrent policy: whether this observation is the first of an episode, as a bool or an array [n].
             mask: Which actions are allowed, in the form of `info["action_mask"]`: [choices] bool or int8, or a tuple with an
-                array for each entry of the action; or the masks of n observations, such as [n, choices]. If it is None, a
-                policy that was trained with masks in its Dict observations reads them there; otherwise all actions are
-                allowed.
+                array for each entry of the action; or the masks of n observations, such as [n, choices] or the
+                `infos["action_mask"]` of a vector environment. If it is None, a policy that was trained with masks in its
+                Dict observations reads them there; otherwise all actions are allowed.
 
         Raises `UsageError` if the observation isn't in the space, isn't finite, or has a different number of copies than the
         preceding `reset`, or if the mask has a wrong shape or allows no action.
@@ -169,16 +171,13 @@ class LoadedPolicy:
         """The mask as an array [1, n, choices]. Raises `UsageError` if it has a wrong shape or dtype or allows no action."""
         action = self.spec.action
         size = action.choices
-        parts = _parts_of_mask(mask, n)
-        total = sum(part.size for part in parts)
-        rows = 1 if total == size else n
-        are_bits = all(part.dtype.kind in "biu" and (rows == 1 or len(part) == rows) for part in parts)
-        if not size or total != rows * size or not are_bits:
+        one = mask_array(mask)
+        masks = [one] if _has_bits(one, size) else [mask_array(each) for each in masks_of_copies(mask, n)]
+        bits = [each.reshape(-1).astype(bool) for each in masks if each is not None and _has_bits(each, size)]
+        if not size or len(bits) < len(masks):
             expected = f"{size} zeros and ones of int8 or bool, or [{n}, {size}]" if size else "none for this action space"
-            got = ", ".join(f"{part.dtype}{list(part.shape)}" for part in parts)
-            raise UsageError(f"mask: expected {expected}, got {got}")
-        flat = np.concatenate([part.astype(bool).reshape(rows, -1) for part in parts], axis=1)
-        allowed: Bools = np.broadcast_to(flat, (1, n, size))
+            raise UsageError(f"mask: expected {expected}, got {_forms_of_mask(mask)}")
+        allowed: Bools = np.broadcast_to(bits, (1, n, size))
         if no_choice(allowed, action).any():
             raise UsageError("mask: expected an allowed choice for each entry of the action, got none")
         return allowed
@@ -227,20 +226,15 @@ def load(run: str | os.PathLike[str], *, best: bool = False, deterministic: bool
     return LoadedPolicy(Path(run), best=best, deterministic=deterministic, seed=seed)
 
 
-def _parts_of_mask(mask: npt.ArrayLike, n: int) -> list[Array]:
-    """The arrays of a mask for n observations: one array for each entry of the action, or a single array for all entries.
+def _has_bits(mask: Array | None, size: int) -> bool:
+    """Whether this is a mask of `size` choices."""
+    return mask is not None and mask.size == size and mask.dtype.kind in "biu"
 
-    A sequence has one array for each entry if its arrays have different shapes, or if it is a tuple of arrays [n, …], which
-    is how a vector environment returns a Tuple.
-    """
-    try:
-        parts = [np.asarray(part) for part in mask] if isinstance(mask, tuple | list) else []
-        in_tuple = isinstance(mask, tuple) and all(part.ndim > 1 and len(part) == n for part in parts)
-        if parts and (in_tuple or len({part.shape for part in parts}) > 1):
-            return parts
-        return [np.asarray(mask)]
-    except (ValueError, TypeError):  # raised for nested lists of different lengths
-        return [np.asarray(None)]
+
+def _forms_of_mask(mask: npt.ArrayLike) -> str:
+    """The dtypes and shapes of a mask's parts, for an error."""
+    parts = [mask_array(part) for part in (mask if isinstance(mask, tuple | list) else [mask])]
+    return one_line(", ".join("no array" if part is None else f"{part.dtype}{list(part.shape)}" for part in parts), 200)
 
 
 def _by_path(observation: Observation, path: str) -> Iterator[tuple[str, Any]]:

@@ -11,6 +11,7 @@ import msgspec
 import numpy as np
 import pytest
 from gymnasium import spaces
+from gymnasium.vector import SyncVectorEnv
 
 import millrace
 from millrace.launch.policy_workers import PlayingWorkers, policy_player
@@ -26,6 +27,7 @@ from millrace.protocol.errors import UsageError
 from millrace.protocol.messages import EpisodeRows
 from millrace.protocol.specs import PolicySpec, RunSpec
 from tests.support.in_process.collectors import TOY, random_weights, run_of
+from tests.support.users_code.mask_envs import SIZES, Parts
 
 STEPS = 30
 
@@ -295,6 +297,14 @@ def masked_policy(tmp_path: Path, sizes: Sequence[int] = (3, 3)) -> millrace.Loa
 MASKS_OF_ENTRIES = np.eye(3, dtype=np.int8)[[[2, 0], [1, 1], [0, 2], [2, 2]]]  # [n, entries, choices], one choice each
 
 
+def in_objects(masks: Any) -> Any:
+    """An array of objects, each a tuple with one mask for each entry: what a vector environment has in its infos."""
+    objects = np.empty(len(masks), object)
+    for n, mask in enumerate(masks):
+        objects[n] = tuple(mask)
+    return objects
+
+
 @pytest.mark.parametrize("n", [1, 2, 3, 4])
 @pytest.mark.parametrize(
     "form",
@@ -302,9 +312,24 @@ MASKS_OF_ENTRIES = np.eye(3, dtype=np.int8)[[[2, 0], [1, 1], [0, 2], [2, 2]]]  #
         lambda masks: masks.reshape(len(masks), -1),
         lambda masks: masks,
         lambda masks: list(masks),
+        lambda masks: list(masks.reshape(len(masks), -1)),
         lambda masks: tuple(masks[:, entry] for entry in range(2)),
+        in_objects,
+        lambda masks: list(in_objects(masks)),
+        lambda masks: tuple(in_objects(masks)),
+        lambda masks: tuple(masks.tolist()),
     ],
-    ids=["rows", "an array", "a list", "a tuple of entries"],
+    ids=[
+        "rows",
+        "an array",
+        "a list",
+        "a list of rows",
+        "a tuple of entries",
+        "objects",
+        "a list of tuples",
+        "a tuple of tuples",
+        "a tuple of lists",
+    ],
 )
 def test_masks_of_a_batch_may_have_each_form_that_environments_give_them(n: int, form: Any, tmp_path: Path) -> None:
     policy = masked_policy(tmp_path)
@@ -313,6 +338,20 @@ def test_masks_of_a_batch_may_have_each_form_that_environments_give_them(n: int,
     seen = np.zeros((n, 1), np.float32)
     assert policy({"x": seen}, mask=form(masks)).tolist() == expected
     assert policy({"x": seen, "action_mask": form(masks)}).tolist() == expected
+
+
+@pytest.mark.parametrize("convert", [lambda masks: masks, list, tuple], ids=["as they are", "a list", "a tuple"])
+@pytest.mark.parametrize("n", [1, len(SIZES), 4])
+def test_the_masks_of_a_vector_environment_may_have_entries_of_different_sizes(n: int, convert: Any, tmp_path: Path) -> None:
+    envs = SyncVectorEnv([Parts] * n)
+    spec = PolicySpec(observation_leaves(Parts.observation_space), action_spec(Parts.action_space))
+    policy = millrace.load(
+        folder_of(RunSpec(EnvSpec("Parts-v0"), spec, 8, copies=1, lanes=1, seed=1, masked=True), tmp_path)
+    )
+    for seed in range(5):
+        observation, infos = envs.reset(seed=seed)
+        envs.step(policy(observation, mask=convert(infos["action_mask"])))  # raises for an action that isn't allowed
+    envs.close()
 
 
 @pytest.mark.parametrize("sizes", [(3, 3), (3, 2)])

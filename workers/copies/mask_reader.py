@@ -17,6 +17,7 @@ import numpy as np
 from millrace.protocol.arrays import Array, Bools
 from millrace.protocol.bounds import one_line
 from millrace.protocol.envs.action_masks import has_mask
+from millrace.protocol.envs.mask_forms import mask_array, masks_of_copies
 from millrace.protocol.envs.spaces import action_spec
 from millrace.protocol.errors import safe_repr
 from millrace.protocol.policy.masks import MASK, no_choice
@@ -60,7 +61,7 @@ class MaskReader:
         count = len(terminated)
         given = (observation if self._in_observation else infos).get(MASK)
         there = np.ones(count, bool) if self._in_observation else np.asarray(infos.get(f"_{MASK}", np.ones(count, bool)))
-        rows = _rows(given, count)
+        rows = masks_of_copies(given, count)
         found = np.ones((count, self._choices), bool)
         for n in np.flatnonzero(~np.asarray(terminated, bool)).tolist():
             found[n] = self._mask(n, rows[n] if there[n] else None, bool(truncated[n]))
@@ -89,7 +90,7 @@ class MaskReader:
             if ended:
                 return self.everything
             raise self._wrong(n, "none")
-        array = _as_array(value)
+        array = mask_array(value)
         if array is None or array.size != self._choices or array.dtype.name not in DTYPES:
             raise self._wrong(n, _shown(value, array))
         mask: Bools = array.reshape(-1).astype(bool)
@@ -105,25 +106,6 @@ class MaskReader:
         parts = "" if len(self._action.sizes) < 2 else f" ({' + '.join(map(str, self._action.sizes))})"
         expected = f"expected {self._choices}{parts} zeros and ones of int8 or bool in {self._where}, at least one allowed"
         return CopyFailed(n, line=f"{MASK}: {expected}, got {got}; fix the environment, or set action_masks to none")
-
-
-def _as_array(value: Any) -> Array | None:
-    """A mask as one array; a list or tuple of masks for several entries is concatenated. None if numpy can't read it."""
-    try:
-        if isinstance(value, tuple | list) and value and np.ndim(value[0]):
-            return np.concatenate([np.asarray(part).reshape(-1) for part in value])
-        return np.asarray(value)
-    except Exception:  # nested lists of different lengths, or a user-defined object
-        return None
-
-
-def _rows(given: Any, count: int) -> Sequence[Any]:
-    """Split a vector environment's masks into one value per copy. For a Tuple space, `given` is a tuple of arrays [N, …]."""
-    if isinstance(given, tuple) and all(len(part) == count for part in given):
-        return list(zip(*given, strict=True))
-    if isinstance(given, np.ndarray | list) and len(given) == count:
-        return list(given)
-    return [given] * count  # no mask, or a value that `_mask` refuses
 
 
 def _shown(value: Any, array: Array | None) -> str:
