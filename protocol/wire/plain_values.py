@@ -4,7 +4,8 @@ A value is plain if it is None, a bool, int, float, complex, str, bytes, list, t
 bools, numbers, text, bytes, dates or durations, or a numpy array of plain objects. Strings with a lone surrogate, which
 UTF-8 cannot encode, and integers with more decimal digits than Python converts are not plain. A value that isn't plain
 raises `TypeError`; if the caller asks for it, the value is instead sent as its `repr` and arrives as a `ReprString`, which
-cannot be confused with a string. For such a caller, subclasses of dict are plain too: they arrive as dicts.
+cannot be confused with a string. For such a caller, subclasses of dict, list and tuple are plain too: they arrive as dicts,
+lists and tuples. Other numbers, and objects that numpy reads as numbers, such as tensors, arrive as numpy scalars or arrays.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ import numpy as np
 from millrace.protocol.errors import BadMessage, safe_repr
 
 DTYPE_KINDS = "biufcSUmM"
+NUMBER_KINDS = "biuf"
 MAX_DEPTH = 32
 MAX_REPR = 1000  # characters
 MOST_WITH_ONE_HASH = 64  # limit on the keys of a dict with the same hash, because Python compares each with all others
@@ -35,7 +37,9 @@ class ReprString(str):
 
 
 def pack(value: object, use_repr: bool = False) -> bytes:
-    """Convert a plain value to bytes. For any other value, packs its `repr` if `use_repr`; otherwise raises `TypeError`."""
+    """Convert a plain value to bytes. For any other value, packs numbers or its `repr` if `use_repr`; otherwise, raises
+    `TypeError`.
+    """
     return _pack(_to_msgpack(value, "", use_repr, 0))
 
 
@@ -74,9 +78,9 @@ def _to_msgpack(value: Any, where: str, use_repr: bool, depth: int) -> Any:
         return value
     if kind is int and (digits := _digits(value)) is not None:
         return msgpack.ExtType(_INT, digits)
-    if kind is list:
+    if kind is list or (use_repr and isinstance(value, list)):
         return [_to_msgpack(inner, f"{where}[{i}]", use_repr, depth + 1) for i, inner in enumerate(value)]
-    if kind is tuple:
+    if kind is tuple or (use_repr and isinstance(value, tuple)):
         inside = [_to_msgpack(inner, f"{where}[{i}]", use_repr, depth + 1) for i, inner in enumerate(value)]
         return msgpack.ExtType(_TUPLE, _pack(inside))
     if kind is dict or (use_repr and isinstance(value, dict)):
@@ -85,7 +89,7 @@ def _to_msgpack(value: Any, where: str, use_repr: bool, depth: int) -> Any:
         ]
         if all(type(key) is str and _is_encodable(key) for key in value):
             return dict(zip(value, inside, strict=True))
-        keys = [_to_msgpack(key, f"{where} key", use_repr, depth + 1) for key in value]
+        keys = [_key(key, f"{where} key", use_repr, depth + 1) for key in value]
         return msgpack.ExtType(_PAIRS, _pack([keys, inside]))
     if kind is complex:
         return msgpack.ExtType(_COMPLEX, _pack([value.real, value.imag]))
@@ -100,9 +104,38 @@ def _to_msgpack(value: Any, where: str, use_repr: bool, depth: int) -> Any:
     if isinstance(value, np.generic) and value.dtype.kind in DTYPE_KINDS:
         return msgpack.ExtType(_SCALAR, _pack([value.dtype.str, value.tobytes()]))
     if use_repr:
-        return msgpack.ExtType(_REPR, safe_repr(value)[:MAX_REPR].encode(errors="backslashreplace"))
+        numbers = _numbers(value)
+        return _repr(value) if numbers is None else _to_msgpack(numbers, where, use_repr, depth)
     got = {str: "text with a lone surrogate", int: "an integer with too many digits"}.get(kind, kind.__name__)
     raise TypeError(f"{where or 'value'}: expected plain data (numbers, strings, lists, dicts, arrays), got {got}")
+
+
+def _key(key: Any, where: str, use_repr: bool, depth: int) -> Any:
+    """Convert a key of a dict. A key that isn't plain becomes its `repr`, because an array can't be a key."""
+    try:
+        return _to_msgpack(key, where, False, depth)
+    except TypeError:
+        if use_repr:
+            return _repr(key)
+        raise
+
+
+def _numbers(value: Any) -> Any:
+    """The scalar or array that numpy reads from a number of another type, or from an object with numpy's protocol.
+
+    None if the value is neither, or if numpy doesn't read numbers from it.
+    """
+    try:
+        if isinstance(value, int | float) or hasattr(value, "__array__"):
+            array = np.asarray(value)
+            return array[()] if array.dtype.kind in NUMBER_KINDS else None
+    except Exception:  # user-defined objects may raise anything
+        pass
+    return None
+
+
+def _repr(value: Any) -> msgpack.ExtType:
+    return msgpack.ExtType(_REPR, safe_repr(value)[:MAX_REPR].encode(errors="backslashreplace"))
 
 
 def _is_encodable(text: str) -> bool:

@@ -168,7 +168,7 @@ class Stepper:
 
 
 def pack_infos(infos: CopyInfos) -> bytes:
-    """Pack the infos as bytes; empty if there are none. Values that aren't plain are replaced by their `repr`."""
+    """Pack the infos as bytes; empty if there are none. Values that aren't plain arrive as numbers or as their `repr`."""
     return pack(infos, use_repr=True) if infos else b""
 
 

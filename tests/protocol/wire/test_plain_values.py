@@ -6,7 +6,8 @@ import itertools
 from collections import OrderedDict, defaultdict
 from collections.abc import Callable
 from contextlib import suppress
-from typing import Any
+from enum import IntEnum
+from typing import Any, NamedTuple
 
 import msgpack
 import numpy as np
@@ -129,6 +130,66 @@ def test_a_subclass_of_dict_arrives_as_a_dict_if_asked_so() -> None:
     assert bit_equal(unpack(pack([OrderedDict(b=counts)], use_repr=True)), [{"b": {"a": 1}}])
     with pytest.raises(TypeError, match="got defaultdict"):
         pack({"level": counts})
+
+
+class Level(IntEnum):
+    LOW = 3
+
+
+class Seconds(float):
+    """A number of a type of its own."""
+
+
+class Pair(NamedTuple):
+    left: Any
+    right: Any
+
+
+class Many(list[Any]):
+    """A list of a type of its own."""
+
+
+class Tensor:
+    """An object of another package that numpy can read."""
+
+    def __init__(self, array: Any) -> None:
+        self._array = array
+
+    def __array__(self, dtype: Any = None, copy: Any = None) -> Any:
+        if isinstance(self._array, Exception):
+            raise self._array
+        return np.asarray(self._array)
+
+    def __repr__(self) -> str:
+        return "<tensor>"
+
+
+@pytest.mark.parametrize(
+    ("value", "arrives"),
+    [
+        (Level.LOW, np.int64(3)),
+        (Seconds(2.5), np.float64(2.5)),
+        (np.ma.masked_array([1, 0], [True, False], np.int8), np.array([1, 0], np.int8)),
+        (Tensor(np.float32(0.5)), np.float32(0.5)),
+        (Tensor(np.eye(2, dtype=bool)), np.eye(2, dtype=bool)),
+        (Pair(Level.LOW, Many([1, Tensor(np.zeros(2))])), (np.int64(3), [1, np.zeros(2)])),
+    ],
+    ids=["int", "float", "masked array", "scalar tensor", "tensor", "sequences"],
+)
+def test_what_numpy_reads_as_numbers_arrives_as_numbers_if_asked_so(value: Any, arrives: Any) -> None:
+    assert bit_equal(unpack(pack({"a": value}, use_repr=True)), {"a": arrives})
+    with pytest.raises(TypeError, match=r"^a: expected plain data"):
+        pack({"a": value})
+
+
+@pytest.mark.parametrize("array", [RuntimeError("requires grad"), np.array([None]), np.array(["a"])])
+def test_other_objects_that_numpy_reads_are_shown_if_asked_so(array: Any) -> None:
+    assert unpack(pack({"a": Tensor(array)}, use_repr=True)) == {"a": "<tensor>"}
+
+
+def test_keys_that_numpy_reads_as_numbers_are_shown_because_an_array_cannot_be_a_key() -> None:
+    keys = {Tensor(np.zeros(2)): 1, (1, Tensor(np.zeros(2))): 2}
+    assert unpack(pack(keys, use_repr=True)) == {"<tensor>": 1, "(1, <tensor>)": 2}
 
 
 def test_what_is_too_deep_is_refused() -> None:
