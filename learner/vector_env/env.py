@@ -192,6 +192,11 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
 
     # ---------------------------------------------------------------- some lanes, while others step
 
+    def incarnations(self) -> list[int]:
+        """For each copy, a number that rises when the copy is lost with its worker and a new one replaces it."""
+        lanes = self.hub.coordinator.lanes
+        return [lanes[lane].incarnation for lane in self._layout.lanes for _ in self._layout.copies(lane)]
+
     def begin_step(self, lanes: Sequence[int], actions: Any) -> None:
         """Start a step of these lanes; others may still be stepping. `actions` has a row for every copy of all lanes."""
         self._check_idle("begin_step", of_sent=True)

@@ -8,7 +8,7 @@ others wait, the lanes are stepped in two parts: the policy acts for one part wh
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from typing import Any, Protocol, TypeVar
 
@@ -29,6 +29,7 @@ from millrace.workers.copies.episode_facts import Facts, facts_of_info
 from millrace.workers.copies.mask_reader import MaskReader
 
 METHODS = ("close", "render", "reset", "step")  # every environment has these methods
+RESETS = 3  # how often copies are reset if each reset loses a worker, and with it the attributes that were set
 Result = TypeVar("Result")
 
 
@@ -54,6 +55,9 @@ class StepsSomeLanes(Protocol):
     """A vector environment that can step some of its lanes while others step."""
 
     calls: Any
+
+    def incarnations(self) -> Sequence[int]:
+        """For each copy, a number that rises when the copy is lost and a new one replaces it."""
 
     def begin_step(self, lanes: Sequence[int], actions: Any) -> None:
         """Order the copies of these lanes to step. `actions` has a row for every copy of the vector environment."""
@@ -104,7 +108,8 @@ class SplitVectorEnv:
         self._result: StepResult | None = None
         self._no_workers: NoWorkers | None = None
         self._assigned: dict[tuple[int, str], tuple[slice, bytes]] = {}  # attributes that were set, by first copy and name
-        self._missing: set[tuple[int, str]] = set()  # attributes that replacements of lost copies may lack
+        self._missing: set[tuple[int, str]] = set()  # attributes that replacements of lost copies lack
+        self._incarnations: Sequence[int] = ()  # of each copy, at the last look for such replacements
 
     def open_lane(self, run: RunSpec, lane: int, pulse: Pulse) -> EnvCopies:
         """The copies of this lane. Pass this method to a `Collector` as its `open_copies`."""
@@ -167,8 +172,7 @@ class SplitVectorEnv:
         """Order these lanes to step with these actions. `copies` are the copies of the lanes."""
         assert self._some is not None
         begin_step = self._some.begin_step
-        if self._missing:
-            self._assign_again(set(copies), pulse)
+        self._assign_missing(set(copies), pulse)
         if self._actions is None:
             self._actions = np.resize(actions, (self.env.num_envs, *actions.shape[1:]))  # arbitrary, but valid
         padded = self._actions
@@ -190,7 +194,6 @@ class SplitVectorEnv:
         if lost_rows := [n for n, info in infos.items() if info.get("worker_lost") is True]:
             lost = np.zeros(count, bool)
             lost[lost_rows] = True
-            self._missing.update(self._assigned)
         facts: Facts = {}
         if self.facts:
             ended = np.zeros(count, bool)
@@ -229,13 +232,21 @@ class SplitVectorEnv:
         )
 
     def reset(self, copies: slice, seeds: Sequence[int], pulse: Pulse) -> Leaves:
-        """Start episodes in these copies, with a seed for each."""
+        """Start episodes in these copies, with a seed for each.
+
+        If a worker is lost meanwhile, the new copies are reset again, after they have got the attributes of the lost ones.
+        """
         mask = np.zeros(self.env.num_envs, bool)
         mask[copies] = True
         all_seeds: list[Any] = [None] * self.env.num_envs
         all_seeds[copies] = seeds
         options = {"reset_mask": mask}
-        observation, _ = self._wait(lambda: self.env.reset(seed=all_seeds, options=options), pulse)
+        chosen = set(range(copies.start, copies.stop))
+        for _ in range(RESETS):
+            self._assign_missing(chosen, pulse)
+            observation, _ = self._wait(lambda: self.env.reset(seed=all_seeds, options=options), pulse)
+            if not self._lacking(chosen):
+                break
         leaves: Leaves = self._read(observation)
         if self._masks is not None:
             leaves = [*leaves, self._read_masks(self._masks, observation, ~mask, np.zeros_like(mask))]
@@ -243,11 +254,12 @@ class SplitVectorEnv:
 
     def assign(self, copies: slice, name: str, packed: bytes, pulse: Pulse) -> None:
         """Set an attribute of these copies, and of later replacements for lost ones."""
+        assert self._some is not None
+        if not self._assigned:
+            self._incarnations = self._some.incarnations()
         self._assigned[copies.start, name] = copies, packed
-        try:
-            self._wait(lambda: self._assign_now(copies, name, packed), pulse)
-        except WorkerLost:
-            self._missing.update(self._assigned)
+        self._missing.add((copies.start, name))
+        self._assign_missing(set(range(copies.start, copies.stop)), pulse)
 
     def _assign_now(self, copies: slice, name: str, packed: bytes) -> None:
         chosen = range(copies.start, copies.stop)
@@ -269,20 +281,27 @@ class SplitVectorEnv:
         except AttributeError:
             return False
 
-    def _assign_again(self, stepped: set[int], pulse: Pulse) -> None:
-        """Before these copies are stepped, set the attributes that they may lack. Other copies are left for later.
+    def _assign_missing(self, chosen: set[int], pulse: Pulse) -> None:
+        """Before these copies are stepped or reset, set the attributes that they lack. Other copies are left for later.
 
-        Other copies may be in the middle of a step. If a worker is lost meanwhile, the next step tries again.
+        Other copies may be in the middle of a step. If a worker is lost meanwhile, the next step or reset tries again.
         """
-        for key in sorted(self._missing):
+        for key in self._lacking(chosen):
             copies, packed = self._assigned[key]
-            if stepped.isdisjoint(range(copies.start, copies.stop)):
-                continue
-            self._missing.discard(key)
-            try:
+            with suppress(WorkerLost):
                 self._wait(partial(self._assign_now, copies, key[1], packed), pulse)
-            except WorkerLost:
-                self._missing.update(self._assigned)
+                self._missing.discard(key)
+
+    def _lacking(self, chosen: set[int]) -> list[tuple[int, str]]:
+        """The attributes that some of these copies lack, because they have replaced lost copies."""
+        if not self._assigned:
+            return []
+        assert self._some is not None
+        before = self._incarnations
+        self._incarnations = self._some.incarnations()
+        new = {n for n, (old, now) in enumerate(zip(before, self._incarnations, strict=True)) if old != now}
+        self._missing.update(key for key, (copies, _) in self._assigned.items() if _overlap(new, copies))
+        return [key for key in sorted(self._missing) if _overlap(chosen, self._assigned[key][0])]
 
     def raise_if_no_workers(self) -> None:
         """Raise `NoWorkers` once, if a wait ended because no worker was left."""
@@ -298,6 +317,10 @@ class SplitVectorEnv:
         except NoWorkers as error:
             self._no_workers = error
             raise
+
+
+def _overlap(chosen: set[int], copies: slice) -> bool:
+    return not chosen.isdisjoint(range(copies.start, copies.stop))
 
 
 class SplitLane:

@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from itertools import pairwise
 from typing import Any
 
+import gymnasium
 import msgspec
 import numpy as np
 import pytest
@@ -266,3 +267,54 @@ def test_replacements_of_lost_copies_get_the_attributes_when_their_part_is_stepp
         split.end([1, 2], no_pulse)
         split.end([0], no_pulse)
         assert env.get_attr("level") == (5,) * LANES
+
+
+class Leveled(gymnasium.Env[Any, Any]):
+    """Shows its level at the reset, which then rises by one."""
+
+    observation_space = gymnasium.spaces.Box(-9, 9, (1,), np.float32)
+    action_space = gymnasium.spaces.Discrete(2)
+    level = 0
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        self._shown = np.full(1, self.level, np.float32)
+        self.level += 1
+        return self._shown, {}
+
+    def step(self, action: Any) -> Any:
+        return self._shown, 1.0, False, False, {}
+
+
+gymnasium.register("Leveled-v0", f"{__name__}:Leveled", disable_env_checker=True)
+
+
+@pytest.mark.parametrize("lost", ["before", "noticed before", "during"])
+@pytest.mark.parametrize("shared", [True, False], ids=["shared memory", "messages"])
+def test_copies_that_replace_lost_ones_in_a_reset_get_the_attributes_before_it(lost: str, shared: bool) -> None:
+    """And attributes that an environment has changed are not set again on copies that were not lost."""
+    name = f"{__name__}:Leveled-v0"
+    run = run_of(name, N=2)
+    with any_order(VectorEnvSettings(name, 2 * LANES, lanes=LANES), LANES, shared=shared) as (env, link):
+        split = SplitVectorEnv(env, LANES, some=env)
+        lanes = [split.open_lane(run, n, no_pulse) for n in range(LANES)]
+        for lane in lanes:
+            lane.assign("level", pack(5), no_pulse)
+        seen = [lane.reset([0, 1], no_pulse) for lane in lanes[:-1]]
+        if lost == "during":
+            link.frozen = {"w2"}
+            leave = iter([lambda: link.leave("w2")])
+            env.hub.while_waiting = lambda: next(leave, lambda: None)()
+        else:
+            link.leave("w2")
+        if lost == "noticed before":
+            env.hub.listen()
+        seen.append(lanes[-1].reset([0, 1], no_pulse))
+        assert [[leaf.tolist() for leaf in leaves] for leaves in seen] == [[[[5.0]] * 2]] * LANES
+        assert env.get_attr("level") == (6,) * 2 * LANES
+        split.begin([0], np.zeros((1, 2), np.int64), no_pulse)
+        split.begin([1, 2], np.zeros((2, 2), np.int64), no_pulse)
+        split.end([0], no_pulse)
+        split.end([1, 2], no_pulse)
+        assert split.result(slice(0, 2 * LANES)).reward.tolist() == [1.0] * 2 * LANES
+        assert env.get_attr("level") == (6,) * 2 * LANES
