@@ -723,7 +723,8 @@ def interrupted_reset_of_lost_copies(lost: str, **changes: Any) -> Iterator[ZmqV
             env.reset(seed=2)
         env.hub.while_waiting = lambda: None
         link.frozen = set()
-        link.join("w2"), link.join("w3")
+        for worker in ("w2", "w3"):
+            link.join(worker)
         env.hub.wait_for(2, 1.0)
         yield env
 

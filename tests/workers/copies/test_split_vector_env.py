@@ -227,6 +227,9 @@ def test_a_dropped_rollout_abandons_the_steps_under_way() -> None:
     class Abandons(InfosByRow):
         calls = None
 
+        def incarnations(self) -> Sequence[int]:
+            return [0] * self.num_envs
+
         def begin_step(self, lanes: Sequence[int], actions: Any) -> None:
             pass
 
