@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import pickletools
 from dataclasses import dataclass
+from enum import Enum, auto
 from typing import NamedTuple
 
 VALUES = {"NONE", "NEWTRUE", "NEWFALSE", "BININT", "BININT1", "BININT2", "LONG1", "LONG4", "BINFLOAT", "BINUNICODE"}
@@ -21,9 +22,9 @@ TUPLES = {"EMPTY_TUPLE": 0, "TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3}
 
 REBUILD = {f"torch._utils {name}" for name in ("_rebuild_tensor_v2", "_rebuild_tensor_v3", "_rebuild_parameter")}
 """Functions that create a view of a storage. torch then checks the size of the view."""
-HOOKS = "collections OrderedDict"  # the empty dict of a tensor's hooks
+ORDERED = "collections OrderedDict"  # the empty dict of a tensor's hooks; also the dict that a module's `state_dict` returns
 BYTES = "_codecs encode"  # creates a bytes object, whose content the pickle holds as text
-CALLED = REBUILD | {HOOKS, BYTES}
+CALLED = REBUILD | {ORDERED, BYTES}
 MOST_KEY = 1 << 60  # limit on the size of a number that is a key; larger numbers may all have the same hash
 MOST_REPEATED = 1 << 20  # limit on how often a visitor finds an object that it has already found,
 REPEATED_PER_BYTE = 16  # plus this number for each byte of the pickle, because many dicts have the same keys
@@ -38,12 +39,19 @@ class _Function(NamedTuple):
     name: str
 
 
+class _DictKind(Enum):
+    """Stands for a dict. An `OrderedDict` may have attributes, which a plain dict contains."""
+
+    PLAIN = auto()
+    ORDERED = auto()
+
+
 @dataclass(slots=True)
 class _Made:
     """An object that the loader would create."""
 
     value: object
-    """a number, a text, a function, or a tuple of these; None for anything else"""
+    """a number, a text, a function, the kind of a dict, or a tuple of these; None for anything else"""
     values: int = 1
     """the number of objects that a visitor finds in it; an object that occurs several times counts several times"""
     used_again: bool = False
@@ -69,7 +77,7 @@ def rehearse(content: bytes) -> None:
             case name, _ if name in VALUES:
                 stack.append(_Made(argument))
             case name, _ if name in CONTAINERS:
-                stack.append(_Made(None))
+                stack.append(_Made(_DictKind.PLAIN if name == "EMPTY_DICT" else None))
             case name, _ if name in TUPLES:
                 _gather(stack, len(stack) - TUPLES[name])
             case "TUPLE", _:
@@ -101,10 +109,12 @@ def rehearse(content: bytes) -> None:
                 bytes_left -= _cost(called.value, arguments.value)
                 if bytes_left < 0:
                     raise Unfit("it has more bytes objects than fit into the file")
-                stack.append(_Made(None))
+                stack.append(_Made(_DictKind.ORDERED if called.value == _Function(ORDERED) else None))
+            case "BUILD", _ if (stack[-2].value, stack[-1].value) == (_DictKind.ORDERED, _DictKind.PLAIN):
+                _add(stack, len(stack) - 1)  # attributes, such as a module's `_metadata`
             case name, _:
                 got = str(argument).replace(" ", ".") if name == "GLOBAL" else f"the opcode {name}"
-                raise Unfit(f"expected a pickle of tensors and plain data, got {got}")
+                raise Unfit(f"expected tensors and plain data, got {got}")
 
 
 def _gather(stack: list[_Made], first: int) -> None:
@@ -131,7 +141,7 @@ def _set_items(stack: list[_Made], first: int) -> None:
     """Move keys and values, from index `first` on, into the dict below them. Raises `Unfit` for a key that isn't allowed."""
     for key in stack[first::2]:
         if not may_be_key(key.value):
-            raise Unfit("expected a pickle of tensors and plain data, got a key that is neither text nor a small number")
+            raise Unfit("expected tensors and plain data, got a key that is neither text nor a small number")
     _add(stack, first)
 
 
@@ -141,7 +151,7 @@ def _check_storage(storage: object) -> None:
         case "storage", _Function(), str(), str(), int():
             pass
         case _:
-            raise Unfit("expected a pickle of tensors and plain data, got a storage of another form")
+            raise Unfit("expected tensors and plain data, got a storage of another form")
 
 
 def _cost(called: object, arguments: object) -> int:
@@ -149,11 +159,11 @@ def _cost(called: object, arguments: object) -> int:
     match called, arguments:
         case _Function(name), tuple() if name in REBUILD:
             return 0
-        case _Function(name), () if name == HOOKS:
+        case _Function(name), () if name == ORDERED:
             return 0
         case _Function(name), (str(text), "latin1") if name == BYTES:
             return len(text)
         case _Function(name), _:
-            raise Unfit(f"expected a pickle of tensors and plain data, got a call of {name.replace(' ', '.')}")
+            raise Unfit(f"expected tensors and plain data, got a call of {name.replace(' ', '.')}")
         case _:
-            raise Unfit("expected a pickle of tensors and plain data, got a call of something that isn't a function")
+            raise Unfit("expected tensors and plain data, got a call of something that isn't a function")

@@ -41,12 +41,12 @@ LEARNER = {  # what each folder of the learner may import of the learner; train.
         "run_state",
     },
     "callbacks": {"config", "run_folder"},
-    "algorithm_check": {"algorithms", "config", "torch_setup"},
+    "algorithm_check": {"algorithms", "config", "torch_setup", "written_state"},
     "members": set[str](),
     "rollouts": {"members", "run_folder"},
     "shards": {"algorithms", "config", "interrupts", "run_folder", "torch_setup"},
     "vector_env": {"members"},
-    "run_folder": {"rehearsed_pickle"},
+    "run_folder": {"written_state"},
 }
 WORKERS = {  # the same for each folder and file of the workers; the files that are not named stand above all of these
     "activity": set[str](),

@@ -38,6 +38,7 @@ from millrace.learner.algorithms.algorithm import wrong_weights
 from millrace.learner.config.algorithm_names import name_of, settings_record
 from millrace.learner.config.hyperparameters import AlgorithmConfig
 from millrace.learner.torch_setup import one_thread
+from millrace.learner.written_state import write_state
 from millrace.protocol.bounds import one_line
 from millrace.protocol.errors import UsageError, first_line
 from millrace.protocol.policy.own_encoder import describe_encoder
@@ -269,10 +270,7 @@ def a_saved_state_goes_on_as_if_nothing_had_happened(subject: Subject) -> Iterat
     state = saved.state_dict()
     kept = copy.deepcopy(state)
     file = io.BytesIO()
-    if odd := _not_plain(state):
-        yield f"state_dict{odd}: expected tensors, numbers, text, and lists and dicts of these; a checkpoint takes no more"
-        return
-    torch.save(state, file)
+    write_state(file, state, state, "state_dict")
     file.seek(0)
     loaded = torch.load(file, weights_only=True)
     restored.load_state_dict(loaded)
@@ -452,18 +450,6 @@ def _undisturbed() -> Iterator[None]:
         torch.set_rng_state(of_torch)
         np.random.set_state(of_numpy)
         random.setstate(of_python)
-
-
-def _not_plain(state: object, where: str = "") -> str:
-    """The path to the first object in this state that can't be stored in a checkpoint; empty if there is none."""
-    match state:
-        case dict():
-            return next((why for key, value in state.items() if (why := _not_plain(value, f"{where}[{key!r}]"))), "")
-        case list() | tuple():
-            return next((why for i, value in enumerate(state) if (why := _not_plain(value, f"{where}[{i}]"))), "")
-        case torch.Tensor():
-            return ""
-    return "" if type(state) in (bool, int, float, str, bytes, type(None)) else where or " "
 
 
 def _raised(what: str, error: Exception) -> str:

@@ -121,7 +121,10 @@ class Algorithm(ABC):
 
     @abstractmethod
     def state_dict(self) -> dict[str, Any]:
-        """A copy of everything that the next update depends on: tensors, numbers, text, and lists and dicts of these."""
+        """A copy of everything that the next update depends on: tensors, numbers, text, and lists and dicts of these.
+
+        Keys are text or whole numbers. The state of a PyTorch module or optimizer may be among it.
+        """
 
     @abstractmethod
     def load_state_dict(self, state: dict[str, Any]) -> None:

@@ -34,12 +34,12 @@ Write = Callable[[], object]
 def write_atomically(target: Path, write: Callable[[BinaryIO], object], *, flush: bool = True) -> None:
     """Let `write` fill a new file, and replace the target with it. Raises what `write` or the file system raises.
 
-    If `flush`, waits until the file is on the disk.
+    `write` may read what it has written. If `flush`, waits until the file is on the disk.
     """
     temporary = target.with_name(target.name + TEMPORARY)
     temporary.unlink(missing_ok=True)  # it may be left from a process that was killed, or be a link
     try:
-        with os.fdopen(open_regular(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL), "wb") as file:
+        with os.fdopen(open_regular(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL), "w+b") as file:
             write(file)
             if flush:
                 file.flush()

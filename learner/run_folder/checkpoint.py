@@ -5,32 +5,27 @@ Rule: a checkpoint is written atomically; a resumed run uses the newest undamage
 `bit_generator.state`. torch's loader does not detect damaged data, so the checksums of the file (a zip archive) are verified
 first. The file must contain every element of a tensor, because a tensor with a stride of 0 has only a few bytes in the file,
 but could grow to any size when copied. The loader's calls are also checked in advance, because they could fill the memory
-(`learner/rehearsed_pickle.py`). `archive_directory.py` ensures that the loader reads the same pickle that was checked.
+(`learner/rehearsed_pickle.py`). `archive_directory.py` ensures that the loader reads the same pickle that was checked. A
+file that would not pass these checks is not written (`learner/written_state.py`).
 """
 
 from __future__ import annotations
 
 import os
 import zipfile
-from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
-from millrace.learner.rehearsed_pickle import may_be_key, rehearse
 from millrace.learner.run_folder.archive_directory import check_directory
 from millrace.learner.run_folder.atomic_write import TEMPORARY, write_atomically
 from millrace.learner.run_folder.regular_files import open_regular, reason, regular_files, subfolder
-from millrace.protocol.errors import CheckpointError, UsageError
-
-if TYPE_CHECKING:
-    from torch import Tensor
+from millrace.learner.written_state import check_memory, check_pickles, write_state
+from millrace.protocol.errors import CheckpointError
 
 FORMAT = 1
 FOLDER = "checkpoints"
 SUFFIX = ".pt"
 ZIP_BEGINS = b"PK\x03\x04"  # if a file begins with anything else, torch reads a pickle before the archive
-PICKLE = "data.pkl"  # suffix of the pickle's name in the archive; torch accepts capital letters, too
-MOST_VIEWS = 16  # limit on views of the same numbers; an algorithm may save parts of a tensor in addition to the whole
 
 
 class Checkpoint(NamedTuple):
@@ -68,16 +63,13 @@ def save(folder: Path, state: dict[str, Any], env_steps: int, keep: int) -> Path
     are damaged. Raises `CheckpointError` if the checkpoint cannot be written; older ones are then untouched. Raises
     `UsageError` if the state contains something that could not be read back.
     """
-    import torch
-
-    _check_plain(state, "state")
     path = folder / FOLDER / f"{env_steps:012d}{SUFFIX}"
     record = {"format": FORMAT, "env_steps": env_steps, "state": state}
     try:
         subfolder(folder, FOLDER)
         for left in regular_files(folder, f"{FOLDER}/*{TEMPORARY}"):  # left by a process that was killed
             left.unlink()
-        write_atomically(path, lambda file: torch.save(record, file))
+        write_atomically(path, lambda file: write_state(file, record, state, "checkpoint: state"))
         for old in [each for each in _files(folder) if each <= path][:-keep]:
             old.unlink()
     except (OSError, RuntimeError) as error:
@@ -140,13 +132,11 @@ def _read(path: Path) -> Checkpoint:
                     raise _Unreadable("it is compressed, which torch never does")  # decompressing it could fill the memory
                 if (damaged := archive.testzip()) is not None:
                     raise _Unreadable(f"checksum of {damaged} does not match")
-                for entry in archive.infolist():
-                    if entry.filename.lower().endswith(PICKLE):
-                        rehearse(archive.read(entry))
+                check_pickles(archive)
             size = file.seek(0, os.SEEK_END)
             file.seek(0)
             record = torch.load(file, map_location="cpu", weights_only=True)
-        _check_memory(record, size)
+        check_memory(record, size)
     except _Unreadable:
         raise
     except Exception as error:  # zipfile and torch raise a dozen types for damaged files
@@ -162,72 +152,3 @@ def _read(path: Path) -> Checkpoint:
             return Checkpoint(path, env_steps, state)
         case _:
             raise _Unreadable("it has no state")
-
-
-def _check_memory(record: object, size: int) -> None:
-    """Raise `_Unreadable` if the tensors are larger than a file of `size` bytes can hold."""
-    tensors = list(_tensors(record))
-    if any(each.device.type != "cpu" or not _is_whole(each) for each in tensors):
-        raise _Unreadable("it has a tensor whose elements are not all in the file")
-    if sum(each.nbytes for each in tensors) > MOST_VIEWS * size:
-        raise _Unreadable("its tensors are larger than the file")
-
-
-def _tensors(record: object) -> Iterator[Tensor]:
-    """Yield each tensor once. Lists in a stranger's file may contain themselves, or one entry many times."""
-    import torch
-
-    seen: set[int] = set()
-    left = [record]
-    while left:
-        each = left.pop()
-        if id(each) in seen:
-            continue
-        seen.add(id(each))
-        match each:
-            case torch.Tensor():
-                yield each
-            case dict():
-                left += [*each.keys(), *each.values()]
-            case list() | tuple() | set():
-                left += each
-
-
-def _is_whole(tensor: Tensor) -> bool:
-    """Whether each element of a tensor has memory of its own."""
-    import torch
-
-    return tensor.layout == torch.strided and tensor.nbytes <= tensor.untyped_storage().nbytes()
-
-
-def _check_plain(value: object, where: str) -> None:
-    import torch
-
-    match value:
-        case dict():
-            for key, inner in value.items():
-                if not may_be_key(key):
-                    raise UsageError(
-                        f"checkpoint: {where}: expected strings and small whole numbers as keys, got {key!r:.100}; "
-                        "fix state_dict"
-                    )
-                _check_plain(inner, f"{where}[{key!r}]")
-        case list() | tuple():
-            for index, inner in enumerate(value):
-                _check_plain(inner, f"{where}[{index}]")
-        case torch.Tensor():
-            if type(value) not in (torch.Tensor, torch.nn.Parameter) or vars(value):
-                raise UsageError(
-                    f"checkpoint: {where}: expected a tensor without attributes, got a {type(value).__name__} with more; "
-                    "fix state_dict, for example with detach()"
-                )
-            if not _is_whole(value):
-                raise UsageError(
-                    f"checkpoint: {where}: expected a tensor with memory for each of its elements, got a sparse or an "
-                    "expanded one; fix state_dict, for example with clone()"
-                )
-        case bytes() if not value:
-            raise UsageError(f"checkpoint: {where}: expected bytes, got none, which torch cannot read back; fix state_dict")
-        case _ if type(value) not in (bool, int, float, str, bytes, type(None)):
-            got = f"{type(value).__module__}.{type(value).__name__}"
-            raise UsageError(f"checkpoint: {where}: expected tensors and plain data, got {got}; fix state_dict")

@@ -248,7 +248,7 @@ class SavesAnArray(ClippedPlus):
         (ReturnsNothing, "ReturnsNothing.update: expected a dict of metrics, got NoneType"),
         (TooFewWeights, "TooFewWeights.weights: parameters: expected float32[58], got float32[57]"),
         (DoublesAfterAnUpdate, "DoublesAfterAnUpdate.weights: parameters: expected float32[58], got float64[58]"),
-        (SavesAnArray, "state['algorithm']['odd']: expected tensors and plain data, got numpy.ndarray"),
+        (SavesAnArray, "state['algorithm']['odd'] (numpy.ndarray): expected tensors and plain data, got"),
     ],
     ids=lambda value: getattr(value, "__name__", ""),
 )

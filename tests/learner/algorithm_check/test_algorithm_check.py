@@ -183,6 +183,11 @@ class SavesAnArray(Sound):
         return super().state_dict() | {"more": {"array": np.zeros(3)}}
 
 
+class SavesCoordinates(Sound):
+    def state_dict(self) -> dict[str, Any]:
+        return super().state_dict() | {"visits": {(0, 1): 2}}
+
+
 class KeepsTheStateItLoads(Sound):
     average: torch.Tensor
 
@@ -243,7 +248,11 @@ MISTAKES: list[tuple[type, str]] = [
     (SwallowsWhatPulseRaises, "update: expected that it lets pass what pulse raises, got none"),
     (GivesTensors, "update: metric train/ratio: expected a name and a float, got Tensor"),
     (GivesItsLiveState, "state_dict['parameters']: expected a copy, got something that the next update changes"),
-    (SavesAnArray, "state_dict['more']['array']: expected tensors, numbers, text, and lists and dicts of these"),
+    (SavesAnArray, "state_dict['more']['array'] (numpy.ndarray): expected tensors and plain data, got "),
+    (
+        SavesCoordinates,
+        "state_dict['visits'] (builtins.dict): expected tensors and plain data, got a key that is neither text",
+    ),
     (KeepsTheStateItLoads, "load_state_dict: expected that it copies the state, got one whose next update changes"),
     (Raises, "update: ValueError at test_algorithm_check.py:"),
     (ReturnsOnlyALoss, "ReturnsOnlyALoss.loss: expected a 0-dimensional tensor that depends on"),
@@ -378,6 +387,25 @@ class Whole(Algorithm):
 
 def test_a_whole_algorithm_passes_and_rolls_back_by_its_base() -> None:
     check_algorithm(Whole, net=(16,))
+
+
+class WithAModule(Whole):
+    def __init__(self, *arguments: Any, **keywords: Any) -> None:
+        super().__init__(*arguments, **keywords)
+        self.model = torch.nn.Linear(2, 2)
+        self.model.requires_grad_(False).weight.fill_(0.5)
+        self.model.bias.zero_()
+
+    def state_dict(self) -> dict[str, Any]:
+        return super().state_dict() | {"model": copy.deepcopy(self.model.state_dict())}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        super().load_state_dict(state)
+        self.model.load_state_dict(state["model"])
+
+
+def test_an_algorithm_may_save_the_state_of_a_module() -> None:
+    check_algorithm(WithAModule, learns=False, net=(16,))
 
 
 class Lacking(Algorithm):

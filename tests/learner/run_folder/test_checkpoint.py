@@ -13,7 +13,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -214,7 +214,7 @@ def test_what_torch_would_make_of_a_few_bytes_is_refused_before_it_is_made(tmp_p
     """Such as a gigabyte in a file of 353 bytes. What is made here is small, so that the loader alone would take it."""
     path = tmp_path / "model.pt"
     torch.save({"format": 1, "env_steps": 3, "state": {"x": hostile}}, path)
-    with pytest.raises(CheckpointError, match=r"expected a pickle of tensors and plain data|more bytes objects than fit"):
+    with pytest.raises(CheckpointError, match=r"expected tensors and plain data|more bytes objects than fit"):
         checkpoint.load(path)
 
 
@@ -259,7 +259,7 @@ STORAGE = b"(X\x07\x00\x00\x00storagectorch\nFloatStorage\n%bX\x03\x00\x00\x00cp
 def test_keys_that_take_long_to_find_are_refused(tmp_path: Path, opcodes: bytes) -> None:
     path = tmp_path / "model.pt"
     with_pickle(path, b"\x80\x02" + opcodes + b".")
-    with pytest.raises(CheckpointError, match=r"expected a pickle of tensors and plain data, got a (key|storage)"):
+    with pytest.raises(CheckpointError, match=r"expected tensors and plain data, got a (key|storage)"):
         checkpoint.load(path)
 
 
@@ -398,25 +398,122 @@ def test_views_come_back(tmp_path: Path) -> None:
     assert all(torch.equal(found[name], saved[name]) for name in ("flat", "transposed"))
 
 
-def test_an_expanded_tensor_is_refused_before_it_is_written(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match=r"state\['flat'\]: expected a tensor with memory for each of its elements"):
-        checkpoint.save(tmp_path, {"flat": torch.zeros(1).expand(30)}, 100, keep=3)
+def refused(folder: Path, state: dict[str, Any]) -> str:
+    """Why the state is not written. Nothing of it stays on the disk."""
+    with pytest.raises(UsageError) as caught:
+        checkpoint.save(folder, state, 100, keep=3)
+    assert files(folder) == []
+    return str(caught.value)
 
 
-@pytest.mark.parametrize("stray", [b"", torch.nn.Buffer(torch.ones(1))], ids=["no bytes", "attributes"])
-def test_a_state_that_torch_would_read_otherwise_is_not_written(tmp_path: Path, stray: object) -> None:
-    with pytest.raises(UsageError, match=r"state\['inner'\]\[0\]: expected (bytes|a tensor without attributes), got"):
-        checkpoint.save(tmp_path, {"inner": [stray]}, 100, keep=3)
+def test_an_expanded_tensor_is_not_written(tmp_path: Path) -> None:
+    line = refused(tmp_path, {"flat": torch.zeros(1).expand(30)})
+    assert line.startswith(
+        "checkpoint: state['flat'] (torch.Tensor): expected tensors whose elements are all in the file, got"
+    )
 
 
-@pytest.mark.parametrize("stray", [np.float64(1.0), np.zeros(3), {1, 2}, np.random.default_rng(0)])
-def test_a_state_that_could_not_be_read_back_is_not_written(tmp_path: Path, stray: object) -> None:
-    with pytest.raises(UsageError, match=r"state\['inner'\]\[0\]: expected tensors and plain data, got"):
-        checkpoint.save(tmp_path, {"inner": [stray]}, 100, keep=3)
-    assert not (tmp_path / "checkpoints").exists()
+class OwnDict(dict[str, Any]):
+    pass
+
+
+class OwnTuple(NamedTuple):
+    x: int = 1
+
+
+def generator() -> Iterator[int]:
+    yield 1
+
+
+@pytest.mark.parametrize(
+    ("stray", "named"),
+    [
+        (b"", "builtins.bytes"),
+        (torch.nn.Buffer(torch.ones(1)), "torch.Tensor"),
+        (np.float64(1.0), "numpy.float64"),
+        (np.zeros(3), "numpy.ndarray"),
+        ({1, 2}, "builtins.set"),
+        (np.random.default_rng(0), "numpy.random._generator.Generator"),
+        (generator(), "builtins.generator"),
+        (OwnDict(), f"{__name__}.OwnDict"),
+        (OwnTuple(), f"{__name__}.OwnTuple"),
+        (torch.Size([1]), "torch.Size"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_what_could_not_be_read_back_is_not_written_and_named(tmp_path: Path, stray: object, named: str) -> None:
+    line = refused(tmp_path, {"whole": [torch.ones(3)], "inner": [stray]})
+    assert line.startswith(f"checkpoint: state['inner'][0] ({named}): expected tensors and plain data, got "), line
+    assert line.endswith("; fix state_dict")
 
 
 @pytest.mark.parametrize("key", [(1, 2), 0.5, None, True, 2**60, -(2**60)])
 def test_a_state_with_keys_that_could_not_be_read_back_is_not_written(tmp_path: Path, key: object) -> None:
-    with pytest.raises(UsageError, match=r"state\['inner'\]: expected strings and small whole numbers as keys, got"):
-        checkpoint.save(tmp_path, {"inner": {key: 1}}, 100, keep=3)
+    line = refused(tmp_path, {"inner": {key: 1}})
+    assert line.startswith("checkpoint: state['inner'] (builtins.dict): expected tensors and plain data, got a key that"), (
+        line
+    )
+
+
+def test_a_state_that_repeats_values_without_end_is_not_written(tmp_path: Path) -> None:
+    paired: Any = ()
+    for _ in range(40):
+        paired = (paired, paired)
+    assert "the same values too often" in refused(tmp_path, {"inner": [paired]})
+    within: list[Any] = []
+    within.append(within)
+    assert "changes after its use" in refused(tmp_path, {"inner": within})
+
+
+def test_the_state_of_a_module_comes_back(tmp_path: Path) -> None:
+    """It is an OrderedDict with an attribute."""
+    net = torch.nn.Sequential(torch.nn.Linear(2, 3), torch.nn.BatchNorm1d(3))
+    saved = {"net": net.state_dict(), "again": net.state_dict()}
+    checkpoint.save(tmp_path, saved, 100, keep=1)
+    found = checkpoint.newest(tmp_path)[0].state
+    assert all(torch.equal(found["net"][name], value) for name, value in saved["net"].items())
+    assert found["net"]._metadata == saved["net"]._metadata  # type: ignore[attr-defined]
+    net.load_state_dict(found["again"])
+
+
+MAKE_ORDERED = b"ccollections\nOrderedDict\n)R"
+
+
+@pytest.mark.parametrize(
+    "opcodes",
+    [
+        b"ctorch\nFloatStorage\n}b",
+        MAKE_ORDERED + b"](K\x01K\x02\x86eb",
+        MAKE_ORDERED + MAKE_ORDERED + b"b",
+        MAKE_ORDERED + b"}\x85b",
+        MAKE_ORDERED + b"K\x00\x85b",
+        TUPLE + b"}b",
+        b"}}b",
+    ],
+    ids=["function", "list of pairs", "ordered", "tuple", "number in a tuple", "on a tuple", "dict"],
+)
+def test_attributes_are_set_only_on_an_ordered_dict_and_only_from_a_dict(tmp_path: Path, opcodes: bytes) -> None:
+    path = tmp_path / "model.pt"
+    with_pickle(path, b"\x80\x02" + opcodes + b".")
+    with pytest.raises(CheckpointError, match="expected tensors and plain data, got the opcode BUILD"):
+        checkpoint.load(path)
+
+
+def test_attributes_are_values_like_others(tmp_path: Path) -> None:
+    path = tmp_path / "model.pt"
+    with_pickle(path, b"\x80\x02" + MAKE_ORDERED + b"}" + TUPLE + b"K\x01sb.")
+    with pytest.raises(CheckpointError, match="got a key that is neither"):
+        checkpoint.load(path)
+    with_pickle(path, b"\x80\x02" + MAKE_ORDERED + b"q\x00}K\x01h\x00sb.")
+    with pytest.raises(CheckpointError, match="a list or dict that changes after its use"):
+        checkpoint.load(path)
+    with_pickle(
+        path, b"\x80\x02" + MAKE_ORDERED + b"q\x00" + (MAKE_ORDERED + b"}X\x01\x00\x00\x00a(h\x00h\x00tsbq\x00") * 200 + b"."
+    )
+    with pytest.raises(CheckpointError, match="the same values too often"):
+        checkpoint.load(path)
+    ordered: Any = OrderedDict()
+    ordered.more = torch.zeros(1).expand(10**12)
+    torch.save({"format": 1, "env_steps": 100, "state": {"x": ordered}}, path)
+    with pytest.raises(CheckpointError, match="elements are all in the file"):
+        checkpoint.load(path)
