@@ -64,10 +64,12 @@ class Evaluations:
         """Evaluate the newest policy, because an evaluation is due. Returns the evaluation's metrics.
 
         With `eval_workers`, only begins the evaluation, and returns None. The previous evaluation must have ended
-        (`end_pending`); if its result ended the run, no other begins. `watch` is called several times a second during the
-        wait.
+        (`end_pending`); if its result ended the run, no other begins, even if the run was resumed without `eval_workers`.
+        `watch` is called several times a second during the wait.
         """
         if not self._config.eval_workers:
+            if self._tally.decided_by_evaluation() is not None:
+                return None
             evaluation = self._evaluate_newest(evaluation_size(self._config), watch)
             self._keep_if_best(evaluation, self._state.env_steps, self._run.algorithm.weights)
             self._tally.evaluated()

@@ -320,6 +320,18 @@ def test_an_evaluation_begins_again_when_the_run_is_resumed(eval_workers: int) -
     assert (state.pending is None) == (not eval_workers)
 
 
+def test_a_result_that_ended_the_run_stays_after_a_resume_without_eval_workers() -> None:
+    """The run was interrupted before the result, when the next evaluation was already due."""
+    policy = np.array([7], np.float32), np.zeros(0, np.float32)
+    state = RunState(version=6, env_steps=210, next_evaluation=200, pending=EvaluatedPolicy(3, 100), pending_policy=policy)
+    fakes = Fakes(6.0, 3.0)
+    tally, evaluations = fakes.evaluations(100, state, target_return=5.0)
+    evaluations.begin_again(None, lambda: None)
+    assert tally.evaluation_is_due()
+    assert evaluate(evaluations) is None
+    assert (tally.stop_reason(), state.best) == (f"{TARGET} by the policy of 100 env steps", (6.0, 100))
+
+
 @pytest.mark.parametrize("seed", [0, 1])
 def test_no_policy_is_chosen_by_the_episodes_that_evaluate_plays(seed: int) -> None:
     fakes = Fakes(1.0, 2.0, 3.0)
