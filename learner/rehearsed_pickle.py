@@ -3,9 +3,9 @@
 Rule: a pickle may contain only what torch.save writes for tensors and plain data. torch's loader for untrusted files
 (`weights_only`) doesn't run code from them, but a few bytes could make it fill the memory: it calls `bytearray` with any
 length, and copies a container or a string as often as the file says. It also hashes the keys of dicts. This could take
-forever if each tuple in a deep nest contains the next tuple twice, or if all numbers have the same hash. With lists nested
-in the same way, any code that visits them could take as long. This module interprets the pickle without creating its
-objects.
+forever if each tuple in a deep nest contains the next tuple twice, or if each of many numbers in a dict collides with all
+others. With lists nested like these tuples, any code that visits them could take as long. This module interprets the pickle
+without creating its objects.
 """
 
 from __future__ import annotations
@@ -14,6 +14,8 @@ import pickletools
 from dataclasses import dataclass
 from enum import Enum, auto
 from typing import NamedTuple
+
+from millrace.protocol.bounds import MOST_OTHER_KEYS
 
 VALUES = {"NONE", "NEWTRUE", "NEWFALSE", "BININT", "BININT1", "BININT2", "LONG1", "LONG4", "BINFLOAT", "BINUNICODE"}
 CONTAINERS = {"EMPTY_LIST", "EMPTY_DICT"}
@@ -25,7 +27,6 @@ REBUILD = {f"torch._utils {name}" for name in ("_rebuild_tensor_v2", "_rebuild_t
 ORDERED = "collections OrderedDict"  # the empty dict of a tensor's hooks; also the dict that a module's `state_dict` returns
 BYTES = "_codecs encode"  # creates a bytes object, whose content the pickle holds as text
 CALLED = REBUILD | {ORDERED, BYTES}
-MOST_KEY = 1 << 60  # limit on the size of a number that is a key; larger numbers may all have the same hash
 MOST_REPEATED = 1 << 20  # limit on how often a visitor finds an object that it has already found,
 REPEATED_PER_BYTE = 16  # plus this number for each byte of the pickle, because many dicts have the same keys
 TYPES = ("torch ", "torch.storage ")  # prefixes of the names of storage types and dtypes, which aren't called
@@ -56,6 +57,8 @@ class _Made:
     """the number of objects that a visitor finds in it; an object that occurs several times counts several times"""
     used_again: bool = False
     """whether it occurs a second time. If so, it must be complete, because `values` would otherwise be too small"""
+    numbers: int = 0
+    """the number of its keys that are numbers"""
 
 
 def rehearse(content: bytes) -> None:
@@ -132,16 +135,15 @@ def _add(stack: list[_Made], first: int) -> None:
         raise Unfit("it has a list or dict that changes after its use")
 
 
-def may_be_key(key: object) -> bool:
-    """Whether this may be the key of a dict."""
-    return type(key) is str or (type(key) is int and abs(key) < MOST_KEY)
-
-
 def _set_items(stack: list[_Made], first: int) -> None:
     """Move keys and values, from index `first` on, into the dict below them. Raises `Unfit` for a key that isn't allowed."""
-    for key in stack[first::2]:
-        if not may_be_key(key.value):
-            raise Unfit("expected tensors and plain data, got a key that is neither text nor a small number")
+    kinds = [type(key.value) for key in stack[first::2]]
+    if not {*kinds} <= {str, int}:
+        raise Unfit("expected tensors and plain data, got a key that is neither text nor a whole number")
+    filled = stack[first - 1]
+    filled.numbers += kinds.count(int)
+    if filled.numbers > MOST_OTHER_KEYS:
+        raise Unfit(f"expected a dict with at most {MOST_OTHER_KEYS:,} numbers as keys, got one with more")
     _add(stack, first)
 
 

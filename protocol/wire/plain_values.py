@@ -2,30 +2,30 @@
 
 A value is plain if it is None, a bool, int, float, complex, str, bytes, list, tuple, dict, or a numpy scalar or array of
 bools, numbers, text, bytes, dates or durations, or a numpy array of plain objects. Strings with a lone surrogate, which
-UTF-8 cannot encode, and integers with more decimal digits than Python converts are not plain. A value that isn't plain
-raises `TypeError`; if the caller asks for it, the value is instead sent as its `repr` and arrives as a `ReprString`, which
-cannot be confused with a string. For such a caller, subclasses of dict, list and tuple are plain too: they arrive as dicts,
-lists and tuples. Other numbers, and objects that numpy reads as numbers, such as tensors, arrive as numpy scalars or arrays.
+UTF-8 cannot encode, integers with more decimal digits than Python converts, and dicts with more than 10,000 keys that aren't
+text are not plain. A value that isn't plain raises `TypeError`; if the caller asks for it, the value is instead sent as its
+`repr` and arrives as a `ReprString`, which cannot be confused with a string. For such a caller, subclasses of dict, list and
+tuple are plain too: they arrive as dicts, lists and tuples. Other numbers, and objects that numpy reads as numbers, such as
+tensors, arrive as numpy scalars or arrays.
 """
 
 from __future__ import annotations
 
 import math
 import sys
-from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Any
 
 import msgpack
 import numpy as np
 
+from millrace.protocol.bounds import MOST_OTHER_KEYS
 from millrace.protocol.errors import BadMessage, safe_repr
 
 DTYPE_KINDS = "biufcSUmM"
 NUMBER_KINDS = "biuf"
 MAX_DEPTH = 32
 MAX_REPR = 1000  # characters
-MOST_WITH_ONE_HASH = 64  # limit on the keys of a dict with the same hash, because Python compares each with all others
 
 _TUPLE, _PAIRS, _ARRAY, _SCALAR, _OBJECTS, _INT, _COMPLEX, _REPR = range(1, 9)
 
@@ -83,7 +83,7 @@ def _to_msgpack(value: Any, where: str, use_repr: bool, depth: int) -> Any:
     if kind is tuple or (use_repr and isinstance(value, tuple)):
         inside = [_to_msgpack(inner, f"{where}[{i}]", use_repr, depth + 1) for i, inner in enumerate(value)]
         return msgpack.ExtType(_TUPLE, _pack(inside))
-    if kind is dict or (use_repr and isinstance(value, dict)):
+    if (kind is dict or (use_repr and isinstance(value, dict))) and not _has_too_many_keys(value):
         inside = [
             _to_msgpack(inner, f"{where}.{key}" if where else str(key), use_repr, depth + 1) for key, inner in value.items()
         ]
@@ -106,7 +106,11 @@ def _to_msgpack(value: Any, where: str, use_repr: bool, depth: int) -> Any:
     if use_repr:
         numbers = _numbers(value)
         return _repr(value) if numbers is None else _to_msgpack(numbers, where, use_repr, depth)
-    got = {str: "text with a lone surrogate", int: "an integer with too many digits"}.get(kind, kind.__name__)
+    got = {
+        str: "text with a lone surrogate",
+        int: "an integer with too many digits",
+        dict: f"a dict with more than {MOST_OTHER_KEYS:,} keys that aren't text",
+    }.get(kind, kind.__name__)
     raise TypeError(f"{where or 'value'}: expected plain data (numbers, strings, lists, dicts, arrays), got {got}")
 
 
@@ -136,6 +140,11 @@ def _numbers(value: Any) -> Any:
 
 def _repr(value: Any) -> msgpack.ExtType:
     return msgpack.ExtType(_REPR, safe_repr(value)[:MAX_REPR].encode(errors="backslashreplace"))
+
+
+def _has_too_many_keys(keys: Collection[object]) -> bool:
+    """Whether too many of these keys aren't text. Python's hashes of text are secret; those of numbers are not."""
+    return len(keys) > MOST_OTHER_KEYS and sum(not isinstance(key, str) for key in keys) > MOST_OTHER_KEYS
 
 
 def _is_encodable(text: str) -> bool:
@@ -189,8 +198,8 @@ def _from_extension(code: int, data: bytes, inner: Callable[[bytes], Any]) -> An
             return tuple(inner(data))
         case 2:  # _PAIRS
             keys, values = inner(data)
-            if keys and max(Counter(map(hash, keys)).values()) > MOST_WITH_ONE_HASH:
-                raise BadMessage("plain value: expected a dict that has keys with different hashes")
+            if _has_too_many_keys(keys):
+                raise BadMessage(f"plain value: expected a dict with at most {MOST_OTHER_KEYS:,} keys that aren't text")
             return dict(zip(keys, values, strict=True))
         case 3:  # _ARRAY
             dtype, shape, raw = inner(data)

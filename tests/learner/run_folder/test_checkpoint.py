@@ -250,11 +250,10 @@ STORAGE = b"(X\x07\x00\x00\x00storagectorch\nFloatStorage\n%bX\x03\x00\x00\x00cp
         b"}" + TUPLE + b"K\x01s",
         b"}(K\x01K\x01" + TUPLE + b"K\x01u",
         b"}G" + bytes(8) + b"K\x01s",
-        b"}\x8a\x08" + (2**61 - 1).to_bytes(8, "little") + b"K\x01s",
         STORAGE % TUPLE,
         b"K\x01Q",
     ],
-    ids=["key", "second key", "float", "number whose hash is 0", "storage", "storage without a tuple"],
+    ids=["key", "second key", "float", "storage", "storage without a tuple"],
 )
 def test_keys_that_take_long_to_find_are_refused(tmp_path: Path, opcodes: bytes) -> None:
     path = tmp_path / "model.pt"
@@ -351,7 +350,7 @@ def test_all_that_a_state_may_hold_passes_the_rehearsal(tmp_path: Path) -> None:
         "plain": [(), (1,), (1, 2), (1, 2, 3), (1, 2, 3, 4), 2**70, -1, 300, 70_000, 0.5, True, False, None, "ä", [], {}],
         "bytes": [b"a", b"\xff" * 300, b"a"],
         "many": list(range(2000)),
-        "keys": {"ä": 0, "": 1, 0: 2, -1: 3, 2**60 - 1: 4, -(2**60) + 1: 5},
+        "keys": {"ä": 0, "": 1, 0: 2, -1: 3, 2**60: 4, -(2**70): 5},
     }
     checkpoint.save(tmp_path, saved, 100, keep=1)
     found = checkpoint.newest(tmp_path)[0].state
@@ -447,7 +446,7 @@ def test_what_could_not_be_read_back_is_not_written_and_named(tmp_path: Path, st
     assert line.endswith("; fix state_dict")
 
 
-@pytest.mark.parametrize("key", [(1, 2), 0.5, None, True, 2**60, -(2**60)])
+@pytest.mark.parametrize("key", [(1, 2), 0.5, None, True])
 def test_a_state_with_keys_that_could_not_be_read_back_is_not_written(tmp_path: Path, key: object) -> None:
     line = refused(tmp_path, {"inner": {key: 1}})
     assert line.startswith("checkpoint: state['inner'] (builtins.dict): expected tensors and plain data, got a key that"), (
@@ -463,6 +462,21 @@ def test_a_state_that_repeats_values_without_end_is_not_written(tmp_path: Path) 
     within: list[Any] = []
     within.append(within)
     assert "changes after its use" in refused(tmp_path, {"inner": within})
+
+
+def test_a_dict_with_too_many_numbers_as_keys_is_refused(tmp_path: Path) -> None:
+    """They can be chosen so that each collides with all others: 700,000 numbers, in 3.5 MB, take minutes."""
+    few = {"x": dict.fromkeys(range(10_000), 1) | {str(n): n for n in range(20_000)}}
+    checkpoint.save(tmp_path, few, 100, keep=1)
+    assert checkpoint.newest(tmp_path)[0].state == few
+    (tmp_path / "checkpoints" / "000000000100.pt").unlink()
+    assert "state['x'] (builtins.dict): expected a dict with at most 10,000 numbers as keys" in refused(
+        tmp_path, {"x": dict.fromkeys(range(10_001), 1)}
+    )
+    path = tmp_path / "model.pt"
+    with_pickle(path, b"\x80\x02}" + b"".join(b"M" + n.to_bytes(2, "little") + b"K\x01s" for n in range(10_001)) + b".")
+    with pytest.raises(CheckpointError, match="at most 10,000 numbers as keys"):
+        checkpoint.load(path)
 
 
 def test_the_state_of_a_module_comes_back(tmp_path: Path) -> None:
