@@ -53,31 +53,23 @@ def import_own(module: str, what: str) -> ModuleType:
 
 
 def refuse_modules_in(folder: Path, names: Iterable[str]) -> None:
-    """Raise `UsageError` if one of these names, `module:name` or `package.module_v1`, would be imported from the run folder.
+    """Ensure that no module is ever imported from a run folder, because it may come from a stranger.
 
-    A run folder may come from a stranger, and its files name modules that are imported. Therefore, no module is ever
-    imported from the folder itself.
+    Removes the folder, and all that is inside it, from the search path, which the workers of this process inherit: besides
+    the modules that the folder's files name, an environment's id can make gymnasium's plugins be imported. Raises
+    `UsageError` if one of these names, `module:name` or `package.module_v1`, leads from a folder above into the run folder.
     """
     inside = folder.resolve()
-    entries = [
-        entry
-        for entry in {Path(each).resolve() for each in sys.path}
-        if entry.is_relative_to(inside) or inside.is_relative_to(entry)
-    ]
+    sys.path[:] = [entry for entry in sys.path if not Path(entry).resolve().is_relative_to(inside)]
+    above = [entry for each in sys.path if inside.is_relative_to(entry := Path(each).resolve())]
     for name in names:
         module, colon, _ = name.partition(":")
-        first, *_ = parts = module.split(".")
-        imported = bool(colon and first) or names_a_module(name)
-        for entry in entries if imported else ():
-            if entry.is_relative_to(inside):
-                is_inside = entry.is_dir() and any(path.name.partition(".")[0] == first for path in entry.iterdir())
-            else:
-                is_inside = entry.joinpath(*parts).is_relative_to(inside)
-            if is_inside:
-                raise UsageError(
-                    f"run {folder}: {one_line(name, 200)} would be imported from the run folder, which is refused; if you "
-                    "trust that module, put it into a folder of your own"
-                )
+        imported = bool(colon and module) or names_a_module(name)
+        if imported and any(entry.joinpath(*module.split(".")).is_relative_to(inside) for entry in above):
+            raise UsageError(
+                f"run {folder}: {one_line(name, 200)} would be imported from the run folder, which is refused; if you "
+                "trust that module, put it into a folder of your own"
+            )
 
 
 def callable_of(module: ModuleType, qualname: str, what: str) -> Callable[..., Any]:

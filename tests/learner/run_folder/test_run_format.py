@@ -2,6 +2,7 @@
 
 import errno
 import json
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -63,20 +64,13 @@ def test_a_folder_without_a_format_is_no_run_folder(run: Path, read: Callable[[P
     assert load_policy(run)[2].id == "CartPole-v1", "the files of the policy are enough to act"
 
 
-@pytest.mark.parametrize(
-    ("found_from", "module"),
-    [
-        ("run", "evil"), ("run", "package.evil"), ("run/package", "evil"), ("", "run.evil"), ("", "run"),
-        ("", "run.package.evil"), ("link", "evil"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("found_from", "module"), [("", "run.evil"), ("", "run"), ("", "run.package.evil")])
 @pytest.mark.parametrize("named", ["env", "module as env", "wrappers", "algo", "callbacks"])
 def test_a_module_in_a_run_folder_is_not_imported(
     run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, named: str, found_from: str, module: str
 ) -> None:
     """Whatever of the search path leads there, and whatever names it."""
     run = run.rename(tmp_path / "run")
-    (tmp_path / "link").symlink_to(run)
     (run / "package").mkdir()
     for folder in (run, run / "package"):
         for file in ("evil.py", "evil_v0.py"):
@@ -104,6 +98,23 @@ def test_a_module_in_a_run_folder_is_not_imported(
     for read in readers:
         with pytest.raises(UsageError, match=f"{name} would be imported from the run folder, which is refused"):
             read(run)
+
+
+@pytest.mark.parametrize("found_from", ["run", "run/package", "link", "run/zipped.zip", "."])
+@pytest.mark.parametrize("read", [config_of_run, load_policy])
+def test_nothing_is_found_in_a_run_folder_that_is_on_the_search_path(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, found_from: str, read: Callable[[Path], object]
+) -> None:
+    """Not even by those who import what no setting names: a namespace's registrar, and the plugins of packages."""
+    run = run.rename(tmp_path / "run")
+    (tmp_path / "link").symlink_to(run)
+    (run / "package").mkdir()
+    monkeypatch.chdir(run)
+    entry = "" if found_from == "." else str(tmp_path / found_from)
+    monkeypatch.setattr(sys, "path", [entry, *sys.path, str(tmp_path)])
+    expected = sys.path[1:]
+    read(run)
+    assert sys.path == expected
 
 
 def test_a_module_beside_a_run_folder_is_the_user_s_own(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
