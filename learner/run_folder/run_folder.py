@@ -52,6 +52,7 @@ from millrace.learner.run_folder.run_format import (
     RUN_FILE,
     check_format,
     is_run_folder,
+    read_config,
     write_format,
 )
 from millrace.learner.run_folder.run_lock import RunLock
@@ -170,7 +171,8 @@ class RunFolder:
     def create(config: RunSettings, started_s: float | None = None) -> RunFolder:
         """Make a new folder with its config.toml. If the name is taken, a number follows the time: -2, -3, ….
 
-        `started_s` is wall-clock time; by default, the current time. Raises `UsageError` if no folder can be made.
+        `started_s` is wall-clock time; by default, the current time. Raises `UsageError` if no folder can be made, or if a
+        resume could not read the settings.
         """
         stamp = time.strftime("%Y%m%d-%H%M%S", time.localtime(started_s))
         name = f"{as_folder_name(config.env)}-{as_folder_name(config.algo)}-s{config.seed}"
@@ -190,6 +192,11 @@ class RunFolder:
                 raise UsageError(f"run folder {path} cannot be made: {error.strerror}; choose another --run-dir") from error
         folder = RunFolder(path, made[-1] if made else path)
         folder.write_config(config)
+        try:
+            read_config(path)
+        except UsageError as error:
+            folder.remove()
+            raise UsageError(f"settings: no resume could read them: {error}") from error
         return folder
 
     @staticmethod

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import platform
+import re
 import tomllib
 from collections.abc import Iterator
 from contextlib import suppress
@@ -34,8 +35,14 @@ HEAD = "# Repeat this run: millrace train --config THIS_FILE (it is whole if it 
 END = "# end\n"
 """The last line of config.toml; `HEAD` is the first. Without it, a file that was cut off could still be valid TOML."""
 MOST_CONFIG_BYTES = 1 << 18
-MOST_NESTED = 1_000_000  # limit on (lines) × (dots in a line): for each line, tomllib visits all parts of a table's name
-MOST_PREFIXES = 10_000_000  # limit on the sum of (dots in a line)²: for a key such as a.b.c, tomllib stores each prefix
+MOST_NESTED = 1_000_000
+"""Limit on (parts of the keys in all lines) × (parts in one line). For a key such as a.b.c, tomllib stores each prefix, and
+the name of the table with it."""
+NOT_IN_KEYS = re.compile(
+    r"""(?s:\"{3}(?:\\.|[^\\])*?(?:"{3,5}|\\?\Z)|'{3}.*?(?:'{3,5}|\Z))"""
+    r"""|"(?:\\.|[^"\\\n])*"?|'[^'\n]*'?|\#[^\n]*|(?<![\w.-])[+-]?\d[\d_]*\.\d[\d_]*(?:[eE][+-]?\d+)?(?=\s*[,\]}\#\n])"""
+)
+"""Strings, comments and numbers. A string that doesn't end also matches, because tomllib reads nothing that follows it."""
 
 
 class RunFormat(msgspec.Struct, frozen=True, kw_only=True):
@@ -111,9 +118,9 @@ def parse_toml(text: str, where: str) -> dict[str, Any]:
     text = text.removeprefix("\ufeff")  # a byte order mark, which some editors write
     if text.startswith(HEAD) and not text.rstrip().endswith(END.strip()):
         raise UsageError(f"{where} is cut off: expected {END.strip()!r} as its last line; restore it, or start a new run")
-    dots = [line.count(".") for line in text.split("\n")]
-    if len(dots) * max(dots) > MOST_NESTED or sum(each**2 for each in dots) > MOST_PREFIXES:
-        raise UsageError(f"{where} has tables in tables in tables, or very long lines; expected the settings of a run")
+    parts = [1 + line.count(".") for line in NOT_IN_KEYS.sub("", text).split("\n")]
+    if sum(parts) * max(parts) > MOST_NESTED:
+        raise UsageError(f"{where} has tables in tables in tables, or very long keys; expected the settings of a run")
     try:
         table = tomllib.loads(text)
         msgspec.json.encode(table)  # raises for a whole number with more digits than Python writes

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import tomli_w
 
 from millrace.extras.monitoring.report.page import write_page
 from millrace.extras.monitoring.report.picture import draw
@@ -148,6 +149,13 @@ def test_settings_that_would_take_minutes_to_read_are_refused(run: Path) -> None
         (nested, "has tables in tables in tables"),
         (".".join(["a"] * 8_000) + " = 1\n", "has tables in tables in tables"),
         ("".join(f"a{n}{'.a' * 330} = 1\n" for n in range(180)), "has tables in tables in tables"),
+        (f"[{'.'.join(['a'] * 1_826)}]\n" + "".join(f"b{n}{'.b' * 107} = 1\n" for n in range(546)), "has tables in tables"),
+        ('x = {a = """\n""", b' + ".b" * 8_000 + ' = "x"}\n', "has tables in tables in tables"),
+        ('x = {a = """""""", b' + ".b" * 8_000 + ' = "x"}\n', "has tables in tables in tables"),
+        ("1.1" + ".1" * 8_000 + " = 1\n", "has tables in tables in tables"),
+        ("[" + '"".' * 8_000 + '""]\n', "has tables in tables in tables"),
+        ('"' + '\\"' * 130_000, "is not TOML"),
+        ('"""' + '\\"""' * 65_000 + "\\", "is not TOML"),
         ("x = 1\n" * 100_000, "expected at most 262,144 bytes"),
     ):
         (run / CONFIG_FILE).write_text(settings)
@@ -157,6 +165,23 @@ def test_settings_that_would_take_minutes_to_read_are_refused(run: Path) -> None
 
 def test_settings_with_many_dots_are_read() -> None:
     assert parse_toml("\n".join([f"x = [{', '.join(['0.25'] * 2_000)}]", *["# ..."] * 300]), "x")["x"] == [0.25] * 2_000
+
+
+@pytest.mark.parametrize(
+    "value",
+    ["0.25 " * 3_300, "# a.b " * 3_000, 'a"b\\.' * 3_000, "it's 0.5\n" * 3_000, [0.25, -1.5e-3] * 1_000],
+    ids=["numbers", "comments", "escapes", "lines", "list"],
+)
+def test_settings_with_many_dots_in_values_are_read(value: object) -> None:
+    table = {"x": value, "table": {"y": value}}
+    assert parse_toml(tomli_w.dumps(table), "x") == table
+    assert parse_toml(tomli_w.dumps(table, multiline_strings=True), "x") == table
+
+
+def test_settings_that_no_resume_could_read_are_refused_before_training(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"settings: no resume could read them: .*expected at most 262,144 bytes"):
+        RunFolder.create(resolve("CartPole-v1", run_dir=str(tmp_path / "runs"), env_kwargs={"a": "x" * 300_000}))
+    assert not (tmp_path / "runs").exists()
 
 
 def test_a_resumed_folder_gets_the_current_format(run: Path) -> None:
