@@ -289,14 +289,14 @@ class Leveled(gymnasium.Env[Any, Any]):
         return self._shown, 1.0, False, False, {}
 
 
-gymnasium.register("Leveled-v0", f"{__name__}:Leveled", disable_env_checker=True)
+gymnasium.register("LeveledLane-v0", f"{__name__}:Leveled", disable_env_checker=True)
 
 
 @pytest.mark.parametrize("lost", ["before", "noticed before", "during"])
 @pytest.mark.parametrize("shared", [True, False], ids=["shared memory", "messages"])
 def test_copies_that_replace_lost_ones_in_a_reset_get_the_attributes_before_it(lost: str, shared: bool) -> None:
     """And attributes that an environment has changed are not set again on copies that were not lost."""
-    name = f"{__name__}:Leveled-v0"
+    name = f"{__name__}:LeveledLane-v0"
     run = run_of(name, N=2)
     with any_order(VectorEnvSettings(name, 2 * LANES, lanes=LANES), LANES, shared=shared) as (env, link):
         split = SplitVectorEnv(env, LANES, some=env)
