@@ -7,7 +7,7 @@ others wait, the lanes are stepped in two parts: the policy acts for one part wh
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
 from typing import Any, Protocol, TypeVar
@@ -172,7 +172,7 @@ class SplitVectorEnv:
         """Order these lanes to step with these actions. `copies` are the copies of the lanes."""
         assert self._some is not None
         begin_step = self._some.begin_step
-        self._assign_missing(set(copies), pulse)
+        self._assign_missing(copies, pulse)
         if self._actions is None:
             self._actions = np.resize(actions, (self.env.num_envs, *actions.shape[1:]))  # arbitrary, but valid
         padded = self._actions
@@ -241,7 +241,7 @@ class SplitVectorEnv:
         all_seeds: list[Any] = [None] * self.env.num_envs
         all_seeds[copies] = seeds
         options = {"reset_mask": mask}
-        chosen = set(range(copies.start, copies.stop))
+        chosen = range(copies.start, copies.stop)
         for _ in range(RESETS):
             self._assign_missing(chosen, pulse)
             observation, _ = self._wait(lambda: self.env.reset(seed=all_seeds, options=options), pulse)
@@ -259,7 +259,7 @@ class SplitVectorEnv:
             self._incarnations = self._some.incarnations()
         self._assigned[copies.start, name] = copies, packed
         self._missing.add((copies.start, name))
-        self._assign_missing(set(range(copies.start, copies.stop)), pulse)
+        self._assign_missing(range(copies.start, copies.stop), pulse)
 
     def _assign_now(self, copies: slice, name: str, packed: bytes) -> None:
         chosen = range(copies.start, copies.stop)
@@ -281,7 +281,7 @@ class SplitVectorEnv:
         except AttributeError:
             return False
 
-    def _assign_missing(self, chosen: set[int], pulse: Pulse) -> None:
+    def _assign_missing(self, chosen: Sequence[int], pulse: Pulse) -> None:
         """Before these copies are stepped or reset, set the attributes that they lack. Other copies are left for later.
 
         Other copies may be in the middle of a step. If a worker is lost meanwhile, the next step or reset tries again.
@@ -292,7 +292,7 @@ class SplitVectorEnv:
                 self._wait(partial(self._assign_now, copies, key[1], packed), pulse)
                 self._missing.discard(key)
 
-    def _lacking(self, chosen: set[int]) -> list[tuple[int, str]]:
+    def _lacking(self, chosen: Sequence[int]) -> list[tuple[int, str]]:
         """The attributes that some of these copies lack, because they have replaced lost copies."""
         if not self._assigned:
             return []
@@ -319,8 +319,8 @@ class SplitVectorEnv:
             raise
 
 
-def _overlap(chosen: set[int], copies: slice) -> bool:
-    return not chosen.isdisjoint(range(copies.start, copies.stop))
+def _overlap(chosen: Iterable[int], copies: slice) -> bool:
+    return any(copies.start <= n < copies.stop for n in chosen)
 
 
 class SplitLane:
