@@ -372,18 +372,34 @@ def test_a_step_that_was_abandoned_before_its_worker_saw_it_is_not_made_after_a_
         assert (observation.tolist(), reward.tolist()) == ([[pytest.approx(0.8)]], [1.0]), "of one step"
 
 
-def test_the_answer_to_an_order_for_which_nobody_waits_any_more_is_not_taken_for_a_later_one() -> None:
-    def stop() -> None:
-        raise InterruptedError("stop")
+def interrupt_after(env: ZmqVectorEnv, *calls: Callable[[], None]) -> None:
+    """While the environment waits, each of these is called, and then the wait is interrupted."""
+    steps = iter(calls)
 
+    def stop() -> None:
+        if (call := next(steps, None)) is None:
+            raise InterruptedError("stop")
+        call()
+
+    env.hub.while_waiting = stop
+
+
+@contextmanager
+def interrupted_after(env: ZmqVectorEnv, *calls: Callable[[], None]) -> Iterator[None]:
+    """The body waits, and is interrupted as by `interrupt_after`. Later waits aren't."""
+    interrupt_after(env, *calls)
+    with pytest.raises(InterruptedError):
+        yield
+    env.hub.while_waiting = lambda: None
+
+
+def test_the_answer_to_an_order_for_which_nobody_waits_any_more_is_not_taken_for_a_later_one() -> None:
     with made(shared=False) as (env, link):
         env.reset(seed=1)
         link.frozen = {"w0", "w1", "w2"}
         env.step_async(zeros(range(3)))
-        env.hub.while_waiting = stop
-        with pytest.raises(InterruptedError):
+        with interrupted_after(env):
             env.step_wait()
-        env.hub.while_waiting = lambda: None
         env.reset_async(seed=1)
         link.frozen = set()
         abandoned = [0, 0, 0]
@@ -677,26 +693,12 @@ def test_a_copy_that_was_never_reset_is_not_stepped_although_another_of_its_lane
             env.step(zeros([0, 1]))
 
 
-def interrupt_after(env: ZmqVectorEnv, *calls: Callable[[], None]) -> None:
-    """While the environment waits, each of these is called, and then the wait is interrupted."""
-    steps = iter(calls)
-
-    def stop() -> None:
-        if (call := next(steps, None)) is None:
-            raise InterruptedError("stop")
-        call()
-
-    env.hub.while_waiting = stop
-
-
 def test_a_loss_of_which_an_interrupted_step_did_not_tell_is_over_when_all_are_reset() -> None:
     with made(copies=2, lanes=2, workers=2, on_worker_loss="raise") as (env, link):
         env.reset(seed=1)
         link.frozen = {"w0", "w1"}
-        interrupt_after(env, lambda: link.leave("w1"), lambda: None, lambda: None)
-        with pytest.raises(InterruptedError):
+        with interrupted_after(env, lambda: link.leave("w1"), lambda: None, lambda: None):
             env.step(zeros([0, 1]))
-        env.hub.while_waiting = lambda: None
         link.frozen = set()
         env.reset()
         assert env.step(zeros([0, 1]))[1].tolist() == [1.0, 1.0]
@@ -718,10 +720,8 @@ def interrupted_reset_of_lost_copies(lost: str, **changes: Any) -> Iterator[ZmqV
             interrupt_after(env, *leave, lambda: None)
             assert env.step(zeros([0, 1]))[3].all()
             leave.clear()
-        interrupt_after(env, *leave, lambda: None, lambda: None)
-        with pytest.raises(InterruptedError):
+        with interrupted_after(env, *leave, lambda: None, lambda: None):
             env.reset(seed=2)
-        env.hub.while_waiting = lambda: None
         link.frozen = set()
         for worker in ("w2", "w3"):
             link.join(worker)
@@ -763,10 +763,8 @@ def test_a_loss_that_a_step_has_reported_is_not_reported_again_if_the_reset_afte
 def test_no_loss_is_reported_if_no_worker_had_the_copies(mode: str) -> None:
     with made(copies=2, lanes=1, workers=1, autoreset_mode=mode) as (env, link):
         link.leave("w0")
-        interrupt_after(env, lambda: None)
-        with pytest.raises(InterruptedError):
+        with interrupted_after(env, lambda: None):
             env.reset(seed=1)
-        env.hub.while_waiting = lambda: None
         link.join("w9")
         for copy in (0, 1):
             env.reset_async(env_ids=[copy])
@@ -785,10 +783,8 @@ def test_a_loss_between_two_calls_is_over_when_all_are_reset() -> None:
 def test_an_order_that_waited_for_a_worker_is_not_sent_once_nobody_waits_for_it() -> None:
     with made(copies=1, lanes=1, workers=1) as (env, link):
         link.leave("w0")
-        interrupt_after(env, lambda: None)
-        with pytest.raises(InterruptedError):
+        with interrupted_after(env, lambda: None):
             env.reset(seed=1)
-        env.hub.while_waiting = lambda: None
         link.join("w9")
         env.hub.wait(1.0, together=True)
         env.reset(seed=2)
@@ -800,15 +796,11 @@ def test_a_lane_whose_results_had_come_has_them_although_its_worker_is_lost_befo
         env.reset(seed=1)
         link.frozen = {"w0"}
         send(env, [0, 1])
-        interrupt_after(env, lambda: None, lambda: None)
-        with pytest.raises(InterruptedError):
+        with interrupted_after(env, lambda: None, lambda: None):
             env.recv(2)
-        env.hub.while_waiting = lambda: None
         link.leave("w1")
-        interrupt_after(env, lambda: None)
-        with pytest.raises(InterruptedError):
+        with interrupted_after(env, lambda: None):
             env.recv(2)
-        env.hub.while_waiting = lambda: None
         link.frozen = set()
         assert [row.truncated for row in received(env, 2).values()] == [False, False]
 
@@ -944,14 +936,8 @@ def test_what_a_watch_raises_ends_the_wait_and_loses_nothing() -> None:
         env.recv(3)
         link.frozen = {"w0", "w1", "w2"}
         send(env, [0, 1, 2])
-
-        def stop() -> None:
-            raise InterruptedError("stop")
-
-        env.hub.while_waiting = stop
-        with pytest.raises(InterruptedError):
+        with interrupted_after(env):
             env.recv()
-        env.hub.while_waiting = lambda: None
         link.frozen = set()
         assert sorted(received(env, 3)) == [0, 1, 2]
 
@@ -962,16 +948,8 @@ def test_a_step_after_an_interrupted_reset_has_its_own_results(shared: bool) -> 
         env.reset(seed=1)
         assert env.step([0])[0].tolist() == [[pytest.approx(0.8)]]
         link.frozen = {"w0"}
-        calls = iter([None, InterruptedError("stop")])  # the second time, the order was sent
-
-        def stop() -> None:
-            if (error := next(calls)) is not None:
-                raise error
-
-        env.hub.while_waiting = stop
-        with pytest.raises(InterruptedError):
+        with interrupted_after(env, lambda: None):  # the second time, the order was sent
             env.reset()
-        env.hub.while_waiting = lambda: None
         link.frozen = set()
         for left in 0.8, 0.6:
             observation, reward, *_ = env.step([0])
