@@ -1,14 +1,15 @@
 """The tables in docs/explanation/wall_clock.md: minutes until a policy reaches a return, from curves and rates. Pure.
 
-Rule: a seed's minutes are the env steps of its first evaluation that reaches the return, divided by the env steps/s. The
-return is the one that millrace's SAC reaches at about 300,000 env steps. If a seed never reaches it, its time is infinite.
+Rule: a seed's minutes are the env steps of its first evaluation that reaches the return, divided by the env steps/s. There
+are two returns for each task: those that millrace's SAC has after about 100,000 and 300,000 env steps. If a seed never
+reaches the return, its time is infinite, and the table shows how long its run was.
 """
 
 from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence, Set
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -17,15 +18,31 @@ from benchmarks.scores import return_text, steps_text
 from benchmarks.wall_clock_curves import Curve
 from benchmarks.wall_clock_programs import ENVS, NAMES, OURS, PROGRAMS, THEIRS, Program
 from benchmarks.wall_clock_rates import Rate, RateAt, largest_error, rate_at
-from benchmarks.wall_clock_returns import comparison, returns_table
+from benchmarks.wall_clock_returns import FEW, MANY, comparison, returns_table
 
 STEP_TIMES_S = (0.01, 0.05, 1.0)
-NEAR = range(275_000, 325_001)
-"""the env steps whose evaluations determine a task's return"""
+AFTER = (FEW, MANY)
+"""the env steps after which SAC's returns are those to reach"""
+NEAR = 25_000
+"""the evaluations at most this many env steps before or after them determine the return"""
 BETWEEN = 24
 """number of intervals between two step times of the table, to find where the quickest algorithm changes"""
 NO_MINUTES = "No rates are kept yet, so there are no minutes; `benchmarks/README.md` says how to measure them."
 NOTHING = "No figures are kept yet; `benchmarks/README.md` says how to make them.\n"
+
+
+class Goal(NamedTuple):
+    """A return to reach on a task."""
+
+    env: str
+    after: int
+    """the env steps after which millrace's SAC has this return"""
+    target: float
+
+    @property
+    def name(self) -> str:
+        """The task and the return."""
+        return f"{self.env}, {return_text(self.target)}"
 
 
 class Row(NamedTuple):
@@ -34,6 +51,8 @@ class Row(NamedTuple):
     program: Program
     env_steps: list[float]
     """for each seed, the env steps until the return was reached; infinite if it wasn't"""
+    trained: int
+    """env steps of the shortest run that didn't reach the return; 0 if there is none"""
     rates: list[Rate]
 
     def minutes(self, step_s: float) -> list[float]:
@@ -45,33 +64,51 @@ class Row(NamedTuple):
         """Minutes of the median seed; infinite if that seed didn't reach the return, or if there is no rate."""
         return statistics.median(self.minutes(step_s) or [math.inf])
 
+    def least(self, step_s: float) -> float:
+        """The median seed needs at least these minutes: those of its run if that was too short to reach the return."""
+        median = self.median(step_s)
+        rate = rate_at(step_s, self.rates)
+        return self.trained / rate.per_s / 60 if median == math.inf and rate is not None else median
+
 
 def steps_until(points: Sequence[tuple[int, float]], target: float) -> float:
     """The env steps of the first evaluation with at least this return; infinite if there is none."""
     return next((float(env_steps) for env_steps, returned in points if returned >= target), math.inf)
 
 
-def target_of(curves: Sequence[Curve], env: str) -> float | None:
+def goals_of(curves: Sequence[Curve]) -> list[Goal]:
+    """The returns to reach, one task after the other."""
+    goals = []
+    for env in ENVS:
+        for after in AFTER:
+            target = target_of(curves, env, after)
+            goals += [] if target is None else [Goal(env, after, target)]
+    return goals
+
+
+def target_of(curves: Sequence[Curve], env: str, after: int) -> float | None:
     """The return to reach in this task: the median over the seeds of millrace's SAC, rounded to two digits.
 
-    A seed's return is the mean of its evaluations between 275,000 and 325,000 env steps. None if no seed has any.
+    A seed's return is the mean of its evaluations near these env steps. None if no seed has any.
     """
     means = []
     for curve in curves:
         if (curve.env, curve.system, curve.algo) == (env, OURS, "sac"):
-            near = [returned for env_steps, returned in curve.points if env_steps in NEAR]
+            near = [returned for env_steps, returned in curve.points if abs(env_steps - after) <= NEAR]
             means += [statistics.mean(near)] if near else []
     return float(f"{statistics.median(means):.2g}") if means else None
 
 
-def rows_of(curves: Sequence[Curve], rates: Sequence[Rate], env: str, target: float) -> list[Row]:
+def rows_of(curves: Sequence[Curve], rates: Sequence[Rate], goal: Goal) -> list[Row]:
     """The programs that have a curve on this task, one algorithm after the other."""
     rows = []
     for program in sorted(PROGRAMS, key=lambda program: list(NAMES).index(program.algo)):
-        its_curves = [curve for curve in curves if (curve.env, curve.system, curve.algo) == (env, *program)]
-        its_rates = [rate for rate in rates if (rate.env, rate.system, rate.algo) == (env, *program)]
+        its_curves = [curve for curve in curves if (curve.env, curve.system, curve.algo) == (goal.env, *program)]
+        its_rates = [rate for rate in rates if (rate.env, rate.system, rate.algo) == (goal.env, *program)]
         if its_curves:
-            rows.append(Row(program, [steps_until(curve.points, target) for curve in its_curves], its_rates))
+            env_steps = [steps_until(curve.points, goal.target) for curve in its_curves]
+            lengths = [curve.points[-1][0] for curve in its_curves if steps_until(curve.points, goal.target) == math.inf]
+            rows.append(Row(program, env_steps, min(lengths, default=0), its_rates))
     return rows
 
 
@@ -81,10 +118,12 @@ def minutes_table(rows: Sequence[Row]) -> str:
     least = {step_s: min(row.median(step_s) for row in rows) for step_s in STEP_TIMES_S}
     cells = []
     for row in rows:
-        line = [name_of(row.program), spread(row.env_steps, lambda steps: steps_text(round(steps)))]
+        line = [name_of(row.program), spread(row.env_steps, row.trained, lambda steps: steps_text(round(steps)))]
         for step_s in STEP_TIMES_S:
             rate = rate_at(step_s, row.rates)
-            text = "" if rate is None else spread(row.minutes(step_s), minutes_text, about=rate.computed)
+            text = ""
+            if rate is not None:
+                text = spread(row.minutes(step_s), row.least(step_s), minutes_text, about=rate.computed)
             quickest = row.median(step_s) == least[step_s] < math.inf
             line.append(f"**{text}**" if quickest else text)
         cells.append(line)
@@ -104,16 +143,21 @@ def rates_table(rows: Sequence[Row]) -> str:
     )
 
 
-def quickest(rows: Sequence[Row]) -> list[tuple[Program, float]]:
+def quickest(rows: Sequence[Row]) -> list[tuple[Program | None, float]]:
     """The quickest programs, each with the step time from which on it is the quickest.
 
-    Step times at which no program reaches the return are skipped.
+    None stands for step times at which a program might be the quickest whose runs were too short to tell. Step times at
+    which no program reaches the return are skipped.
     """
-    found: list[tuple[Program, float]] = []
+    found: list[tuple[Program | None, float]] = []
     for step_s in step_times():
         best = min(rows, key=lambda row: row.median(step_s), default=None)
-        if best is not None and best.median(step_s) < math.inf and (not found or found[-1][0] != best.program):
-            found.append((best.program, step_s))
+        if best is None or best.median(step_s) == math.inf:
+            continue
+        sure = best.median(step_s) <= min(row.least(step_s) for row in rows)
+        program = best.program if sure else None
+        if not found or found[-1][0] != program:
+            found.append((program, step_s))
     return found
 
 
@@ -125,11 +169,11 @@ def step_times() -> list[float]:
     return times
 
 
-def quickest_table(tasks: Mapping[str, Sequence[Row]]) -> str:
+def quickest_table(goals: Mapping[Goal, Sequence[Row]]) -> str:
     """A table of the quickest algorithm at each step time, among all programs and among Stable-Baselines3's."""
-    head = ("task", "of all", f"of {THEIRS}")
-    theirs = {env: [row for row in rows if row.program.system == THEIRS] for env, rows in tasks.items()}
-    return table(head, [[env, ranges_text(rows), ranges_text(theirs[env])] for env, rows in tasks.items()])
+    head = ("task and return", "of all", f"of {THEIRS}")
+    theirs = {goal: [row for row in rows if row.program.system == THEIRS] for goal, rows in goals.items()}
+    return table(head, [[goal.name, ranges_text(rows), ranges_text(theirs[goal])] for goal, rows in goals.items()])
 
 
 def ranges_text(rows: Sequence[Row]) -> str:
@@ -137,7 +181,7 @@ def ranges_text(rows: Sequence[Row]) -> str:
     texts = []
     for program, step_s in quickest(rows):
         since = "" if step_s == STEP_TIMES_S[0] else f"from {step_text(step_s)} on "
-        texts.append(f"{since}{name_of(program)}")
+        texts.append(f"{since}{'not known' if program is None else name_of(program)}")
     return "; ".join(texts) or "–"
 
 
@@ -146,36 +190,36 @@ def page_part(curves: Sequence[Curve], rates: Sequence[Rate]) -> str:
     if not curves:
         return NOTHING
     parts = ["Returns of greedy episodes:", returns_table(curves), comparison(curves)]
-    targets = {env: target for env in ENVS if (target := target_of(curves, env)) is not None}
-    if targets and rates:
-        parts += _minutes(curves, rates, targets)
+    goals = goals_of(curves)
+    if goals and rates:
+        parts += _minutes(curves, rates, goals)
     else:
         parts.append(NO_MINUTES)
     return "\n\n".join(part.rstrip("\n") for part in parts if part) + "\n"
 
 
-def _minutes(curves: Sequence[Curve], rates: Sequence[Rate], targets: dict[str, float]) -> list[str]:
-    """The paragraphs and tables of minutes and rates. `targets`: the return to reach in each task."""
-    parts = [_sources(curves, rates, targets)]
-    for processor in sorted({rate.processor for rate in rates}) or [""]:
+def _minutes(curves: Sequence[Curve], rates: Sequence[Rate], goals: Sequence[Goal]) -> list[str]:
+    """The paragraphs and tables of minutes and rates."""
+    parts = [_sources(curves, rates, {goal.env for goal in goals})]
+    for processor in sorted({rate.processor for rate in rates}):
         here = [rate for rate in rates if rate.processor == processor]
-        tasks = {env: rows_of(curves, here, env, target) for env, target in targets.items()}
-        for env, rows in tasks.items():
-            where = f" on {processor}" if processor else ""
-            parts += [f"**{env}**, minutes until a return of {return_text(targets[env])}{where}:", minutes_table(rows)]
-        rated = {env: rows for env, rows in tasks.items() if any(row.rates for row in rows)}
+        found = {goal: rows_of(curves, here, goal) for goal in goals}
+        for goal, rows in found.items():
+            whose = f"{return_text(goal.target)} (SAC's after {steps_text(goal.after)} env steps)"
+            parts += [f"**{goal.env}**, minutes until a return of {whose} on {processor}:", minutes_table(rows)]
+        rated = {goal: rows for goal, rows in found.items() if any(row.rates for row in rows)}
         if rated:
             parts += ["The quickest algorithm, by the time of a step:", quickest_table(rated)]
-        for env, rows in rated.items():
+        for env, rows in {goal.env: rows for goal, rows in rated.items()}.items():
             parts += [f"The rates on {env}:", rates_table(rows)]
     return parts
 
 
-def _sources(curves: Sequence[Curve], rates: Sequence[Rate], targets: dict[str, float]) -> str:
-    seeds = sorted({sum(other.key[:3] == curve.key[:3] for other in curves) for curve in curves if curve.env in targets})
+def _sources(curves: Sequence[Curve], rates: Sequence[Rate], envs: Set[str]) -> str:
+    seeds = sorted({sum(other.key[:3] == curve.key[:3] for other in curves) for curve in curves if curve.env in envs})
     count = str(seeds[0]) if len(seeds) == 1 else f"{seeds[0]} to {seeds[-1]}"
     text = f"Each row has {count} {'seed' if count == '1' else 'seeds'}."
-    if any(rate.env in targets for rate in rates):
+    if any(rate.env in envs for rate in rates):
         rounds = min(len(rate.rates) for rate in rates)
         text += f" A measured rate is the median of at least {rounds} {'round' if rounds == 1 else 'rounds'}."
     error = largest_error(rates)
@@ -189,17 +233,18 @@ def name_of(program: Program) -> str:
     return f"{program.system} {NAMES[program.algo]}"
 
 
-def spread(values: Sequence[float], text: Callable[[float], str], *, about: bool = False) -> str:
+def spread(values: Sequence[float], least: float, text: Callable[[float], str], *, about: bool = False) -> str:
     """The median and range over seeds as text. If some seeds are infinite, their share replaces the range.
 
-    If the median seed is infinite, a dash replaces the median. `about`: mark the median as approximate.
+    If the median seed is infinite, `least` is known to be too little. `about`: mark the median as approximate.
     """
     reached = sorted(value for value in values if value < math.inf)
     middle = statistics.median(values)
     share = f"{len(reached)} of {len(values)}"
+    approximate = "≈ " if about else ""
     if middle == math.inf:
-        return f"– ({share})"
-    shown = f"{'≈ ' if about else ''}{text(middle)}"
+        return f"> {approximate}{text(least)} ({share})"
+    shown = f"{approximate}{text(middle)}"
     if len(values) == 1:
         return shown
     return f"{shown} ({text(reached[0])} to {text(reached[-1])})" if len(reached) == len(values) else f"{shown} ({share})"

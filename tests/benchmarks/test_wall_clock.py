@@ -24,7 +24,9 @@ from benchmarks.wall_clock_returns import comparison, return_after, returns_tabl
 from benchmarks.wall_clock_tables import (
     NO_MINUTES,
     NOTHING,
+    Goal,
     Row,
+    goals_of,
     minutes_table,
     page_part,
     quickest,
@@ -144,9 +146,10 @@ def test_the_error_of_computed_rates() -> None:
 
 
 def test_the_return_of_a_task_is_that_of_our_sac() -> None:
-    near = [curve(SAC, 1, (100_000, 9e9), (290_000, 7000.0), (299_968, 7900.0)), curve(SAC, 2, (299_968, 8000.0))]
-    assert target_of(near, ENV) == 7700
-    assert target_of([curve(SAC, 1, (100_000, 5.0)), curve(XQC, 1, (300_000, 5.0))], ENV) is None
+    near = [curve(SAC, 1, (99_000, 5000.0), (290_000, 7000.0), (299_968, 7900.0)), curve(SAC, 2, (299_968, 8000.0))]
+    assert target_of(near, ENV, 300_000) == 7700
+    assert goals_of(near) == [Goal(ENV, 100_000, 5000.0), Goal(ENV, 300_000, 7700.0)]
+    assert goals_of([curve(SAC, 1, (130_000, 5.0)), curve(XQC, 1, (300_000, 5.0))]) == []
 
 
 def test_the_first_evaluation_that_reaches_a_return_counts() -> None:
@@ -156,22 +159,24 @@ def test_the_first_evaluation_that_reaches_a_return_counts() -> None:
 
 
 def test_a_cell_has_the_median_and_the_range_or_how_many_seeds_came_so_far() -> None:
-    assert spread([3.0, 1.0, 2.0], str) == "2.0 (1.0 to 3.0)"
-    assert spread([3.0, math.inf, 2.0], str, about=True) == "≈ 3.0 (2 of 3)"
-    assert spread([math.inf, math.inf, 2.0], str) == "– (1 of 3)"
-    assert spread([4.0], str) == "4.0"
+    assert spread([3.0, 1.0, 2.0], 0.0, str) == "2.0 (1.0 to 3.0)"
+    assert spread([3.0, math.inf, 2.0], 9.0, str, about=True) == "≈ 3.0 (2 of 3)"
+    assert spread([math.inf, math.inf, 2.0], 9.0, str) == "> 9.0 (1 of 3)"
+    assert spread([math.inf], 9.0, str, about=True) == "> ≈ 9.0 (0 of 1)"
+    assert spread([4.0], 0.0, str) == "4.0"
 
 
 def example() -> list[Row]:
     """Our SAC is the quicker one as long as steps are fast, our XQC learns more from each."""
     curves = [curve(SAC, 1, (300_000, 5.0)), curve(XQC, 1, (150_000, 5.0)), curve(THEIR_SAC, 1, (300_000, 4.0))]
-    return rows_of(curves, [rate(SAC, 0.01, 400.0), rate(XQC, 0.01, 100.0), rate(THEIR_SAC, 0.01, 100.0)], ENV, 5.0)
+    rates = [rate(SAC, 0.01, 400.0), rate(XQC, 0.01, 100.0), rate(THEIR_SAC, 0.01, 100.0)]
+    return rows_of(curves, rates, Goal(ENV, 300_000, 5.0))
 
 
 def test_the_table_of_minutes() -> None:
     lines = minutes_table(example()).splitlines()
     assert lines[2] == "| millrace SAC | 300k | **12** | **≈ 16** | ≈ 312 |"
-    assert lines[3] == "| Stable-Baselines3 SAC | – (0 of 1) | – (0 of 1) | – (0 of 1) | – (0 of 1) |"
+    assert lines[3] == "| Stable-Baselines3 SAC | > 300k (0 of 1) | > 50 (0 of 1) | > ≈ 62 (0 of 1) | > ≈ 359 (0 of 1) |"
     assert lines[4] == "| millrace XQC | 150k | 25 | ≈ 25 | **≈ 156** |"
 
 
@@ -184,13 +189,23 @@ def test_from_which_step_time_on_another_algorithm_is_the_quickest() -> None:
     assert ranges_text([row for row in example() if row.program.system == THEIRS]) == "–"
 
 
+def test_a_run_that_was_too_short_might_have_been_the_quickest() -> None:
+    curves = [curve(SAC, 1, (300_000, 5.0)), curve(XQC, 1, (150_000, 4.0))]
+    rows = rows_of(curves, [rate(SAC, 0.01, 400.0), rate(XQC, 0.01, 100.0)], Goal(ENV, 300_000, 5.0))
+    (first, at_once), (second, later) = quickest(rows)
+    assert (first, second, at_once) == (SAC, None, 0.01)
+    before = [step_s for step_s in step_times() if step_s < later][-1]
+    assert before < 0.08 <= later  # from there on, XQC's whole run took less time than SAC's
+    assert ranges_text(rows).endswith("on not known")
+
+
 def test_the_part_of_the_page_has_what_there_is() -> None:
     curves = [curve(SAC, 1, (300_000, 5.0))]
     assert page_part([], []) == NOTHING
     assert page_part(curves, []).endswith(f"{NO_MINUTES}\n"), "without rates"
     assert page_part([curve(XQC, 1, (300_000, 5.0))], [rate(XQC, 0.01, 9.0)]).endswith(f"{NO_MINUTES}\n"), "without a goal"
     whole = page_part([*curves, curve(SAC, 2, (300_000, 4.0))], [rate(SAC, 0.01, 400.0, 300.0), rate(SAC, 0.05, 320.0)])
-    assert f"**{ENV}**, minutes until a return of 4.50 on p:" in whole
+    assert f"**{ENV}**, minutes until a return of 4.50 (SAC's after 300k env steps) on p:" in whole
     assert "Each row has 2 seeds. A measured rate is the median of at least 1 round." in whole
     assert "the two differ by at most 0 %" in whole
     assert ENVS[1] not in whole
