@@ -1,25 +1,34 @@
 """Variants of XQC that each lack one of its parts, to measure what the part contributes.
 
-`python -m benchmarks.xqc_ablations` prints the commands that train them. If no setting turns a part off, a separate class
-does, as in `--algo benchmarks.xqc_ablations:WithoutTarget`.
+`python -m benchmarks.xqc_ablations` prints the commands that train them. With `--table FOLDER ...`, it prints the returns of
+the runs in these folders. If no setting turns a part off, a separate class does, as in `--algo
+benchmarks.xqc_ablations:WithoutTarget`.
 """
 
 from __future__ import annotations
 
 import argparse
 import shlex
+from collections.abc import Iterable, Sequence
+from itertools import chain
+from pathlib import Path
 
 import torch
 
-from benchmarks.wall_clock_programs import training
+from benchmarks.markdown_tables import table
+from benchmarks.scores import steps_text
+from benchmarks.wall_clock_curves import Curve, found_in, read_curves
+from benchmarks.wall_clock_programs import OURS, training
+from benchmarks.wall_clock_returns import of_seeds, return_after
 from millrace.algorithms import CriticLoss, Transitions
 from millrace.learner.algorithms.bodies.actor_with_critics import ActorWithCritics
 from millrace.learner.algorithms.bodies.stacked_mlps import MLPShape, Normalized
 from millrace.learner.algorithms.xqc import XQC
 from millrace.protocol.arrays import Floats
 
-ENVS = ("HalfCheetah-v5", "Walker2d-v5")
 STEPS = 101_000
+ENVS = {"HalfCheetah-v5": (20_000, 40_000), "Walker2d-v5": (70_000, 80_000)}
+"""the tasks, and the env steps of their columns in the table; on Walker2d-v5, XQC itself has learned little before"""
 
 
 class WithoutTarget(XQC):
@@ -117,11 +126,44 @@ def command(env: str, flags: tuple[str, ...], seed: int, folder: str) -> str:
     return shlex.join([*training(env, flags, seed, str(STEPS), folder), "--torch-threads", "1", "--resume", "auto"])
 
 
+def variant_of(curve: Curve) -> str | None:
+    """The variant that a run trained, by the flags of its command: of those that fit, the one with the most flags."""
+    words = f"{curve.command} "
+    fitting = [
+        name
+        for name, (algo, *flags) in VARIANTS.items()
+        if f" --algo {algo} " in words and (not flags or f" {' '.join(flags)} " in words)
+    ]
+    return max(fitting, key=lambda name: len(VARIANTS[name]), default=None)
+
+
+def returns_table(curves: Sequence[Curve]) -> str:
+    """The table of the variants' returns on each task, in the order of `VARIANTS`, as Markdown."""
+    columns = [(env, steps) for env, several in ENVS.items() for steps in several]
+    lines = []
+    for name in VARIANTS:
+        cells = [of_seeds(returns_of(curves, name, env, steps)) for env, steps in columns]
+        if any(cells):
+            lines.append((name, *cells))
+    return table(("", *(f"{env}, {steps_text(steps)}" for env, steps in columns)), lines)
+
+
+def returns_of(curves: Iterable[Curve], variant: str, env: str, steps: int) -> list[float]:
+    """The returns of all runs of a variant in the first evaluation after this number of env steps."""
+    mine = (curve for curve in curves if curve.env == env and variant_of(curve) == variant)
+    return [returned for curve in mine if (returned := return_after(curve, steps)) is not None]
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description="print the commands that train XQC without one of its parts each")
     parser.add_argument("--seeds", type=int, nargs="+", default=[1])
     parser.add_argument("--out", default="runs/ablations")
+    parser.add_argument("--table", type=Path, nargs="+", metavar="FOLDER", help="print the returns of these runs")
     given = parser.parse_args()
+    if given.table:
+        kept = [curve for curve in read_curves() if (curve.system, curve.algo) == (OURS, "xqc")]
+        print(returns_table([*kept, *chain.from_iterable(found_in(folder, None) for folder in given.table)]))
+        return
     for seed in given.seeds:
         for number, flags in enumerate(VARIANTS.values()):
             for env in ENVS:
