@@ -51,9 +51,14 @@ class Row(NamedTuple):
     program: Program
     env_steps: list[float]
     """for each seed, the env steps until the return was reached; infinite if it wasn't"""
-    trained: int
-    """env steps of the shortest run that didn't reach the return; 0 if there is none"""
+    trained: list[int]
+    """for each seed, the env steps of its run"""
     rates: list[Rate]
+
+    @property
+    def least_env_steps(self) -> float:
+        """The median seed needs at least these env steps, as a seed that reached no such return needs more than its run."""
+        return statistics.median(map(min, self.env_steps, self.trained))
 
     def minutes(self, step_s: float) -> list[float]:
         """Minutes of each seed at this step time; empty without a rate."""
@@ -65,10 +70,9 @@ class Row(NamedTuple):
         return statistics.median(self.minutes(step_s) or [math.inf])
 
     def least(self, step_s: float) -> float:
-        """The median seed needs at least these minutes: those of its run if that was too short to reach the return."""
-        median = self.median(step_s)
+        """The median seed needs at least these minutes; infinite without a rate."""
         rate = rate_at(step_s, self.rates)
-        return self.trained / rate.per_s / 60 if median == math.inf and rate is not None else median
+        return math.inf if rate is None else self.least_env_steps / rate.per_s / 60
 
 
 def steps_until(points: Sequence[tuple[int, float]], target: float) -> float:
@@ -107,8 +111,7 @@ def rows_of(curves: Sequence[Curve], rates: Sequence[Rate], goal: Goal) -> list[
         its_rates = [rate for rate in rates if (rate.env, rate.system, rate.algo) == (goal.env, *program)]
         if its_curves:
             env_steps = [steps_until(curve.points, goal.target) for curve in its_curves]
-            lengths = [curve.points[-1][0] for curve in its_curves if steps_until(curve.points, goal.target) == math.inf]
-            rows.append(Row(program, env_steps, min(lengths, default=0), its_rates))
+            rows.append(Row(program, env_steps, [curve.points[-1][0] for curve in its_curves], its_rates))
     return rows
 
 
@@ -118,7 +121,7 @@ def minutes_table(rows: Sequence[Row]) -> str:
     least = {step_s: min(row.median(step_s) for row in rows) for step_s in STEP_TIMES_S}
     cells = []
     for row in rows:
-        line = [name_of(row.program), spread(row.env_steps, row.trained, lambda steps: steps_text(round(steps)))]
+        line = [name_of(row.program), spread(row.env_steps, row.least_env_steps, lambda steps: steps_text(round(steps)))]
         for step_s in STEP_TIMES_S:
             rate = rate_at(step_s, row.rates)
             text = ""

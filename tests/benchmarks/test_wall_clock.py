@@ -189,6 +189,12 @@ def test_from_which_step_time_on_another_algorithm_is_the_quickest() -> None:
     assert ranges_text([row for row in example() if row.program.system == THEIRS]) == "–"
 
 
+def test_of_two_seeds_one_that_was_too_short_leaves_open_which_algorithm_is_the_quickest() -> None:
+    curves = [curve(SAC, 1, (90_000, 5.0)), curve(XQC, 1, (50_000, 5.0)), curve(XQC, 2, (100_000, 4.0))]
+    ((first, _),) = quickest(rows_of(curves, [rate(SAC, 0.01, 100.0), rate(XQC, 0.01, 100.0)], Goal(ENV, 100_000, 5.0)))
+    assert first is None
+
+
 def test_a_run_that_was_too_short_might_have_been_the_quickest() -> None:
     curves = [curve(SAC, 1, (300_000, 5.0)), curve(XQC, 1, (150_000, 4.0))]
     rows = rows_of(curves, [rate(SAC, 0.01, 400.0), rate(XQC, 0.01, 100.0)], Goal(ENV, 300_000, 5.0))
