@@ -67,12 +67,15 @@ class Row(NamedTuple):
 
     def median(self, step_s: float) -> float:
         """Minutes of the median seed; infinite if that seed didn't reach the return, or if there is no rate."""
-        return statistics.median(self.minutes(step_s) or [math.inf])
+        return self._minutes_of(statistics.median(self.env_steps), step_s)
 
     def least(self, step_s: float) -> float:
         """The median seed needs at least these minutes; infinite without a rate."""
+        return self._minutes_of(self.least_env_steps, step_s)
+
+    def _minutes_of(self, env_steps: float, step_s: float) -> float:
         rate = rate_at(step_s, self.rates)
-        return math.inf if rate is None else self.least_env_steps / rate.per_s / 60
+        return math.inf if rate is None else env_steps / rate.per_s / 60
 
 
 def steps_until(points: Sequence[tuple[int, float]], target: float) -> float:
