@@ -27,6 +27,7 @@ REBUILD = {f"torch._utils {name}" for name in ("_rebuild_tensor_v2", "_rebuild_t
 ORDERED = "collections OrderedDict"  # the empty dict of a tensor's hooks; also the dict that a module's `state_dict` returns
 BYTES = "_codecs encode"  # creates a bytes object, whose content the pickle holds as text
 CALLED = REBUILD | {ORDERED, BYTES}
+MOST_KEY = 1 << 60  # limit on the size of a number that is a key; larger numbers may all have the same hash
 MOST_REPEATED = 1 << 20  # limit on how often a visitor finds an object that it has already found,
 REPEATED_PER_BYTE = 16  # plus this number for each byte of the pickle, because many dicts have the same keys
 TYPES = ("torch ", "torch.storage ")  # prefixes of the names of storage types and dtypes, which aren't called
@@ -70,6 +71,7 @@ def rehearse(content: bytes) -> None:
     marks = list[int]()
     notes = dict[int, _Made]()
     bytes_left = len(content)
+    squares_left = MOST_OTHER_KEYS**2
     values_left = MOST_REPEATED + REPEATED_PER_BYTE * len(content)
     for opcode, argument, _ in pickletools.genops(content):
         match opcode.name, argument:
@@ -90,9 +92,9 @@ def rehearse(content: bytes) -> None:
             case "APPEND", _:
                 _add(stack, len(stack) - 1)
             case "SETITEMS", _:
-                _set_items(stack, marks.pop())
+                squares_left = _set_items(stack, marks.pop(), squares_left)
             case "SETITEM", _:
-                _set_items(stack, len(stack) - 2)
+                squares_left = _set_items(stack, len(stack) - 2, squares_left)
             case "BINPUT" | "LONG_BINPUT", int(note):
                 notes[note] = stack[-1]
             case "BINGET" | "LONG_BINGET", int(note):
@@ -135,16 +137,27 @@ def _add(stack: list[_Made], first: int) -> None:
         raise Unfit("it has a list or dict that changes after its use")
 
 
-def _set_items(stack: list[_Made], first: int) -> None:
-    """Move keys and values, from index `first` on, into the dict below them. Raises `Unfit` for a key that isn't allowed."""
-    kinds = [type(key.value) for key in stack[first::2]]
-    if not {*kinds} <= {str, int}:
-        raise Unfit("expected tensors and plain data, got a key that is neither text nor a whole number")
+def _may_be_key(key: object) -> bool:
+    return type(key) is str or (type(key) is int and abs(key) < MOST_KEY)
+
+
+def _set_items(stack: list[_Made], first: int, squares_left: int) -> int:
+    """Move keys and values, from index `first` on, into the dict below them. Raises `Unfit` for a key that isn't allowed.
+
+    In all dicts together, the squares of the numbers of keys that are numbers may add up to `squares_left`. Returns how much
+    of it is left.
+    """
+    keys = [key.value for key in stack[first::2]]
+    if not all(map(_may_be_key, keys)):
+        raise Unfit("expected tensors and plain data, got a key that is neither text nor a small number")
     filled = stack[first - 1]
-    filled.numbers += kinds.count(int)
-    if filled.numbers > MOST_OTHER_KEYS:
-        raise Unfit(f"expected a dict with at most {MOST_OTHER_KEYS:,} numbers as keys, got one with more")
+    squares_left += filled.numbers**2
+    filled.numbers += sum(type(key) is int for key in keys)
+    squares_left -= filled.numbers**2
+    if squares_left < 0:
+        raise Unfit(f"expected dicts with at most {MOST_OTHER_KEYS:,} numbers as keys, got more")
     _add(stack, first)
+    return squares_left
 
 
 def _check_storage(storage: object) -> None:

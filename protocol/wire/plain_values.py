@@ -2,24 +2,25 @@
 
 A value is plain if it is None, a bool, int, float, complex, str, bytes, list, tuple, dict, or a numpy scalar or array of
 bools, numbers, text, bytes, dates or durations, or a numpy array of plain objects. Strings with a lone surrogate, which
-UTF-8 cannot encode, integers with more decimal digits than Python converts, and dicts with more than 10,000 keys that aren't
-text are not plain. A value that isn't plain raises `TypeError`; if the caller asks for it, the value is instead sent as its
-`repr` and arrives as a `ReprString`, which cannot be confused with a string. For such a caller, subclasses of dict, list and
-tuple are plain too: they arrive as dicts, lists and tuples. Other numbers, and objects that numpy reads as numbers, such as
-tensors, arrive as numpy scalars or arrays.
+UTF-8 cannot encode, integers with more decimal digits than Python converts, and dicts whose keys could make them slow
+(`_KeyLimit`) are not plain. A value that isn't plain raises `TypeError`; if the caller asks for it, the value is instead
+sent as its `repr` and arrives as a `ReprString`, which cannot be confused with a string. For such a caller, subclasses of
+dict, list and tuple are plain too: they arrive as dicts, lists and tuples. Other numbers, and objects that numpy reads as
+numbers, such as tensors, arrive as numpy scalars or arrays.
 """
 
 from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Callable, Collection
+from collections import Counter
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import msgpack
 import numpy as np
 
-from millrace.protocol.bounds import MOST_OTHER_KEYS
+from millrace.protocol.bounds import MOST_OTHER_KEYS, MOST_WITH_ONE_HASH
 from millrace.protocol.errors import BadMessage, safe_repr
 
 DTYPE_KINDS = "biufcSUmM"
@@ -36,11 +37,37 @@ class ReprString(str):
     __slots__ = ()
 
 
+class _KeyLimit:
+    """Limits the time that the dicts in one value take because of their keys.
+
+    Keys can be chosen so that each collides with all others in its dict. Therefore, the time that a dict takes can grow with
+    the square of the number of its keys, and the squares of all dicts are added up. If keys have the same hash, Python also
+    compares them with each other, however long they are. Text doesn't count, because Python's hashes of text are secret.
+    """
+
+    def __init__(self) -> None:
+        self._squares_left = MOST_OTHER_KEYS**2
+
+    def too_slow(self, keys: Iterable[object]) -> bool:
+        """Whether a dict with these keys would exceed the limit. If not, it counts from now on."""
+        others = [key for key in keys if not isinstance(key, str)]
+        squares = len(others) ** 2
+        if squares > self._squares_left:
+            return True
+        if len(others) > MOST_WITH_ONE_HASH and max(Counter(map(hash, others)).values()) > MOST_WITH_ONE_HASH:
+            return True
+        self._squares_left -= squares
+        return False
+
+
+TOO_SLOW = f"more than {MOST_OTHER_KEYS:,} keys that aren't text, or more than {MOST_WITH_ONE_HASH} with the same hash"
+
+
 def pack(value: object, use_repr: bool = False) -> bytes:
     """Convert a plain value to bytes. For any other value, packs numbers or its `repr` if `use_repr`; otherwise, raises
     `TypeError`.
     """
-    return _pack(_to_msgpack(value, "", use_repr, 0))
+    return _pack(_to_msgpack(value, "", use_repr, _KeyLimit(), 0))
 
 
 def unpack(data: bytes | memoryview) -> Any:
@@ -49,7 +76,7 @@ def unpack(data: bytes | memoryview) -> Any:
     The result has at most `MAX_DEPTH` levels, so it is safe to traverse recursively.
     """
     try:
-        value = _unpack(data, 0)
+        value = _unpack(data, _KeyLimit(), 0)
         _check_depth(value, 0)
         return value
     except BadMessage:
@@ -63,7 +90,7 @@ def _pack(value: object) -> bytes:
     return packed
 
 
-def _to_msgpack(value: Any, where: str, use_repr: bool, depth: int) -> Any:
+def _to_msgpack(value: Any, where: str, use_repr: bool, limit: _KeyLimit, depth: int) -> Any:
     """Convert a value to types that msgpack knows. Types are compared exactly, so that no subclass arrives as its base
     class.
 
@@ -79,17 +106,18 @@ def _to_msgpack(value: Any, where: str, use_repr: bool, depth: int) -> Any:
     if kind is int and (digits := _digits(value)) is not None:
         return msgpack.ExtType(_INT, digits)
     if kind is list or (use_repr and isinstance(value, list)):
-        return [_to_msgpack(inner, f"{where}[{i}]", use_repr, depth + 1) for i, inner in enumerate(value)]
+        return [_to_msgpack(inner, f"{where}[{i}]", use_repr, limit, depth + 1) for i, inner in enumerate(value)]
     if kind is tuple or (use_repr and isinstance(value, tuple)):
-        inside = [_to_msgpack(inner, f"{where}[{i}]", use_repr, depth + 1) for i, inner in enumerate(value)]
+        inside = [_to_msgpack(inner, f"{where}[{i}]", use_repr, limit, depth + 1) for i, inner in enumerate(value)]
         return msgpack.ExtType(_TUPLE, _pack(inside))
-    if (kind is dict or (use_repr and isinstance(value, dict))) and not _has_too_many_keys(value):
+    if (kind is dict or (use_repr and isinstance(value, dict))) and not limit.too_slow(value):
         inside = [
-            _to_msgpack(inner, f"{where}.{key}" if where else str(key), use_repr, depth + 1) for key, inner in value.items()
+            _to_msgpack(inner, f"{where}.{key}" if where else str(key), use_repr, limit, depth + 1)
+            for key, inner in value.items()
         ]
         if all(type(key) is str and _is_encodable(key) for key in value):
             return dict(zip(value, inside, strict=True))
-        keys = [_key(key, f"{where} key", use_repr, depth + 1) for key in value]
+        keys = [_key(key, f"{where} key", use_repr, limit, depth + 1) for key in value]
         return msgpack.ExtType(_PAIRS, _pack([keys, inside]))
     if kind is complex:
         return msgpack.ExtType(_COMPLEX, _pack([value.real, value.imag]))
@@ -98,26 +126,27 @@ def _to_msgpack(value: Any, where: str, use_repr: bool, depth: int) -> Any:
             return msgpack.ExtType(_ARRAY, _pack([value.dtype.str, list(value.shape), value.tobytes()]))
         if value.dtype.kind == "O":
             inside = [
-                _to_msgpack(inner, f"{where}[{i}]", use_repr, depth + 1) for i, inner in enumerate(value.ravel().tolist())
+                _to_msgpack(inner, f"{where}[{i}]", use_repr, limit, depth + 1)
+                for i, inner in enumerate(value.ravel().tolist())
             ]
             return msgpack.ExtType(_OBJECTS, _pack([list(value.shape), inside]))
     if isinstance(value, np.generic) and value.dtype.kind in DTYPE_KINDS:
         return msgpack.ExtType(_SCALAR, _pack([value.dtype.str, value.tobytes()]))
     if use_repr:
         numbers = _numbers(value)
-        return _repr(value) if numbers is None else _to_msgpack(numbers, where, use_repr, depth)
+        return _repr(value) if numbers is None else _to_msgpack(numbers, where, use_repr, limit, depth)
     got = {
         str: "text with a lone surrogate",
         int: "an integer with too many digits",
-        dict: f"a dict with more than {MOST_OTHER_KEYS:,} keys that aren't text",
+        dict: f"dicts with {TOO_SLOW}",
     }.get(kind, kind.__name__)
     raise TypeError(f"{where or 'value'}: expected plain data (numbers, strings, lists, dicts, arrays), got {got}")
 
 
-def _key(key: Any, where: str, use_repr: bool, depth: int) -> Any:
+def _key(key: Any, where: str, use_repr: bool, limit: _KeyLimit, depth: int) -> Any:
     """Convert a key of a dict. A key that isn't plain becomes its `repr`, because an array can't be a key."""
     try:
-        return _to_msgpack(key, where, False, depth)
+        return _to_msgpack(key, where, False, limit, depth)
     except TypeError:
         if use_repr:
             return _repr(key)
@@ -142,11 +171,6 @@ def _repr(value: Any) -> msgpack.ExtType:
     return msgpack.ExtType(_REPR, safe_repr(value)[:MAX_REPR].encode(errors="backslashreplace"))
 
 
-def _has_too_many_keys(keys: Collection[object]) -> bool:
-    """Whether too many of these keys aren't text. Python's hashes of text are secret; those of numbers are not."""
-    return len(keys) > MOST_OTHER_KEYS and sum(not isinstance(key, str) for key in keys) > MOST_OTHER_KEYS
-
-
 def _is_encodable(text: str) -> bool:
     """Whether UTF-8 can encode the text."""
     if text.isascii():
@@ -166,12 +190,12 @@ def _digits(value: int) -> bytes | None:
         return None
 
 
-def _unpack(data: bytes | memoryview, depth: int) -> Any:
+def _unpack(data: bytes | memoryview, limit: _KeyLimit, depth: int) -> Any:
     if depth > MAX_DEPTH:
         raise BadMessage(f"plain value: expected at most {MAX_DEPTH} levels, got more")
 
     def extension(code: int, inside: bytes) -> Any:
-        return _from_extension(code, inside, lambda inner: _unpack(inner, depth + 1))
+        return _from_extension(code, inside, limit, lambda inner: _unpack(inner, limit, depth + 1))
 
     return msgpack.unpackb(data, ext_hook=extension, strict_map_key=True)
 
@@ -192,14 +216,14 @@ def _check_depth(value: object, depth: int) -> None:
             pass
 
 
-def _from_extension(code: int, data: bytes, inner: Callable[[bytes], Any]) -> Any:
+def _from_extension(code: int, data: bytes, limit: _KeyLimit, inner: Callable[[bytes], Any]) -> Any:
     match code:
         case 1:  # _TUPLE
             return tuple(inner(data))
         case 2:  # _PAIRS
             keys, values = inner(data)
-            if _has_too_many_keys(keys):
-                raise BadMessage(f"plain value: expected a dict with at most {MOST_OTHER_KEYS:,} keys that aren't text")
+            if limit.too_slow(keys):
+                raise BadMessage(f"plain value: got dicts with {TOO_SLOW}")
             return dict(zip(keys, values, strict=True))
         case 3:  # _ARRAY
             dtype, shape, raw = inner(data)

@@ -250,10 +250,11 @@ STORAGE = b"(X\x07\x00\x00\x00storagectorch\nFloatStorage\n%bX\x03\x00\x00\x00cp
         b"}" + TUPLE + b"K\x01s",
         b"}(K\x01K\x01" + TUPLE + b"K\x01u",
         b"}G" + bytes(8) + b"K\x01s",
+        b"}\x8a\x08" + (2**61 - 1).to_bytes(8, "little") + b"K\x01s",
         STORAGE % TUPLE,
         b"K\x01Q",
     ],
-    ids=["key", "second key", "float", "storage", "storage without a tuple"],
+    ids=["key", "second key", "float", "number whose hash is 0", "storage", "storage without a tuple"],
 )
 def test_keys_that_take_long_to_find_are_refused(tmp_path: Path, opcodes: bytes) -> None:
     path = tmp_path / "model.pt"
@@ -350,7 +351,7 @@ def test_all_that_a_state_may_hold_passes_the_rehearsal(tmp_path: Path) -> None:
         "plain": [(), (1,), (1, 2), (1, 2, 3), (1, 2, 3, 4), 2**70, -1, 300, 70_000, 0.5, True, False, None, "ä", [], {}],
         "bytes": [b"a", b"\xff" * 300, b"a"],
         "many": list(range(2000)),
-        "keys": {"ä": 0, "": 1, 0: 2, -1: 3, 2**60: 4, -(2**70): 5},
+        "keys": {"ä": 0, "": 1, 0: 2, -1: 3, 2**60 - 1: 4, -(2**60) + 1: 5},
     }
     checkpoint.save(tmp_path, saved, 100, keep=1)
     found = checkpoint.newest(tmp_path)[0].state
@@ -446,7 +447,7 @@ def test_what_could_not_be_read_back_is_not_written_and_named(tmp_path: Path, st
     assert line.endswith("; fix state_dict")
 
 
-@pytest.mark.parametrize("key", [(1, 2), 0.5, None, True])
+@pytest.mark.parametrize("key", [(1, 2), 0.5, None, True, 2**60, -(2**60)])
 def test_a_state_with_keys_that_could_not_be_read_back_is_not_written(tmp_path: Path, key: object) -> None:
     line = refused(tmp_path, {"inner": {key: 1}})
     assert line.startswith("checkpoint: state['inner'] (builtins.dict): expected tensors and plain data, got a key that"), (
@@ -470,13 +471,25 @@ def test_a_dict_with_too_many_numbers_as_keys_is_refused(tmp_path: Path) -> None
     checkpoint.save(tmp_path, few, 100, keep=1)
     assert checkpoint.newest(tmp_path)[0].state == few
     (tmp_path / "checkpoints" / "000000000100.pt").unlink()
-    assert "state['x'] (builtins.dict): expected a dict with at most 10,000 numbers as keys" in refused(
+    assert "state['x'] (builtins.dict): expected dicts with at most 10,000 numbers as keys" in refused(
         tmp_path, {"x": dict.fromkeys(range(10_001), 1)}
     )
     path = tmp_path / "model.pt"
-    with_pickle(path, b"\x80\x02}" + b"".join(b"M" + n.to_bytes(2, "little") + b"K\x01s" for n in range(10_001)) + b".")
-    with pytest.raises(CheckpointError, match="at most 10,000 numbers as keys"):
-        checkpoint.load(path)
+    for first, dicts, keys in ((b"}", 1, 10_001), (b"]", 5, 5_000)):
+        one = b"".join(b"M" + n.to_bytes(2, "little") + b"K\x01s" for n in range(keys))
+        content = first + (one if dicts == 1 else (b"}" + one + b"a") * dicts)
+        with_pickle(path, b"\x80\x02" + content + b".")
+        with pytest.raises(CheckpointError, match="at most 10,000 numbers as keys"):
+            checkpoint.load(path)
+
+
+def test_dicts_with_some_numbers_as_keys_may_be_many(tmp_path: Path) -> None:
+    """Their times add up to the time of one dict with 10,000 such keys."""
+    few = {"x": [dict.fromkeys(range(n), 1) for n in (5_000,) * 4]}
+    checkpoint.save(tmp_path, few, 100, keep=1)
+    assert checkpoint.newest(tmp_path)[0].state == few
+    (tmp_path / "checkpoints" / "000000000100.pt").unlink()
+    assert "expected dicts with at most 10,000 numbers as keys" in refused(tmp_path, {"x": few["x"], "y": {0: 1}})
 
 
 def test_the_state_of_a_module_comes_back(tmp_path: Path) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections import OrderedDict, defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from enum import IntEnum
 from typing import Any, NamedTuple
@@ -16,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from millrace.protocol.bounds import MOST_OTHER_KEYS
+from millrace.protocol.bounds import MOST_OTHER_KEYS, MOST_WITH_ONE_HASH
 from millrace.protocol.errors import BadMessage
 from millrace.protocol.wire.plain_values import MAX_DEPTH, ReprString, pack, repr_paths, unpack
 from tests.support.numbers.bit_equality import bit_equal
@@ -53,21 +53,64 @@ def test_arrays_of_objects_come_back() -> None:
     assert bit_equal(unpack(pack(array)), array)
 
 
+def packed_dict(keys: Iterable[object]) -> bytes:
+    """A dict with these keys, as a program that knows no limit packs it."""
+    packed = [*map(pack, keys)]
+    length = b"\xdd" + len(packed).to_bytes(4, "big")
+    pairs = b"\x92" + length + b"".join(packed) + length + b"\xc0" * len(packed)
+    return b"\xc9" + len(pairs).to_bytes(4, "big") + b"\x02" + pairs
+
+
 @pytest.mark.parametrize("key", [int, complex, lambda n: (n,), lambda n: str(n).encode()])
 def test_a_dict_with_too_many_keys_that_are_not_text_is_refused(key: Callable[[int], Any]) -> None:
     """They can be chosen so that each collides with all others: 700,000 numbers, in 3.5 MB, take minutes."""
     few, many = ({key(n): None for n in range(count)} for count in (MOST_OTHER_KEYS, MOST_OTHER_KEYS + 1))
-    assert unpack(pack(few)) == few
-    for packed in ([*map(pack, many)], [pack("a"), *map(pack, many)]):
-        keys = b"\xdd" + len(packed).to_bytes(4, "big") + b"".join(packed)
-        pairs = b"\x92" + keys + b"\xdd" + len(packed).to_bytes(4, "big") + b"\xc0" * len(packed)
-        with pytest.raises(BadMessage, match="at most 10,000 keys that aren't text"):
-            unpack(b"\xc9" + len(pairs).to_bytes(4, "big") + b"\x02" + pairs)
+    assert unpack(pack(few)) == few == unpack(packed_dict(few))
+    for keys in ([*many], ["a", *many]):
+        with pytest.raises(BadMessage, match="more than 10,000 keys that aren't text"):
+            unpack(packed_dict(keys))
     with pytest.raises(
-        TypeError, match=r"^a: expected plain data .*, got a dict with more than 10,000 keys that aren't text$"
+        TypeError, match=r"^a: expected plain data .*, got dicts with more than 10,000 keys that aren't text"
     ):
         pack({"a": many})
     assert type(unpack(pack({"a": many}, use_repr=True))["a"]) is ReprString
+
+
+@pytest.mark.parametrize(
+    "key",
+    [
+        lambda n: (2**61 - 1) * n,
+        lambda n: complex(-1_000_003 * n, n),
+        lambda n: tuple(-1 - (n >> bit & 1) for bit in reversed(range(211))),
+    ],
+    ids=["whole numbers", "complex numbers", "long tuples"],
+)
+def test_a_dict_whose_keys_have_the_same_hash_is_refused(key: Callable[[int], Any]) -> None:
+    """Python would compare each in full with all others: 2,000 long tuples, in 436 kB, take a second."""
+    few, many = ({key(n): None for n in range(1, count + 1)} for count in (MOST_WITH_ONE_HASH, MOST_WITH_ONE_HASH + 1))
+    assert len({hash(each) for each in many}) == 1
+    assert unpack(pack(few | {"a": None})) == few | {"a": None}
+    for keys in ([*many], ["a", 1, *many]):
+        with pytest.raises(BadMessage, match="more than 64 with the same hash"):
+            unpack(packed_dict(keys))
+    with pytest.raises(TypeError, match=r"^a: expected plain data .*, got dicts with .* more than 64 with the same hash$"):
+        pack({"a": many})
+    assert type(unpack(pack({"a": many}, use_repr=True))["a"]) is ReprString
+
+
+def test_dicts_that_would_together_take_longer_than_the_largest_one_are_refused() -> None:
+    """The time of each grows with the square of the number of its keys."""
+    half = dict.fromkeys(range(MOST_OTHER_KEYS // 2))
+    few = [half, {"a": half}, (half, half)]
+    assert unpack(pack(few)) == few
+    one, few_packed = packed_dict(half), b"\x94" + packed_dict(half) * 4
+    assert unpack(few_packed) == [half] * 4
+    for packed in (b"\x95" + one * 4 + packed_dict([1]), b"\x92" + packed_dict([*half, -5]) + b"\x93" + one * 3):
+        with pytest.raises(BadMessage, match="more than 10,000 keys that aren't text"):
+            unpack(packed)
+    with pytest.raises(TypeError, match=r"^\[3\]: expected plain data .*, got dicts with more than 10,000 keys"):
+        pack([*few, {1: None}])
+    assert unpack(pack([*few, {1: None}, {"a": 1}], use_repr=True)) == [*few, "{1: None}", {"a": 1}]
 
 
 def test_a_dict_may_have_any_number_of_names() -> None:
@@ -77,6 +120,7 @@ def test_a_dict_may_have_any_number_of_names() -> None:
 
 
 def test_a_large_dict_of_coordinates_comes_back() -> None:
+    """Python's hashes of -1 and -2 are the same."""
     grid = dict.fromkeys(itertools.product(range(-5, 5), repeat=4), 0)
     assert unpack(pack(grid)) == grid
 
