@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 PICKLE = "data.pkl"  # suffix of the pickle's name in the archive; torch accepts capital letters, too
+MOST_STEPS = 20  # limit on the steps of the path to a part; in a nest that is too deep to be pickled, each part is wrong
 MOST_VIEWS = 16  # limit on views of the same numbers; an algorithm may save parts of a tensor in addition to the whole
 
 
@@ -24,13 +25,13 @@ def write_state(file: BinaryIO, record: object, state: object, where: str) -> No
     """Write a record, which contains the state, into an empty file that can also be read.
 
     Raises `UsageError` if the state contains something that couldn't be read back. The error names the first such part,
-    as a path that begins with `where`. Raises `OSError` and `RuntimeError` as torch.save does.
+    as a path that begins with `where`. Raises `OSError` if the file system refuses the file.
     """
     if not (why := _why_unreadable(file, record)):
         return
     part = state
     tried = set[int]()
-    while True:
+    for _ in range(MOST_STEPS):
         for step, inner in _parts(part):
             if id(inner) not in tried:
                 tried.add(id(inner))
@@ -38,8 +39,9 @@ def write_state(file: BinaryIO, record: object, state: object, where: str) -> No
                     where, part, why = f"{where}{step}", inner, why_inner
                     break
         else:
-            kind = type(part)
-            raise UsageError(f"{where} ({kind.__module__}.{kind.__qualname__}): {why}; fix state_dict")
+            break
+    kind = type(part)
+    raise UsageError(f"{where} ({kind.__module__}.{kind.__qualname__}): {why}; fix state_dict")
 
 
 def check_pickles(archive: zipfile.ZipFile) -> None:
@@ -69,11 +71,14 @@ def _why_unreadable(file: BinaryIO, record: object) -> str:
         with zipfile.ZipFile(file) as archive:
             check_pickles(archive)
         check_memory(record, file.seek(0, 2))
-    except (OSError, RuntimeError, MemoryError):  # not the state's fault
+    except (OSError, MemoryError):  # not the state's fault
         raise
     except Unfit as unfit:
         return str(unfit)
     except Exception as error:  # objects of any class raise anything when they are pickled
+        refused = error.__context__  # torch raises its own RuntimeError while it handles the file's error
+        if isinstance(error, RuntimeError) and isinstance(refused, OSError):
+            raise refused from error
         return f"expected tensors and plain data, got {type(error).__name__}: {first_line(error)}"
     return ""
 

@@ -72,10 +72,8 @@ def save(folder: Path, state: dict[str, Any], env_steps: int, keep: int) -> Path
         write_atomically(path, lambda file: write_state(file, record, state, "checkpoint: state"))
         for old in [each for each in _files(folder) if each <= path][:-keep]:
             old.unlink()
-    except (OSError, RuntimeError) as error:
-        refused = error.__context__  # torch raises its own RuntimeError while it handles the file's error
-        why = reason(refused if isinstance(refused, OSError) and not isinstance(error, OSError) else error)
-        raise CheckpointError(f"checkpoint {path} not written: {why}; older checkpoints are untouched") from error
+    except OSError as error:
+        raise CheckpointError(f"checkpoint {path} not written: {reason(error)}; older checkpoints are untouched") from error
     return path
 
 

@@ -4,6 +4,7 @@ import codecs
 import errno
 import os
 import pickle
+import re
 import resource
 import shutil
 import signal
@@ -425,6 +426,19 @@ def generator() -> Iterator[int]:
     yield 1
 
 
+def nest() -> list[Any]:
+    """Deeper than pickle can follow."""
+    outermost: list[Any] = []
+    for _ in range(10_000):
+        outermost = [outermost]
+    return outermost
+
+
+class Handle:
+    def __reduce__(self) -> str:
+        raise RuntimeError("a handle can't be pickled")
+
+
 @pytest.mark.parametrize(
     ("stray", "named"),
     [
@@ -438,6 +452,8 @@ def generator() -> Iterator[int]:
         (OwnDict(), f"{__name__}.OwnDict"),
         (OwnTuple(), f"{__name__}.OwnTuple"),
         (torch.Size([1]), "torch.Size"),
+        (iter(torch.utils.data.DataLoader([1])), "torch.utils.data.dataloader._SingleProcessDataLoaderIter"),  # type: ignore[arg-type]
+        (Handle(), f"{__name__}.Handle"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
@@ -445,6 +461,13 @@ def test_what_could_not_be_read_back_is_not_written_and_named(tmp_path: Path, st
     line = refused(tmp_path, {"whole": [torch.ones(3)], "inner": [stray]})
     assert line.startswith(f"checkpoint: state['inner'][0] ({named}): expected tensors and plain data, got "), line
     assert line.endswith("; fix state_dict")
+
+
+def test_a_nest_that_is_too_deep_is_not_written_and_named(tmp_path: Path) -> None:
+    line = refused(tmp_path, {"whole": [torch.ones(3)], "inner": nest()})
+    assert re.fullmatch(
+        r"checkpoint: state\['inner'\](\[0\]){19} \(builtins\.list\): .*RecursionError: .*; fix state_dict", line
+    )
 
 
 @pytest.mark.parametrize("key", [(1, 2), 0.5, None, True, 2**60, -(2**60)])
