@@ -7,6 +7,8 @@ about a missing package needs none.
 from __future__ import annotations
 
 import importlib
+import logging
+import site
 import sys
 import traceback
 from collections.abc import Callable, Iterable
@@ -19,6 +21,8 @@ from millrace.protocol.envs.advice.files_as_modules import module_of_file
 from millrace.protocol.envs.advice.missing_modules import what_to_install
 from millrace.protocol.envs.found_names import attribute, names_a_module
 from millrace.protocol.errors import UsageError, did_you_mean, first_line
+
+log = logging.getLogger("millrace.own_module")
 
 
 def is_name(text: str) -> bool:
@@ -56,11 +60,17 @@ def refuse_modules_in(folder: Path, names: Iterable[str]) -> None:
     """Ensure that no module is ever imported from a run folder, because it may come from a stranger.
 
     Removes the folder, and all that is inside it, from the search path, which the workers of this process inherit: besides
-    the modules that the folder's files name, an environment's id can make gymnasium's plugins be imported. Raises
+    the modules that the folder's files name, an environment's id can make gymnasium's plugins be imported. Python's own
+    libraries stay on the path, because the run folder may be a project's folder that contains a virtual environment. Raises
     `UsageError` if one of these names, `module:name` or `package.module_v1`, leads from a folder above into the run folder.
     """
     inside = folder.resolve()
-    sys.path[:] = [entry for entry in sys.path if not Path(entry).resolve().is_relative_to(inside)]
+    installations = [each for each in _installations() if each.is_relative_to(inside)]
+    for searched in sys.path.copy():
+        path = Path(searched).resolve()
+        if path.is_relative_to(inside) and not any(each in path.parents for each in installations):
+            sys.path.remove(searched)
+            log.warning("run %s: nothing is imported from a run folder, so %s is taken off the search path", folder, path)
     above = [entry for each in sys.path if inside.is_relative_to(entry := Path(each).resolve())]
     for name in names:
         module, colon, _ = name.partition(":")
@@ -70,6 +80,14 @@ def refuse_modules_in(folder: Path, names: Iterable[str]) -> None:
                 f"run {folder}: {one_line(name, 200)} would be imported from the run folder, which is refused; if you "
                 "trust that module, put it into a folder of your own"
             )
+
+
+def _installations() -> set[Path]:
+    """The folders below which this Python finds installed libraries: its virtual environment, its own, and the user's."""
+    prefixes = {sys.prefix, sys.exec_prefix, sys.base_prefix, sys.base_exec_prefix}
+    if site.ENABLE_USER_SITE:
+        prefixes.add(site.getuserbase())
+    return {Path(each).resolve() for each in prefixes}
 
 
 def callable_of(module: ModuleType, qualname: str, what: str) -> Callable[..., Any]:

@@ -2,6 +2,7 @@
 
 import errno
 import json
+import site
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -104,7 +105,12 @@ def test_a_module_in_a_run_folder_is_not_imported(
 @pytest.mark.parametrize("found_from", ["run", "run/package", "link", "run/zipped.zip", "."])
 @pytest.mark.parametrize("read", [config_of_run, load_policy])
 def test_nothing_is_found_in_a_run_folder_that_is_on_the_search_path(
-    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, found_from: str, read: Callable[[Path], object]
+    run: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    found_from: str,
+    read: Callable[[Path], object],
 ) -> None:
     """Not even by those who import what no setting names: a namespace's registrar, and the plugins of packages."""
     run = run.rename(tmp_path / "run")
@@ -115,6 +121,39 @@ def test_nothing_is_found_in_a_run_folder_that_is_on_the_search_path(
     monkeypatch.setattr(sys, "path", [entry, *sys.path, str(tmp_path)])
     expected = sys.path[1:]
     read(run)
+    assert sys.path == expected
+    removed = (run if entry == "" else Path(entry)).resolve()
+    assert [each.message for each in caplog.records] == [
+        f"run {run}: nothing is imported from a run folder, so {removed} is taken off the search path"
+    ]
+
+
+@pytest.mark.parametrize("prefix", ["prefix", "exec_prefix", "base_prefix", "base_exec_prefix", "user"])
+def test_the_libraries_of_a_python_that_is_installed_in_a_run_folder_stay_on_the_search_path(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, prefix: str
+) -> None:
+    """For example, a policy that is saved in the folder of a project."""
+    (tmp_path / "link").symlink_to(run)
+    if prefix == "user":
+        monkeypatch.setattr(site, "ENABLE_USER_SITE", True)
+        monkeypatch.setattr(site, "USER_BASE", str(tmp_path / "link" / ".venv"))
+    else:
+        monkeypatch.setattr(sys, prefix, str(tmp_path / "link" / ".venv"))
+    libraries = [str(run / ".venv" / "lib" / each) for each in ("python311.zip", "python3.11", "python3.11/site-packages")]
+    others = [str(run / each) for each in ("", "src", ".venv", ".venv2/lib")]
+    monkeypatch.setattr(sys, "path", [others[0], *libraries, *others, *sys.path])
+    expected = [*libraries, *sys.path[8:]]
+    load_policy(run)
+    assert sys.path == expected
+    assert len(caplog.records) == 5
+
+
+def test_a_run_folder_inside_a_python_s_installation_is_not_searched(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a container, Python may be installed in /usr, and the run folder may be below it."""
+    monkeypatch.setattr(sys, "prefix", str(run.parent))
+    monkeypatch.setattr(sys, "path", [str(run), str(run / "package"), *sys.path])
+    expected = sys.path[2:]
+    load_policy(run)
     assert sys.path == expected
 
 
