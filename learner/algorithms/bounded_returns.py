@@ -33,13 +33,14 @@ class BoundedReturns(RewardScaler):
         divided: Floats = (reward / max(self.std, self._largest / self._bound)).astype(np.float32)
         return divided
 
-    def may_last(self, reward: Floats, steps: int = 1) -> None:
-        """Record that the largest of these rewards may be earned forever. Without a discount, do nothing.
+    def may_last(self, reward: Floats, discount: Floats) -> None:
+        """Record that such rewards may be earned forever. With γ = 1, do nothing.
 
-        `reward`: discounted sums of the rewards of `steps` steps.
+        `reward` [B]: Σ γⁱ r over k steps. `discount` [B]: γᵏ; 0 if the episode terminated, because the rewards then end.
         """
-        if self._gamma < 1:  # Σ γⁱ over these steps is (1 − γⁿ) / (1 − γ), and the value is that of 1 / (1 − γ) steps
-            self._largest = max(self._largest, float(abs(reward).max(initial=0)) / (1 - self._gamma**steps))
+        if self._gamma < 1:  # the same sum again after k steps, again and again, is worth its (1 + γᵏ + γ²ᵏ + …)-fold
+            value = reward / (1 - np.minimum(discount, self._gamma, dtype=np.float64))  # float32 may round γᵏ up to 1
+            self._largest = max(self._largest, float(abs(value).max(initial=0)))
 
     def counted(self, returns: Doubles, reward: Floats, ends: EpisodeEnds, lane: int, fresh: Bools) -> None:
         """See `RewardScaler`."""

@@ -19,9 +19,10 @@ from millrace.learner.algorithms.bodies.normalized_sac import NormalizedSAC
 from millrace.learner.algorithms.bodies.stacked_mlps import MLPShape, Normalized
 from millrace.learner.algorithms.bounded_returns import BoundedReturns
 from millrace.learner.algorithms.replay.off_policy import CriticLoss
+from millrace.learner.algorithms.replay.replay_buffer import Sample
+from millrace.learner.algorithms.replay.sequence_replay import SequenceSample
 from millrace.learner.algorithms.replay.transitions import Transitions
 from millrace.learner.config.hyperparameters import XQCConfig
-from millrace.protocol.arrays import Floats
 from millrace.protocol.specs import PolicySpec
 
 INITIAL_TEMPERATURE = 0.01
@@ -56,14 +57,14 @@ class XQC(NormalizedSAC):
         """See `Continuous`."""
         return ActorWithCritics(self.policy, *self.shapes(), self.categories.mean, device, self.seed)
 
-    def scaled(self, reward: Floats) -> Floats:
-        """See `GradientDescent`. Rewards are scaled so that values don't exceed `return_bound`.
+    def transitions(self, sample: Sample | SequenceSample) -> Transitions:
+        """See `OffPolicy`. Rewards are scaled so that values don't exceed `return_bound`.
 
         With hindsight, an agent that stays at a goal gets the goal's reward at every step, which no collected return shows.
         """
         if self.config.hindsight and self.config.goal_ends is None:
-            self.rewards.may_last(reward, self.config.n_step)
-        return super().scaled(reward)
+            self.rewards.may_last(sample.reward, sample.discount)
+        return super().transitions(sample)
 
     def target_distribution(self, rows: Transitions, next_logits: Tensor, next_log_prob: Tensor) -> Tensor:
         """The distribution [B, O] over categories of Σ γⁱ r + γᵏ (Z′ − α log π(a′|s′)), without a gradient.

@@ -125,7 +125,7 @@ def test_a_truncated_episode_of_one_step_says_nothing() -> None:
 def test_without_a_discount_only_returns_count() -> None:
     scaler = BoundedReturns(1.0, BOUND)
     life([5.0] * 4, "truncated").count_into(scaler)
-    scaler.may_last(np.ones(1, np.float32))
+    scaler.may_last(np.ones(1, np.float32), np.ones(1, np.float32))
     assert divisor(scaler) == pytest.approx(max(scaler.std, 20 / BOUND))
 
 
@@ -133,14 +133,30 @@ def test_a_reward_that_may_last_is_worth_what_it_is_for_ever() -> None:
     scaler = BoundedReturns(GAMMA, BOUND)
     life([0.0] * 4, "truncated").count_into(scaler)
     assert divisor(scaler) == 1
-    scaler.may_last(np.array([0, 1, -2], np.float32))
+    scaler.may_last(np.array([0, 1, -2], np.float32), np.full(3, GAMMA, np.float32))
     assert divisor(scaler) == pytest.approx(2 / (1 - GAMMA) / BOUND)
 
 
-def test_a_sum_of_rewards_that_may_last_counts_as_its_mean() -> None:
+@pytest.mark.parametrize("steps", [1, 2, 3])
+def test_a_sum_of_rewards_that_may_last_counts_as_its_mean_however_many_steps_it_has(steps: int) -> None:
+    """Where an episode is truncated, it has fewer than the others."""
     scaler = BoundedReturns(GAMMA, BOUND)
-    scaler.may_last(np.array([2 * (1 + GAMMA + GAMMA**2)], np.float32), steps=3)
+    reward = [1 + GAMMA + GAMMA**2, 2 * sum(GAMMA**i for i in range(steps))]
+    scaler.may_last(np.array(reward, np.float32), np.array([GAMMA**3, GAMMA**steps], np.float32))
     assert divisor(scaler) == pytest.approx(2 / (1 - GAMMA) / BOUND)
+
+
+def test_rewards_before_an_episode_terminates_do_not_last() -> None:
+    scaler = BoundedReturns(GAMMA, BOUND)
+    scaler.may_last(np.array([50, 1], np.float32), np.array([0, GAMMA], np.float32))
+    assert divisor(scaler) == pytest.approx(50 / BOUND)
+
+
+def test_a_discount_that_float32_rounds_to_1_does_not_make_a_reward_infinite() -> None:
+    gamma = 1 - 1e-9
+    scaler = BoundedReturns(gamma, BOUND)
+    scaler.may_last(np.ones(1, np.float32), np.array([gamma], np.float32))
+    assert divisor(scaler) == pytest.approx(1 / (1 - gamma) / BOUND)
 
 
 def test_a_saved_state_goes_on() -> None:

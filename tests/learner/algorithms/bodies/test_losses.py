@@ -257,14 +257,20 @@ def test_xqc_learns_from_rewards_whose_values_are_within_the_bound_of_the_catego
     assert np.array_equal(plainly.scaled(rows.reward), rows.reward)
 
 
-@pytest.mark.parametrize(("goal_ends", "n_step", "lasts"), [(None, 1, 100.0), (None, 3, 1 / (1 - 0.99**3)), (0.05, 1, 1.0)])
+@pytest.mark.parametrize(
+    ("goal_ends", "discount", "lasts"),
+    [(None, 0.99, 100.0), (None, 0.99**3, 1 / (1 - 0.99**3)), (None, 0, 1.0), (0.05, 0.99, 1.0)],
+)
 def test_with_hindsight_the_reward_of_a_goal_may_last_unless_a_goal_ends_the_episode(
-    goal_ends: float | None, n_step: int, lasts: float
+    goal_ends: float | None, discount: float, lasts: float
 ) -> None:
-    algorithm = made("xqc", gamma=0.99)
-    algorithm.config = replace(algorithm.config, hindsight=0.8, goal_ends=goal_ends, n_step=n_step)
-    reward = np.array([0, 1], np.float32)
-    assert algorithm.scaled(reward)[1] == pytest.approx(1 / max(1, lasts / algorithm.config.return_bound))
+    algorithm = made("xqc", gamma=0.99, return_bound=5)
+    algorithm.config = replace(algorithm.config, hindsight=0.8, goal_ends=goal_ends, n_step=3)
+    sample = sample_of(np.random.default_rng(0), 2)._replace(
+        reward=np.array([0, 1], np.float32), discount=np.array([0.99**3, discount], np.float32)
+    )
+    expected = 1 / max(1, lasts / algorithm.config.return_bound)
+    assert algorithm.transitions(sample).reward[1].item() == pytest.approx(expected)
 
 
 def test_the_temperature_of_xqc_begins_in_units_of_scaled_rewards() -> None:
