@@ -56,6 +56,7 @@ class ResetAhead(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._second: gymnasium.Env[Any, Any] | None = None
         self._second_seed: int | None = None  # seed for the second instance's next reset
         self._prepared: Future[Prepared] | None = None
+        self._late: dict[str, Any] = {}  # attributes for the second instance, which lacks them until its first reset
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """See `gymnasium.Env.reset`. If the prepared reset has raised, raises its exception."""
@@ -87,7 +88,11 @@ class ResetAhead(gymnasium.Wrapper[Any, Any, Any, Any]):
             try:
                 env = self._make() if instance is None else instance
                 self._second = env
-                prepared.set_result((env, *env.reset(seed=seed)))
+                first = env.reset(seed=seed)
+                for name, value in self._late.items():
+                    _set(env, name, value)
+                self._late = {}
+                prepared.set_result((env, *first))
             except BaseException as error:
                 prepared.set_exception(error)
 
@@ -98,11 +103,16 @@ class ResetAhead(gymnasium.Wrapper[Any, Any, Any, Any]):
         """See `gymnasium.Wrapper.set_wrapper_attr`. An attribute of the environment is set on both instances.
 
         Waits for a reset in progress. The other instance gets a copy of the value, because an instance may change its value.
+        If the other instance lacks the attribute, because `reset` creates it, the instance gets it after its first reset.
+        Raises `AttributeError` if the instance lacks it even then.
         """
         if hasattr(self, name) or not self.env.has_wrapper_attr(name):
             return super().set_wrapper_attr(name, value, force=force)
         playing, other = self.instances()
-        other.set_wrapper_attr(name, deepcopy(value))
+        if self._prepared is None and not other.has_wrapper_attr(name):
+            self._late[name] = deepcopy(value)
+        else:
+            _set(other, name, deepcopy(value))
         return playing.set_wrapper_attr(name, value)
 
     def instances(self) -> tuple[gymnasium.Env[Any, Any], gymnasium.Env[Any, Any]]:
@@ -133,3 +143,11 @@ class ResetAhead(gymnasium.Wrapper[Any, Any, Any, Any]):
         finally:
             give_back(self.env)  # for both instances, because they have taken turns
             give_back(self._second)
+
+
+def _set(env: gymnasium.Env[Any, Any], name: str, value: Any) -> None:
+    """Set an attribute that the instance has. A new one would belong to a wrapper, and hide that of the environment."""
+    if not env.set_wrapper_attr(name, value, force=False):
+        raise AttributeError(
+            f"expected an attribute {name} of both instances of ResetAhead, got one of the playing instance only"
+        )

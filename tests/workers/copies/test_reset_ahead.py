@@ -17,6 +17,7 @@ from millrace.protocol.errors import UsageError
 from millrace.protocol.random_streams import Purpose, env_seed
 from millrace.protocol.wire.plain_values import pack
 from millrace.workers.copies.env_copies import CANNOT_RESTART, LoopedCopies
+from millrace.workers.copies.env_errors import CopyFailed
 from millrace.workers.copies.reset_ahead import ResetAhead
 from millrace.workers.copies.seated_copies import SeatedCopies
 from tests.support.in_process.collectors import no_pulse
@@ -74,6 +75,18 @@ class Traced(gymnasium.Env[Any, Any]):
         self.closed = True
 
 
+class Windy(Traced):
+    """Its attribute `wind` exists after the first reset, and `gust` after the first step."""
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        self.wind = 0.0
+        return super().reset(seed=seed, options=options)
+
+    def step(self, action: Any) -> Any:
+        self.gust = 1.0
+        return super().step(action)
+
+
 class TracedPair(Traced):
     """The same for two agents, which both see everything."""
 
@@ -90,6 +103,7 @@ class TracedPair(Traced):
 
 
 gymnasium.register("tests/Traced-v0", f"{__name__}:Traced", disable_env_checker=True)
+gymnasium.register("tests/Windy-v0", f"{__name__}:Windy", disable_env_checker=True, max_episode_steps=9)
 gymnasium.register("tests/TracedPair-v0", f"{__name__}:TracedPair", disable_env_checker=True)
 
 
@@ -200,6 +214,35 @@ def test_the_method_of_gymnasium_sets_attributes_on_both_instances_too(make: Cal
     assert [each.level for each in Traced.made] == [3, 3]
     assert [each.levels for each in Traced.made] == [[1, 2], [1, 2]]
     assert Traced.made[0].levels is not Traced.made[1].levels, "an instance may change its value"
+
+
+def test_an_attribute_that_a_reset_creates_is_set_in_every_episode() -> None:
+    """Before its first reset, the second instance lacks the attribute."""
+    env = ResetAhead(gymnasium.make("tests/Windy-v0"))
+    env.reset(seed=1)
+    for wind in (4, 5):
+        env.set_wrapper_attr("wind", wind, force=False)
+    seen = []
+    for wind in (6, 7, 8, 9):
+        env.reset()
+        env.instances()  # the other one is reset as well
+        before = [each.wind for each in Traced.made if isinstance(each, Windy)]
+        env.set_wrapper_attr("wind", wind, force=False)
+        seen.append((before, env.unwrapped.wind))  # type: ignore[attr-defined]
+    env.close()
+    assert [wind for _, wind in seen] == [6, 7, 8, 9]
+    assert seen[0][0] == [0, 5], "set before the first reset of the second instance"
+
+
+def test_an_attribute_that_the_other_instance_lacks_after_its_reset_is_an_error() -> None:
+    copies = LoopedCopies([lambda: ResetAhead(gymnasium.make("tests/Windy-v0"))], no_pulse)
+    copies.reset([1], no_pulse)
+    for _ in range(4):  # the second episode has begun, so the next one is prepared
+        copies.step(np.zeros(1, np.int64), no_pulse)
+    with pytest.raises(CopyFailed) as caught:
+        copies.assign("gust", pack(2.0), no_pulse)
+    assert str(caught.value.__cause__).startswith("expected an attribute gust of both instances of ResetAhead")
+    copies.close()
 
 
 @pytest.mark.parametrize("agents", [1, 2])
