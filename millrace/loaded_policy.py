@@ -115,7 +115,8 @@ class LoadedPolicy:
             first: For a recurrent policy: whether this observation is the first of an episode, as a bool or an array [n].
             mask: Which actions are allowed, in the form of `info["action_mask"]`: [choices] bool or int8, or a tuple with an
                 array for each entry of the action; or the masks of n observations, such as [n, choices] or the
-                `infos["action_mask"]` of a vector environment. If it is None, a policy that was trained with masks in its
+                `infos["action_mask"]` of a vector environment, with ones for copies that have none because their episodes
+                have ended (`~infos["_action_mask"]`). If it is None, a policy that was trained with masks in its
                 Dict observations reads them there; otherwise all actions are allowed.
 
         Raises `UsageError` if the observation isn't in the space, isn't finite, or has a different number of copies than the
@@ -178,8 +179,12 @@ class LoadedPolicy:
             expected = f"{size} zeros and ones of int8 or bool, or [{n}, {size}]" if size else "none for this action space"
             raise UsageError(f"mask: expected {expected}, got {_forms_of_mask(mask)}")
         allowed: Bools = np.broadcast_to(bits, (1, n, size))
-        if no_choice(allowed, action).any():
-            raise UsageError("mask: expected an allowed choice for each entry of the action, got none")
+        if (without := no_choice(allowed, action)[0]).any():
+            whose = f" for observations {np.flatnonzero(without).tolist()[:20]}" if n > 1 else ""
+            raise UsageError(
+                f"mask: expected an allowed choice for each entry of the action, got none{whose}; if copies have no mask "
+                "because their episodes have ended, pass ones for them"
+            )
         return allowed
 
     def _leaves(self, observation: Observation) -> tuple[tuple[Array, ...], bool]:

@@ -1,8 +1,8 @@
 """The forms in which environments and vector environments return masks of allowed actions. Pure.
 
 Rule: a mask is an array, or a list or tuple with an array for each entry of the action. The masks of several env copies are
-an array or list with a mask for each copy, or a tuple: of masks if its elements are lists or tuples, otherwise with an array
-[N, …] for each entry of the action, as a vector environment returns a Tuple.
+an array, list or tuple with a mask for each copy. As an exception, a tuple of arrays [N, …] with two or more dimensions
+has an array for each entry of the action, as a vector environment returns a Tuple.
 """
 
 from __future__ import annotations
@@ -27,8 +27,7 @@ def mask_array(value: Any) -> Array | None:
 
 def masks_of_copies(given: Any, count: int) -> Sequence[Any]:
     """Split the masks of `count` env copies into one value per copy; `given` itself for each if it isn't their masks."""
-    are_of_entries = isinstance(given, tuple) and bool(given) and all(_length(part) == count for part in given)
-    if are_of_entries and not any(isinstance(part, tuple | list) for part in given):
+    if isinstance(given, tuple) and given and all(getattr(part, "ndim", 0) > 1 and len(part) == count for part in given):
         return list(zip(*given, strict=True))
     if isinstance(given, np.ndarray | list | tuple) and _length(given) == count:
         return list(given)

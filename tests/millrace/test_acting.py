@@ -340,6 +340,26 @@ def test_masks_of_a_batch_may_have_each_form_that_environments_give_them(n: int,
     assert policy({"x": seen, "action_mask": form(masks)}).tolist() == expected
 
 
+@pytest.mark.parametrize("convert", [tuple, list, np.stack])
+@pytest.mark.parametrize("n", [2, 3, 4])
+def test_a_mask_for_each_copy_may_be_one_array_even_if_there_are_as_many_copies_as_choices(
+    n: int, convert: Any, tmp_path: Path
+) -> None:
+    policy = masked_policy(tmp_path, sizes=(3,))
+    chosen = [2, 0, 2, 1][:n]
+    masks = convert([np.eye(3, dtype=np.int8)[choice] for choice in chosen])
+    assert policy({"x": np.zeros((n, 1), np.float32)}, mask=masks).tolist() == [[choice] for choice in chosen]
+
+
+def test_a_mask_without_a_choice_is_refused_and_the_error_names_the_observation(tmp_path: Path) -> None:
+    """Vector environments of gymnasium return zeros for copies without a mask."""
+    policy = masked_policy(tmp_path)
+    masks = [[1, 1, 1, 1, 1, 1], [0, 0, 0, 0, 0, 0], [1, 1, 1, 1, 0, 0], [1, 1, 1, 0, 0, 0]]
+    expected = r"^mask: expected an allowed choice for each entry of the action, got none for observations \[1, 3\]; "
+    with pytest.raises(UsageError, match=expected + "if copies have no mask .* pass ones"):
+        policy({"x": np.zeros((4, 1), np.float32)}, mask=masks)
+
+
 @pytest.mark.parametrize("convert", [lambda masks: masks, list, tuple], ids=["as they are", "a list", "a tuple"])
 @pytest.mark.parametrize("n", [1, len(SIZES), 4])
 def test_the_masks_of_a_vector_environment_may_have_entries_of_different_sizes(n: int, convert: Any, tmp_path: Path) -> None:
