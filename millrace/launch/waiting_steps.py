@@ -5,7 +5,8 @@ worker of its own. This can't be known before the run, so the workers are watche
 
 Rule: a worker counts as computing if any of its threads or processes is running or ready to run, so a worker that lacks a
 core isn't taken for one that waits. A simulator may compute outside of its worker's session, as a server on this machine or
-in a container. Therefore, the cores must have been idle as well.
+in a container. Therefore, the cores must have been idle as well. Only the time between two looks at which workers collected
+counts, because an update on these cores, or on a GPU, says nothing about steps.
 
 Rule: more workers are only suggested. If some joined during the run, lanes would move to them, and episodes that can't be
 replayed would end, so results would depend on the time of joining.
@@ -52,7 +53,8 @@ class WaitingSteps:
         self._to_judge = 0  # looks at which workers collected, since the last judgement
         self._collecting = 0  # workers seen collecting at these looks, in total
         self._waiting = 0  # how often these workers waited
-        self._cores_before = CoreTimes()  # at the first of these looks
+        self._cores_then: CoreTimes | None = None  # at the last look, if a worker collected
+        self._cores = CoreTimes()  # total time between two successive looks at which workers collected
 
     def is_due(self, now: float) -> bool:
         """Whether to look at the workers now."""
@@ -68,18 +70,23 @@ class WaitingSteps:
         self._look_at_s = ended_s + max(LOOK_EVERY_S, (ended_s - began_s) / MOST_TIME)
         collecting = [worker for worker in workers if worker.doing in COLLECTING]
         self._looks += bool(collecting or self._looks)
+        before = self._cores_then
+        self._cores_then = cores if collecting else None
         if not collecting:
             return ""
-        if not self._to_judge:
-            self._cores_before = cores
+        if before is not None:
+            so_far = self._cores
+            self._cores = CoreTimes(so_far.idle + cores.idle - before.idle, so_far.total + cores.total - before.total)
         self._to_judge += 1
         self._collecting += len(collecting)
         self._waiting += sum(not worker.uses.computes for worker in collecting)
         if self._to_judge < LOOKS:
             return ""
         share = self._waiting / self._collecting
+        idle = idle_share(CoreTimes(), self._cores)
         self._to_judge = self._collecting = self._waiting = 0
-        if min(share, idle_share(self._cores_before, cores)) < ENOUGH:
+        self._cores = CoreTimes()
+        if min(share, idle) < ENOUGH:
             return ""
         self._looks = MOST_LOOKS
         return self._line(share, max(worker.uses.resident for worker in collecting), free_bytes)

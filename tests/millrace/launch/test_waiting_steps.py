@@ -83,6 +83,19 @@ def test_what_the_cores_did_before_does_not_count(doing: Doing) -> None:
     assert lines(waiting, seen(WAITS), times=LOOKS, machine=machine)[-1]
 
 
+@pytest.mark.parametrize(("idle_collecting", "suggested"), [(0.3, False), (0.7, True)])
+def test_what_the_cores_do_while_workers_wait_for_weights_does_not_count(idle_collecting: float, suggested: bool) -> None:
+    """An update may keep all cores busy, or none, if it runs on a GPU."""
+    waiting = WaitingSteps(2, 8, 8)
+    machine = Machine()
+    line = ""
+    for _ in range(LOOKS // 5):
+        lines(waiting, seen(WAITS, "waiting"), times=20, idle=1.0 - idle_collecting, machine=machine)
+        machine.passes(1.0 - idle_collecting)  # the workers get weights between two looks
+        *_, line = lines(waiting, seen(WAITS), times=5, idle=idle_collecting, machine=machine)
+    assert bool(line) == suggested
+
+
 @pytest.mark.parametrize("doing", ["starting", "waiting", "describing", "making", "preparing", "evaluating", "closing"])
 def test_only_workers_that_collect_count(doing: Doing) -> None:
     """A worker that waits for a ticket says nothing about its steps."""
