@@ -95,18 +95,18 @@ class SendRecv:
         self.check_back(by_lane)
         self._check_whole(by_lane)
         resets = {lane: self._asked_reset(lane, chosen, seeds, options) for lane, chosen in by_lane.items()}
-        whole = [lane for lane, chosen in by_lane.items() if len(chosen) == layout.size(lane)]
+        whole = {lane for lane, chosen in by_lane.items() if len(chosen) == layout.size(lane)}
         for n in copies:
             parts.seeds[n] = seeds[n] if seeds[n] is not None else parts.seeds[n]
         if len(whole) == len(layout.lanes):
             hub.listen()  # a loss that is noticed now needs no report, because the copies are reset
         parts.lost_lanes.add(hub.coordinator.take_lost())
-        parts.lost_lanes.forget(whole)
         now = self._watched.look(hub.now())
         try:
             for lane, reset in resets.items():
                 self._sent.send([lane], Sent(reset, now))
                 hub.send_order(lane, reset.order())
+                parts.lost_lanes.forget({lane} & whole)  # only now, because an interrupt may come before the order
         except BaseException:  # such as Ctrl-C
             self.abandon(list(resets))
             raise
@@ -223,7 +223,7 @@ class SendRecv:
             self._to_raise.pop(lane, None)
         self._parts.hub.forget(sent.give_up(lanes))
         lost_lanes = self._parts.lost_lanes
-        lost_lanes.add(dict.fromkeys(hidden, UNKNOWN_REASON))
+        lost_lanes.add({lane: UNKNOWN_REASON for lane in hidden if lane not in lost_lanes.unreported})
         lost_lanes.add(self._parts.hub.coordinator.take_lost())
         lost_lanes.report([lane for lane in steps if lane in lost_lanes.unreported])
 

@@ -24,6 +24,7 @@ from millrace.learner.vector_env import env as env_module
 from millrace.learner.vector_env.batch_layout import BatchLayout
 from millrace.learner.vector_env.env import ZmqVectorEnv
 from millrace.learner.vector_env.lane_orders import packed, step_order
+from millrace.learner.vector_env.order_coordinator import MakeOrder
 from millrace.learner.vector_env.sent_lanes import LONGEST_GAP_S, Asked, AskedReset, Sent, SentLanes, WatchedTime
 from millrace.learner.vector_env.settings import VectorEnvSettings
 from millrace.protocol.errors import EnvironmentFailed, NoWorkers, UsageError, WorkerLost
@@ -757,6 +758,32 @@ def test_a_loss_that_a_step_has_reported_is_not_reported_again_if_the_reset_afte
     with interrupted_reset_of_lost_copies("reported") as env:
         observation, _, _, truncated, _ = env.step(zeros([0, 1]))
         assert (observation.tolist(), truncated.tolist()) == ([[1.0], [1.0]], [False, False])
+
+
+@pytest.mark.parametrize("mode", [NEXT, SAME, DISABLED])
+@pytest.mark.parametrize("sent", [0, 1])
+def test_a_loss_is_reported_if_its_reset_was_interrupted_before_the_lane_got_it(
+    mode: str, sent: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with made(copies=2, lanes=2, workers=2, autoreset_mode=mode) as (env, link):
+        env.reset(seed=1), env.step(zeros([0, 1]))
+        for lost, new in (("w0", "w2"), ("w1", "w3")):
+            link.leave(lost)
+            link.join(new)
+        env.hub.wait_for(2, 1.0)
+        send_order = env.hub.send_order
+
+        def interrupted_at(lane: int, make: MakeOrder) -> None:
+            if lane == sent:
+                raise InterruptedError("stop")
+            send_order(lane, make)
+
+        with monkeypatch.context() as patched, pytest.raises(InterruptedError):
+            patched.setattr(env.hub, "send_order", interrupted_at)
+            env.reset(seed=2)
+        _, reward, _, truncated, _ = env.step(zeros([0, 1]))
+        assert truncated.tolist() == [sent == 0, True], "the lanes without a reset"
+        assert reward.tolist() == [float(sent > 0), 0.0]
 
 
 @pytest.mark.parametrize("mode", [NEXT, SAME, DISABLED])
