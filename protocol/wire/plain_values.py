@@ -5,8 +5,8 @@ bools, numbers, text, bytes, dates or durations, or a numpy array of plain objec
 UTF-8 cannot encode, integers with more decimal digits than Python converts, and dicts whose keys could make them slow
 (`_KeyLimit`) are not plain. A value that isn't plain raises `TypeError`; if the caller asks for it, the value is instead
 sent as its `repr` and arrives as a `ReprString`, which cannot be confused with a string. For such a caller, subclasses of
-dict, list and tuple are plain too: they arrive as dicts, lists and tuples. Other numbers, and objects that numpy reads as
-numbers, such as tensors, arrive as numpy scalars or arrays.
+dict, list and tuple are plain too: they arrive as dicts, lists and tuples. Other numbers, other sequences, buffers, and
+objects with numpy's protocol, such as tensors, arrive as numpy scalars or arrays if numpy reads numbers from them.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import msgpack
@@ -25,6 +25,7 @@ from millrace.protocol.errors import BadMessage, safe_repr
 
 DTYPE_KINDS = "biufcSUmM"
 NUMBER_KINDS = "biuf"
+NUMPY_PROTOCOL = ("__array__", "__array_interface__", "__array_struct__")
 MAX_DEPTH = 32
 MAX_REPR = 1000  # characters
 
@@ -154,17 +155,18 @@ def _key(key: Any, where: str, use_repr: bool, limit: _KeyLimit, depth: int) -> 
 
 
 def _numbers(value: Any) -> Any:
-    """The scalar or array that numpy reads from a number of another type, or from an object with numpy's protocol.
+    """The scalar or array that numpy reads from a number or sequence of another type, from a buffer, or from an object with
+    numpy's protocol.
 
-    None if the value is neither, or if numpy doesn't read numbers from it.
+    None for other objects, because their items may never end, or if numpy doesn't read numbers from the value.
     """
     try:
-        if isinstance(value, int | float) or hasattr(value, "__array__"):
-            array = np.asarray(value)
-            return array[()] if array.dtype.kind in NUMBER_KINDS else None
+        if not isinstance(value, int | float | Sequence) and not any(hasattr(value, name) for name in NUMPY_PROTOCOL):
+            memoryview(value)  # raises TypeError if the value isn't a buffer
+        array = np.asarray(value)
+        return array[()] if array.dtype.kind in NUMBER_KINDS else None
     except Exception:  # user-defined objects may raise anything
-        pass
-    return None
+        return None
 
 
 def _repr(value: Any) -> msgpack.ExtType:

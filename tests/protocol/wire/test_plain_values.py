@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import ctypes
 import itertools
-from collections import OrderedDict, defaultdict
+from array import array as buffer
+from collections import OrderedDict, defaultdict, deque
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from enum import IntEnum
@@ -198,6 +200,31 @@ class Many(list[Any]):
     """A list of a type of its own."""
 
 
+class Interface:
+    """An object with numpy's older protocol."""
+
+    _array = np.array([1, 0], np.int8)
+    __array_interface__ = _array.__array_interface__
+
+
+class Endless:
+    """An object with a length whose items never end. It counts the items that were read."""
+
+    items = 0
+
+    def __len__(self) -> int:
+        return 2
+
+    def __getitem__(self, index: int) -> int:
+        self.items += 1
+        if self.items == 100:
+            raise RuntimeError("numpy would never stop reading it")
+        return index
+
+    def __repr__(self) -> str:
+        return "<endless>"
+
+
 class Tensor:
     """An object of another package that numpy can read."""
 
@@ -221,9 +248,28 @@ class Tensor:
         (np.ma.masked_array([1, 0], [True, False], np.int8), np.array([1, 0], np.int8)),
         (Tensor(np.float32(0.5)), np.float32(0.5)),
         (Tensor(np.eye(2, dtype=bool)), np.eye(2, dtype=bool)),
+        (buffer("i", [1, 0]), np.array([1, 0], np.int32)),
+        (memoryview(bytearray([1, 0])), np.array([1, 0], np.uint8)),
+        ((ctypes.c_int8 * 2)(1, 0), np.array([1, 0], np.int8)),
+        (Interface(), np.array([1, 0], np.int8)),
+        (deque([1, 0]), np.array([1, 0])),
+        (range(2), np.array([0, 1])),
         (Pair(Level.LOW, Many([1, Tensor(np.zeros(2))])), (np.int64(3), [1, np.zeros(2)])),
     ],
-    ids=["int", "float", "masked array", "scalar tensor", "tensor", "sequences"],
+    ids=[
+        "int",
+        "float",
+        "masked array",
+        "scalar tensor",
+        "tensor",
+        "array.array",
+        "memoryview",
+        "ctypes",
+        "interface",
+        "deque",
+        "range",
+        "sequences",
+    ],
 )
 def test_what_numpy_reads_as_numbers_arrives_as_numbers_if_asked_so(value: Any, arrives: Any) -> None:
     assert bit_equal(unpack(pack({"a": value}, use_repr=True)), {"a": arrives})
@@ -234,6 +280,20 @@ def test_what_numpy_reads_as_numbers_arrives_as_numbers_if_asked_so(value: Any, 
 @pytest.mark.parametrize("array", [RuntimeError("requires grad"), np.array([None]), np.array(["a"])])
 def test_other_objects_that_numpy_reads_are_shown_if_asked_so(array: Any) -> None:
     assert unpack(pack({"a": Tensor(array)}, use_repr=True)) == {"a": "<tensor>"}
+
+
+@pytest.mark.parametrize(
+    ("value", "shown"),
+    [(deque(["a", "b"]), "deque(['a', 'b'])"), (deque([[1], [1, 2]]), "deque([[1], [1, 2]])")],
+)
+def test_other_sequences_are_shown_if_asked_so(value: Any, shown: str) -> None:
+    assert unpack(pack({"a": value}, use_repr=True)) == {"a": shown}
+
+
+def test_an_object_that_may_have_endless_items_is_not_read() -> None:
+    value = Endless()
+    assert unpack(pack({"a": value}, use_repr=True)) == {"a": "<endless>"}
+    assert not value.items
 
 
 def test_keys_that_numpy_reads_as_numbers_are_shown_because_an_array_cannot_be_a_key() -> None:
