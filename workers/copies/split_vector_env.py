@@ -235,6 +235,7 @@ class SplitVectorEnv:
         """Start episodes in these copies, with a seed for each.
 
         If a worker is lost meanwhile, the new copies are reset again, after they have got the attributes of the lost ones.
+        Raises `WorkerLost` if every attempt loses a worker.
         """
         mask = np.zeros(self.env.num_envs, bool)
         mask[copies] = True
@@ -247,6 +248,12 @@ class SplitVectorEnv:
             observation, _ = self._wait(lambda: self.env.reset(seed=all_seeds, options=options), pulse)
             if not self._lacking(chosen):
                 break
+        else:
+            names = ", ".join(sorted({name for _, name in self._lacking(chosen)}))
+            raise WorkerLost(
+                f"copies {copies.start} to {copies.stop - 1}: each of {RESETS} resets lost a worker, so new copies lack the "
+                f"attribute {names}"
+            )
         leaves: Leaves = self._read(observation)
         if self._masks is not None:
             leaves = [*leaves, self._read_masks(self._masks, observation, ~mask, np.zeros_like(mask))]

@@ -16,7 +16,7 @@ from millrace.extras.datasets.episodes import EpisodeAssembler
 from millrace.learner.vector_env.settings import VectorEnvSettings
 from millrace.protocol.arrays import Array
 from millrace.protocol.envs.env_actions import action_converter_of
-from millrace.protocol.errors import NoWorkers
+from millrace.protocol.errors import NoWorkers, WorkerLost
 from millrace.protocol.policy.layout import acting_size, buffer_size
 from millrace.protocol.policy.torch_policy import TorchPolicy
 from millrace.protocol.specs import RunSpec
@@ -321,3 +321,26 @@ def test_copies_that_replace_lost_ones_in_a_reset_get_the_attributes_before_it(l
         split.end([1, 2], no_pulse)
         assert split.result(slice(0, 2 * LANES)).reward.tolist() == [1.0] * 2 * LANES
         assert env.get_attr("level") == (6,) * 2 * LANES
+
+
+def test_no_episode_begins_in_copies_without_their_attributes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each of the three resets loses a worker, after the attributes were set."""
+    name = f"{__name__}:LeveledLane-v0"
+    with any_order(VectorEnvSettings(name, 2, lanes=1), 4, shared=False) as (env, link):
+        lane = SplitVectorEnv(env, 1, some=env).open_lane(run_of(name, N=2), 0, no_pulse)
+        lane.assign("level", pack(5), no_pulse)
+        reset = env.reset
+
+        def loses_a_worker(**given: Any) -> Any:
+            results = reset(**given)
+            owner = env.hub.coordinator.owner(0)
+            assert owner is not None
+            link.leave(owner.hello.worker)
+            env.hub.listen()
+            return results
+
+        with monkeypatch.context() as patched, pytest.raises(WorkerLost) as caught:
+            patched.setattr(env, "reset", loses_a_worker)
+            lane.reset([0, 1], no_pulse)
+        assert str(caught.value) == "copies 0 to 1: each of 3 resets lost a worker, so new copies lack the attribute level"
+        assert [leaf.tolist() for leaf in lane.reset([0, 1], no_pulse)] == [[[5.0]] * 2]
