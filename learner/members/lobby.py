@@ -94,6 +94,7 @@ class Lobby:
         stall_timeout_s = self._settings.stall_timeout_s
         members = coordinator.members
         began_s = self._clock()
+        has_joined = False  # whether any worker has
         wait = LongWait(began_s)
         server.send(coordinator.ask(unknown))
         while coordinator.described is None:
@@ -101,6 +102,9 @@ class Lobby:
             check_interrupt()
             self._check()
             now = self._clock()
+            has_joined = has_joined or bool(members)
+            if not has_joined:
+                began_s = now  # the first worker that joins will describe the environment
             # Time in the environment's code doesn't count, because those calls have their own timeouts, with better errors.
             busy_s = max((member.in_env_code_s for member in members.values()), default=began_s)
             if now - max(began_s, busy_s) > stall_timeout_s and members:

@@ -172,6 +172,15 @@ def test_when_no_description_comes_for_long_another_one_is_asked_as_well() -> No
     assert made.described.observation_space == spaces.Discrete(3)
 
 
+def test_a_long_time_without_workers_has_no_more_of_them_asked() -> None:
+    made = coordinator()
+    for _ in range(3):
+        assert made.ask_more() == []
+    for name in (A, B):
+        join(made, name)
+    assert [bool(made.members[name].tickets) for name in (A, B)] == [True, False]
+
+
 def test_an_order_that_a_heartbeat_shows_to_be_lost_is_sent_again() -> None:
     made = coordinator()
     session = join(made, A)
@@ -489,6 +498,26 @@ def test_of_two_descriptions_the_one_that_took_longer_counts() -> None:
                     link.inbox.append((A, Described(member.session, max(member.tickets), DESCRIPTION)))
 
         lobby.describe(Unknown(ENV), describe_in_time)
+    assert lobby.described_in_s == pytest.approx(3.0, abs=0.2)
+
+
+def test_the_time_before_the_first_worker_joined_is_no_time_of_a_description() -> None:
+    """Nor does a run stall that waited longer for workers than for what they describe."""
+    link = FakeLink()
+    settings = replace(SETTINGS, stall_timeout_s=20)
+    lobby = Lobby(cast(LearnerLink, link), FakeProcesses(expected=1), settings, lambda: link.now)
+    joins_s = link.now + 50.0
+    joined: list[bool] = []
+
+    def join_and_describe() -> None:
+        if not joined and link.now >= joins_s:
+            link.inbox.append((A, hello(A)))
+            joined.append(True)
+        for member in lobby._coordinator.members.values():
+            if member.tickets and link.now >= joins_s + 3.0:
+                link.inbox.append((A, Described(member.session, max(member.tickets), DESCRIPTION)))
+
+    lobby.describe(Unknown(ENV), join_and_describe)
     assert lobby.described_in_s == pytest.approx(3.0, abs=0.2)
 
 
