@@ -1,7 +1,7 @@
 """`millrace:TupleOfAgents`, a wrapper for multi-agent gymnasium environments whose spaces are Tuples.
 
 Rule: element i of the observations, actions and rewards belongs to agent i. An episode ends for all agents at once, when
-each of them is terminated or truncated.
+each of them has been terminated or truncated, because some environments set an agent's flag only in the agent's last step.
 """
 
 from __future__ import annotations
@@ -69,6 +69,7 @@ class TupleOfAgents:
         self.render_mode = env.render_mode
         self.possible_agents = [f"agent_{number}" for number in range(count)]
         self.agents: list[str] = []
+        self._ended = self._not_ended()
         self._observation_spaces = dict(zip(self.possible_agents, _elements(observation), strict=True))
         self._action_spaces = dict(zip(self.possible_agents, _elements(action), strict=True))
 
@@ -89,6 +90,7 @@ class TupleOfAgents:
         """Begin an episode with all agents. Returns observations and infos, by agent."""
         observations, info = reset_answer(self.env.reset(seed=seed, options=options))
         self.agents = list(self.possible_agents)
+        self._ended = self._not_ended()
         return self._by_agent("observation", observations), dict.fromkeys(self.possible_agents, info)
 
     def step(self, actions: dict[str, Any]) -> tuple[dict[str, Any], ...]:
@@ -98,17 +100,22 @@ class TupleOfAgents:
             observations, rewards, terminated, truncated, info = answer
         except (TypeError, ValueError) as error:
             raise wrong_step(answer) from error
-        terminates, truncates = self._flags(terminated), self._flags(truncated)
-        over = bool((terminates | truncates).all())
+        self._ended |= np.stack([self._flags(terminated), self._flags(truncated)])
+        over = bool(self._ended.any(axis=0).all())
+        terminates, truncates = (self._ended & over).tolist()
         if over:
             self.agents = []
         return (
             self._by_agent("observation", observations),
             self._by_agent("reward", rewards),
-            dict(zip(self.possible_agents, (terminates & over).tolist(), strict=True)),
-            dict(zip(self.possible_agents, (truncates & over).tolist(), strict=True)),
+            dict(zip(self.possible_agents, terminates, strict=True)),
+            dict(zip(self.possible_agents, truncates, strict=True)),
             dict.fromkeys(self.possible_agents, info),
         )
+
+    def _not_ended(self) -> Bools:
+        """[2, agents]: no agent has been terminated or truncated in this episode."""
+        return np.zeros((2, len(self.possible_agents)), bool)
 
     def _flags(self, given: Any) -> Bools:
         """The flag of each agent, given one flag for each agent or a single flag for all."""

@@ -110,6 +110,28 @@ def test_an_episode_ends_once_each_agent_is_terminated_or_truncated(terminated: 
     assert env.agents == ([] if expected else env.possible_agents)
 
 
+class Leaving(Lamps):
+    """Sets each agent's flag only in the agent's last step: agent 0 is terminated in step 1, agent 1 truncated in step 2."""
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        self._steps = 0
+        return super().reset(seed=seed)
+
+    def step(self, action: Any) -> Any:
+        self._steps += 1
+        return *super().step(action)[:2], [self._steps == 1, False], [False, self._steps == 2], {}
+
+
+def test_an_agent_whose_flag_was_set_only_once_stays_ended_until_the_reset() -> None:
+    env = millrace.TupleOfAgents(Leaving())
+    action = dict(zip(env.possible_agents, Lamps().action_space.sample(), strict=True))
+    for _ in range(2):  # the second episode, too, ends in its step 2, not before
+        env.reset(seed=1)
+        flags = [[list(by_agent.values()) for by_agent in env.step(action)[2:4]] for _ in range(2)]
+        assert flags == [[[False, False], [False, False]], [[True, False], [False, True]]]
+        assert env.agents == []
+
+
 def test_each_agent_gets_the_info_of_a_reset_and_of_a_step() -> None:
     plain = Ending(False, False)
     env = millrace.TupleOfAgents(plain)
