@@ -34,7 +34,11 @@ def last_line(program: str, error: BaseException, hints: Sequence[str] = (), *, 
         case KeyboardInterrupt():
             why = "interrupted"
             if (run := getattr(error, "run", None)) is not None:  # an `Interrupted`, whose class isn't imported here
-                more = [f"continue with: {resume_command(run, elsewhere=elsewhere)}"]
+                if getattr(error, "complete", False):
+                    why += " after training"
+                    more = [f"the run is complete: {run}"]
+                else:
+                    more = [f"continue with: {resume_command(run, elsewhere=elsewhere)}"]
         case UserFacingError():
             why = str(error)
         case _:

@@ -74,11 +74,15 @@ log = logging.getLogger("millrace.learner")
 
 
 class Interrupted(KeyboardInterrupt):
-    """The user stopped the run. Its checkpoint has been written, and it can be resumed from its folder."""
+    """The user stopped the run. Its checkpoint has been written, and it can be resumed from its folder.
 
-    def __init__(self, run: Path) -> None:
+    `complete`: training had ended by then, so nothing is left to resume.
+    """
+
+    def __init__(self, run: Path, *, complete: bool = False) -> None:
         super().__init__(str(run))
         self.run = run
+        self.complete = complete
 
 
 class ArrayPosition(msgspec.Struct, frozen=True):

@@ -127,7 +127,7 @@ def _train(
             setup.announce(pool.bound)
             train_to_the_end(run, 1 if acts else workers)
         if interrupts.received:  # after training, as in `on_end`: the run is complete, but the caller's program must end
-            raise Interrupted(folder.shown)
+            raise Interrupted(folder.shown, complete=True)
         return folder.shown
 
 

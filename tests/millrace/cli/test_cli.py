@@ -415,6 +415,15 @@ def test_an_interrupted_run_says_how_to_go_on(capsys: Captured, monkeypatch: pyt
     assert refusal(capsys, "train", "CartPole-v1", exit_code=130) == "interrupted"
 
 
+@pytest.mark.parametrize("command", ["train", "learner"])
+def test_a_signal_after_training_says_that_the_run_is_complete(
+    command: str, capsys: Captured, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    failing(monkeypatch, Interrupted(Path("runs/mine"), complete=True))
+    line = refusal(capsys, command, "CartPole-v1", exit_code=130)
+    assert line == "interrupted after training; the run is complete: runs/mine"
+
+
 # --------------------------------------------------------------------------------------------------------------- keys
 
 

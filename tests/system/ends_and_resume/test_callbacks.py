@@ -222,6 +222,7 @@ def test_an_interrupt_while_a_callback_runs(tmp_path: Path, whole: Path) -> None
     told = Acts("on_update", lambda progress: signal.raise_signal(signal.SIGINT), updates=4)
     with pytest.raises(Interrupted) as caught:
         run(tmp_path, told, eval_every=130)
+    assert not caught.value.complete
     folder = caught.value.run
     assert saved(folder) == max(n for moment, n in told.told if moment == "on_update") == 4
     again = Acts()
@@ -240,6 +241,7 @@ def test_an_interrupt_after_training_ends_the_program_and_the_run_is_complete(
     """A loop that trains one run after another must not begin the next run."""
     with pytest.raises(Interrupted) as caught:
         run(tmp_path, Acts(moment, lambda progress: signal.raise_signal(number), updates=UPDATES))
+    assert caught.value.complete
     folder = caught.value.run
     told = summary(folder)
     assert (told["stop_reason"], told["cut_short"], told["updates"]) == ("all steps done", False, UPDATES)
