@@ -9,7 +9,7 @@ import logging
 import math
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import replace
 from typing import Literal
@@ -147,8 +147,11 @@ def make_vec(
     return start_vector_env(settings, Crew())
 
 
-def start_vector_env(settings: VectorEnvSettings, crew: Crew) -> ZmqVectorEnv:
+def start_vector_env(settings: VectorEnvSettings, crew: Crew, check: Callable[[], None] = lambda: None) -> ZmqVectorEnv:
     """Start a vector environment and wait for its workers, which get the log files and cores of `crew`.
+
+    `check` is called now and then while this function, or later the vector environment, waits for workers. An exception that
+    it raises ends the wait.
 
     Raises `UsageError`, `NoWorkers` and `EnvironmentFailed`.
     """
@@ -159,6 +162,10 @@ def start_vector_env(settings: VectorEnvSettings, crew: Crew) -> ZmqVectorEnv:
             deaths.collected(lane)  # the worker has taken steps, and here each step counts as a result
         if line := deaths.count(event, time.monotonic()):
             logging.getLogger("millrace.learner").warning("%s", line)
+
+    def check_waiting() -> None:
+        deaths.check()
+        check()
 
     local_workers = settings.local_workers
     join_timeout_s = JOIN_TIMEOUT_S if local_workers else settings.timeout_s
@@ -173,9 +180,9 @@ def start_vector_env(settings: VectorEnvSettings, crew: Crew) -> ZmqVectorEnv:
     try:
         pool = open_vector_env_pool(settings, resources)
         lobby = resources.enter_context(pool.start(crew, before))
-        made = pool.vector_env(lobby.describe(pool.requested.to_describe))
+        made = pool.vector_env(lobby.describe(pool.requested.to_describe, check))
         made.hub.on_death = died
-        made.hub.while_waiting = deaths.check
+        made.hub.while_waiting = check_waiting
         made.hub.wait_for(local_workers or settings.lane_count, join_timeout_s)
         spaces = made.single_observation_space, made.single_action_space
         found = observation_spaces(settings.observation_mode, spaces, made.calls.make(), max(1, len(made.seats)))

@@ -24,7 +24,9 @@ from millrace.launch.crew import Crew
 from millrace.launch.vector import call_timeouts_of, start_vector_env
 from millrace.learner.vector_env.env import ZmqVectorEnv
 from millrace.learner.vector_env.settings import VectorEnvSettings
-from millrace.planning.measurements import WORKER_BYTES, ActionKind, Machine, Measurements, StepCosts
+from millrace.planning.in_words import counted
+from millrace.planning.measurements import ActionKind, Machine, Measurements, StepCosts
+from millrace.planning.probe_sizes import Needed, SessionSize, most_each, numbers_of_workers
 from millrace.planning.random_actions import SEED, RandomActions, SeenMasks
 from millrace.planning.stopwatch import CopyTimes, read_notes
 from millrace.protocol.arrays import Array
@@ -40,14 +42,11 @@ WARM_UP = 2  # this many steps at the beginning of a copy aren't counted
 OF_ALONE = 0.15  # share of the time in which one copy steps alone
 OF_SIDE_BY_SIDE = 0.9  # share of the time after which no more copies are started
 EACH_S = 2.0  # how long each number of workers is measured
-MOST_PER_CORE = 8  # largest number of workers to try per core
-MOST_AT_LEAST = 16  # number of workers to try even if `MOST_PER_CORE` allows fewer
+GRACE_S = 1.0  # how long after the end of its time a session waits for the last steps
 SHORT_S = 1e-3  # shorter steps are measured in workers with several copies, because a run steps them in this way
-COPIES_OF_SHORT = 8  # number of copies in a worker if steps are short
 OF_ITS_OWN = "if a copy needs a port, a folder or a licence of its own, see docs/how-to/simulators.md"
-GROWTH = 4  # each number of workers to try is this many times the one before
+MORE_TIME = "allow more with --seconds"
 WORTH_WHILE = 1.1  # if more workers don't increase the env steps/s by this factor, even larger numbers aren't tried
-OF_MEMORY = 0.7  # the probe uses at most this share of the free memory
 
 
 class ProbedEnv(NamedTuple):
@@ -81,59 +80,55 @@ def probe(env: ProbedEnv, machine: Machine, seconds: float) -> Probed:
 
     Raises `UserFacingError` if no step was completed.
     """
-    began_s = time.monotonic()
-    give_up_at_s = began_s + seconds
-    first = _session(env, 1, OF_ALONE * seconds, give_up_at_s)
+    give_up_at_s = time.monotonic() + seconds
+    first = _session(env, SessionSize(), OF_ALONE * seconds, give_up_at_s)
     if not first.times or not len(first.times[0].steps):
-        why = first.wrong or "a step takes longer"
+        why = first.wrong or "the start of a copy, a reset or a step takes longer"
         raise RunError(f"plan: {env.name}: no step could be made within {seconds:g} s: {why}")
     sessions = [first]
     measured = _measured_alone(env, first)
-    each = 1
-    most_each = min(COPIES_OF_SHORT, machine.most_copies // machine.cores) if machine.most_copies else COPIES_OF_SHORT
+    worked = first
+    too_slow = ""
 
-    def has_time() -> bool:
-        """Whether another session can start and step; otherwise its timeout would count as a failure of its copies."""
-        return time.monotonic() - began_s + 1.5 * sessions[-1].start_s <= OF_SIDE_BY_SIDE * seconds
+    def left_s() -> float:
+        """The time that is left for sessions with several copies."""
+        return give_up_at_s - (1 - OF_SIDE_BY_SIDE) * seconds - time.monotonic()
 
-    if measured.alone.own_s < SHORT_S and not first.wrong and most_each > 1 and has_time():
-        several = _session(env, 1, OF_ALONE * seconds, give_up_at_s, each=most_each)
-        sessions.append(several)
-        if several.is_whole:
-            each = most_each
-            measured = msgspec.structs.replace(measured, side_by_side=(_costs(1, several.times),))
-    for workers in _ladder(measured, machine, each):
-        if not has_time():
+    if measured.alone.own_s < SHORT_S and first.is_whole:
+        each = min(most_each(machine), first.needed.most_each(left_s()))
+        if each > 1:
+            several = _session(env, SessionSize(each=each), OF_ALONE * seconds, give_up_at_s)
+            sessions.append(several)
+            if several.is_whole:
+                worked = several
+                measured = msgspec.structs.replace(measured, side_by_side=(_costs(1, several.times),))
+    for workers in numbers_of_workers(measured, machine, worked.size.each):
+        size = SessionSize(workers, worked.size.each)
+        if not worked.needed.fits(size, machine.cores, left_s()):
+            too_slow = _not_tried(worked.size, measured)
             break
-        session = _session(env, workers, EACH_S, give_up_at_s, each=each)
+        session = _session(env, size, EACH_S, give_up_at_s)
         sessions.append(session)
         if not session.is_whole:
             break
+        worked = session
         costs = _costs(workers, session.times)
         if costs.steps_per_s < WORTH_WHILE * measured.side_by_side[-1].steps_per_s:
             break
         measured = msgspec.structs.replace(measured, side_by_side=(*measured.side_by_side, costs))
-    if len(sessions) == 1 and not first.wrong:  # a second copy must show whether the environment is deterministic
-        sessions.append(_session(env, 1, OF_ALONE * seconds, give_up_at_s))
-    return Probed(_with_all(measured, sessions), first.observation_space, first.action_space, first.seats)
+    if len(sessions) == 1 and not first.wrong and first.needed.seconds < give_up_at_s - time.monotonic():
+        # A second copy must show whether the environment is deterministic.
+        sessions.append(_session(env, SessionSize(), OF_ALONE * seconds, give_up_at_s))
+    findings = [each for each in (*(session.finding for session in sessions), too_slow) if each]
+    return Probed(_with_all(measured, sessions, findings), first.observation_space, first.action_space, first.seats)
 
 
-def _ladder(measured: Measurements, machine: Machine, each: int) -> Iterator[int]:
-    """The numbers of workers to try, ascending. `each`: the number of copies of each worker."""
-    alone = measured.alone
-    limit = max(MOST_AT_LEAST, MOST_PER_CORE * machine.cores)
-    if machine.free_bytes is not None:
-        limit = min(limit, int(OF_MEMORY * machine.free_bytes / max(measured.worker_bytes, WORKER_BYTES)))
-    if machine.most_copies:
-        limit = min(limit, machine.most_copies // each)
-    # Try more copies than cores only if steps spend time waiting rather than computing.
-    limit = min(limit, machine.cores if alone.computes else math.ceil(machine.cores / max(alone.cpu_share, 1e-3)))
-    workers = max(2, machine.cores)
-    while workers < limit:
-        yield workers
-        workers *= GROWTH
-    if limit > 1:
-        yield limit
+def _not_tried(worked: SessionSize, measured: Measurements) -> str:
+    """A line that says why no more workers were tried, if that limits the plan: a plan for steps that wait has no more."""
+    if measured.alone.computes:
+        return ""
+    tried = counted(worked.workers, "worker")
+    return f"more than {tried} were not tried, because their start, reset and first steps may take too long; {MORE_TIME}"
 
 
 # ------------------------------------------------------------------------------------------------------------ one session
@@ -142,12 +137,17 @@ def _ladder(measured: Measurements, machine: Machine, each: int) -> Iterator[int
 class _SteppedCopies(NamedTuple):
     """The record of a session in which some copies were stepped side by side."""
 
+    size: SessionSize
     times: list[CopyTimes]
     traces: list[list[int]]
     """for each copy and step, a checksum of the observation, reward and flags that it returned"""
     start_s: float
+    needed_s: float
+    """time until each copy had taken `LEAST_STEPS` steps"""
     wrong: str
     """what went wrong, as one line; empty if nothing did"""
+    too_slow: bool
+    """whether the time was up before all copies had answered"""
     masks: SeenMasks
     observation_space: gymnasium.Space[Any]
     action_space: gymnasium.Space[Any]
@@ -155,77 +155,101 @@ class _SteppedCopies(NamedTuple):
     time_limit: int | None
 
     @property
+    def needed(self) -> Needed:
+        """The session's size, and the time that it needed."""
+        return Needed(self.size, self.needed_s)
+
+    @property
     def is_whole(self) -> bool:
-        """Whether all copies took steps and nothing went wrong."""
+        """Whether all copies took steps, in time, and nothing went wrong."""
         stepped = sum(len(each.steps) > WARM_UP for each in self.times)
-        return stepped == len(self.traces) and not self.wrong
+        return stepped == len(self.traces) and not self.wrong and not self.too_slow
 
     @property
     def finding(self) -> str:
         """What went wrong, and with how many copies, as one line; empty if nothing did."""
-        copies = len(self.traces)
-        if not self.wrong:
+        if not self.wrong and not self.too_slow:
             return ""
-        if copies == 1:
-            return f"one copy, after {max(map(len, self.traces))} calls: {self.wrong}"
-        return f"{copies} copies side by side: {self.wrong}; {OF_ITS_OWN}"
+        if self.size.copies == 1:
+            calls = max(map(len, self.traces))
+            why = self.wrong or f"the time was up before the next one returned; unless it hangs, {MORE_TIME}"
+            return f"one copy, after {calls} calls: {why}"
+        copies = f"{self.size.copies} copies {'in one worker' if self.size.workers == 1 else 'side by side'}"
+        if self.too_slow:
+            return f"{copies} were not measured, because the time was up before all had answered; {MORE_TIME}"
+        return f"{copies}: {self.wrong}; {OF_ITS_OWN}"
 
 
-def _session(env: ProbedEnv, workers: int, seconds: float, give_up_at_s: float, each: int = 1) -> _SteppedCopies:
-    """Step copies for this many seconds. `each`: the number of copies of each worker.
+class _TimeIsUp(Exception):
+    """The probe's time is up, and copies have not answered."""
+
+
+def _session(env: ProbedEnv, size: SessionSize, seconds: float, give_up_at_s: float) -> _SteppedCopies:
+    """Step copies for this many seconds.
 
     Raises `UserFacingError` if there is only one copy and it can't be made.
     """
-    copies = workers * each
+
+    def check_time() -> None:
+        if time.monotonic() > give_up_at_s + GRACE_S:
+            raise _TimeIsUp
+
     with TemporaryDirectory(prefix="millrace-plan-") as folder:
         notes = Path(folder, "notes")
         notes.mkdir()
         began_s = time.monotonic()
-        traces: list[list[int]] = [[] for _ in range(copies)]
+        traces: list[list[int]] = [[] for _ in range(size.copies)]
         wrong = ""
+        too_slow = False
         known: tuple[Any, ...] = (None, None, (), None)
         masks = SeenMasks(False, "")
-        start_s = 0.0
+        start_s = needed_s = 0.0
         try:
-            timeout_s = max(1.0, give_up_at_s - began_s)
             settings = VectorEnvSettings(
                 env.in_wrapper(f"millrace.planning.stopwatch:stopwatch(folder={str(notes)!r})"),
-                copies,
-                workers=workers,
-                lanes=workers,
+                size.copies,
+                workers=size.workers,
+                lanes=size.workers,
                 on_worker_loss="raise",
                 max_env_failures=0,
-                timeout_s=timeout_s,
-                call_timeouts=call_timeouts_of(timeout_s),
+                timeout_s=math.inf,  # only `check_time` limits a call, because a slow worker isn't lost
+                call_timeouts=call_timeouts_of(math.inf),
             )
-            with start_vector_env(settings, Crew(logs=Path(folder, "logs"))) as envs:
+            with start_vector_env(settings, Crew(logs=Path(folder, "logs")), check_time) as envs:
                 start_s = time.monotonic() - began_s
                 limit = None if envs.spec is None else envs.spec.max_episode_steps
                 known = (envs.single_observation_space, envs.single_action_space, envs.seats, limit)
                 random_actions = RandomActions(*known[:2], max(1, len(envs.seats)))
                 try:
-                    _step(envs, random_actions, traces, time.monotonic() + seconds, give_up_at_s)
+                    needed_s = _step(envs, random_actions, traces, time.monotonic() + seconds, give_up_at_s) - began_s
                 finally:
                     masks = random_actions.masks
         except UsageError:
             raise
+        except _TimeIsUp:
+            too_slow = True
         except MillraceError as error:
-            if copies == 1 and not any(notes.iterdir()):
+            if size.copies == 1 and not any(notes.iterdir()):
                 raise
             wrong = one_line(first_line(error, type(error).__name__))
         times = [each for each in read_notes(notes) if len(each.resets)]
-        return _SteppedCopies(times, traces, start_s, wrong, masks, *known)
+        needed_s = needed_s or time.monotonic() - began_s
+        return _SteppedCopies(size, times, traces, start_s, needed_s, wrong, too_slow, masks, *known)
 
 
 def _step(
     envs: ZmqVectorEnv, random_actions: RandomActions, traces: list[list[int]], end_at_s: float, give_up_at_s: float
-) -> None:
-    """Step all copies until `end_at_s`; a copy's next step begins as soon as its previous one has ended."""
+) -> float:
+    """Step all copies until `end_at_s`; a copy's next step begins as soon as its previous one has ended.
+
+    Returns the time at which each copy had taken `LEAST_STEPS` steps.
+    """
     agents = max(1, len(envs.seats))
     space = envs.single_action_space
+    stepped_at_s = 0.0
     envs.reset_async(seed=[SEED] * len(traces))
     while envs.outstanding:
-        observation, reward, terminated, truncated, infos = envs.recv(timeout=max(1.0, give_up_at_s - time.monotonic()))
+        observation, reward, terminated, truncated, infos = envs.recv()
         ready = infos["env_id"].tolist()
         for i, copy in enumerate(ready):
             rows = slice(i * agents, (i + 1) * agents)
@@ -235,10 +259,13 @@ def _step(
             terminated = ~infos["acts"]
         actions = random_actions.choose([len(traces[copy]) for copy in ready], observation, infos, terminated, truncated)
         now_s = time.monotonic()
-        if now_s < give_up_at_s and (now_s < end_at_s or min(map(len, traces)) <= LEAST_STEPS):
+        if not stepped_at_s and min(map(len, traces)) > LEAST_STEPS:
+            stepped_at_s = now_s
+        if now_s < give_up_at_s and (now_s < end_at_s or not stepped_at_s):
             into: Any = create_empty_array(space, len(actions))
             batch = concatenate(space, actions, into)
             envs.send(batch, ready)
+    return stepped_at_s or time.monotonic()
 
 
 def _arrays(observation: Any) -> Iterator[Array]:
@@ -289,7 +316,7 @@ def _measured_alone(env: ProbedEnv, session: _SteppedCopies) -> Measurements:
     )
 
 
-def _with_all(measured: Measurements, sessions: Sequence[_SteppedCopies]) -> Measurements:
+def _with_all(measured: Measurements, sessions: Sequence[_SteppedCopies], findings: Sequence[str]) -> Measurements:
     """Add the measurements that need all sessions.
 
     The first reset of a copy may be slower than the later ones, so it isn't counted unless no copy was reset twice.
@@ -299,7 +326,8 @@ def _with_all(measured: Measurements, sessions: Sequence[_SteppedCopies]) -> Mea
     resets = np.concatenate(later or [each.resets for each in times])
     steps = sum(int(np.count_nonzero(each.steps[:, 0] < each.resets[-1, 0])) for each in times)  # steps of complete episodes
     share = max(each.others_cpu_share for each in times)
-    worked = max((len(each.traces) for each in sessions if each.is_whole), default=1)
+    worked = max((each.size.copies for each in sessions if each.is_whole), default=1)
+    failed = [each.size for each in sessions if each.wrong and each.size.copies > 1]
     wrong_masks = next((each.masks.wrong for each in sessions if each.masks.wrong), "")
     return msgspec.structs.replace(
         measured,
@@ -309,10 +337,10 @@ def _with_all(measured: Measurements, sessions: Sequence[_SteppedCopies]) -> Mea
         reset_cpu_s=float((resets[:, 2] + share * resets[:, 1]).mean()),
         resets=len(resets),
         copies_worked=worked,
-        copies_failed=min((len(each.traces) for each in sessions if each.wrong and len(each.traces) > worked), default=0),
+        copies_failed=min((size.copies for size in failed if size.copies > worked), default=0),
         episode_steps=steps / sum(map(len, later)) if later else sessions[0].time_limit,
         deterministic=_deterministic([trace for session in sessions for trace in session.traces]),
-        findings=tuple(session.finding for session in sessions if session.wrong),
+        findings=tuple(findings),
     )
 
 

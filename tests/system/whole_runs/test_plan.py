@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import os
+import re
 import shlex
 import time
 from pathlib import Path
@@ -23,6 +24,7 @@ from millrace.protocol.errors import RunError, UsageError
 
 TOY = "tests.support.envs.toy"
 BRIEF_S = 6.0
+ENDS_WITHIN_S = 5.0  # after the time of a probe, its workers have this long to end
 LARGEST = float(np.finfo(np.float32).max)
 
 
@@ -149,6 +151,44 @@ def test_a_plan_for_an_environment_of_which_a_second_copy_fails_has_one_copy(
     assert (plan.settings["envs"], plan.settings["workers"], plan.settings["lanes"]) == (1, 1, 1)
     assert plan.settings["eval_copies"] == 1
     assert any(line.startswith("evaluations need a second copy, but 2 did not work side by side") for line in plan.advice)
+
+
+class Slow(gymnasium.Env[Any, Any]):
+    """Short steps. Making a copy, a reset, or making another copy in the same process takes this many seconds."""
+
+    observation_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
+    action_space = gymnasium.spaces.Discrete(2)
+    made = 0
+
+    def __init__(self, start_s: float = 0.0, reset_s: float = 0.0, another_s: float = 0.0) -> None:
+        time.sleep(start_s + (another_s if Slow.made else 0.0))
+        Slow.made += 1
+        self._reset_s = reset_s
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        time.sleep(self._reset_s)
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action: Any) -> Any:
+        return np.zeros(1, np.float32), 0.0, False, False, {}
+
+
+@pytest.mark.parametrize("slow", ["start_s", "reset_s"])
+def test_slow_copies_are_tried_only_as_far_as_the_time_allows_and_limit_nothing(slow: str) -> None:
+    began_s = time.monotonic()
+    measured = probe(ProbedEnv(Slow, {slow: 1.5}, ()), Machine(cores=2), seconds=2 * BRIEF_S).measured
+    assert time.monotonic() - began_s < 2 * BRIEF_S + ENDS_WITHIN_S
+    assert (measured.copies_failed, measured.findings) == (0, ())
+
+
+def test_a_session_that_takes_longer_than_the_time_left_is_not_a_failure_and_ends_with_the_time() -> None:
+    began_s = time.monotonic()
+    measured = probe(ProbedEnv(Slow, {"another_s": 60.0}, ()), Machine(cores=2), seconds=2 * BRIEF_S).measured
+    assert time.monotonic() - began_s < 2 * BRIEF_S + ENDS_WITHIN_S
+    assert measured.copies_failed == 0
+    (line,) = measured.findings
+    assert re.fullmatch(r"[2-8] copies in one worker were not measured, because the time was up .*--seconds", line)
 
 
 def test_if_no_step_can_be_made_the_error_says_why() -> None:

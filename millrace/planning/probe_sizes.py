@@ -1,0 +1,74 @@
+"""How many workers and copies the sessions of a probe have, so that they fit into its time. Pure.
+
+Rule: an estimate assumes the worst case: the copies of a worker start, reset and step one after another, and all of this
+computes, so that more workers than cores take turns.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import NamedTuple
+
+from millrace.planning.measurements import WORKER_BYTES, Machine, Measurements
+
+MOST_PER_CORE = 8  # largest number of workers to try per core
+MOST_AT_LEAST = 16  # number of workers to try even if `MOST_PER_CORE` allows fewer
+COPIES_OF_SHORT = 8  # number of copies in a worker if steps are short
+GROWTH = 4  # each number of workers to try is this many times the one before
+OF_MEMORY = 0.7  # the probe uses at most this share of the free memory
+SPARE = 1.5  # a session begins only if there is this many times the time that it needs
+
+
+class SessionSize(NamedTuple):
+    """The number of workers in a session, and of copies in each of them."""
+
+    workers: int = 1
+    each: int = 1
+
+    @property
+    def copies(self) -> int:
+        """The number of copies of all workers together."""
+        return self.workers * self.each
+
+
+class Needed(NamedTuple):
+    """The time that a session needed until each copy had taken a few steps."""
+
+    size: SessionSize
+    seconds: float
+
+    def most_each(self, left_s: float) -> int:
+        """The largest number of copies in each worker for which a session with as many workers fits into `left_s`."""
+        return int(left_s * self.size.each / (SPARE * max(self.seconds, 1e-9)))
+
+    def fits(self, size: SessionSize, cores: int, left_s: float) -> bool:
+        """Whether a session of this size fits into `left_s`."""
+        turns = max(1.0, size.workers / cores) / max(1.0, self.size.workers / cores)
+        return SPARE * self.seconds * turns * size.each / self.size.each <= left_s
+
+
+def most_each(machine: Machine) -> int:
+    """How many copies to step in each worker if steps are short, so that a worker for each core is still allowed."""
+    most = COPIES_OF_SHORT
+    if machine.most_copies:
+        most = min(most, machine.most_copies // machine.cores)
+    return max(1, most)
+
+
+def numbers_of_workers(measured: Measurements, machine: Machine, each: int) -> Iterator[int]:
+    """The numbers of workers to try, ascending. `each`: the number of copies of each worker."""
+    alone = measured.alone
+    limit = max(MOST_AT_LEAST, MOST_PER_CORE * machine.cores)
+    if machine.free_bytes is not None:
+        limit = min(limit, int(OF_MEMORY * machine.free_bytes / max(measured.worker_bytes, WORKER_BYTES)))
+    if machine.most_copies:
+        limit = min(limit, machine.most_copies // each)
+    # Try more copies than cores only if steps spend time waiting rather than computing.
+    limit = min(limit, machine.cores if alone.computes else math.ceil(machine.cores / max(alone.cpu_share, 1e-3)))
+    workers = max(2, machine.cores)
+    while workers < limit:
+        yield workers
+        workers *= GROWTH
+    if limit > 1:
+        yield limit
