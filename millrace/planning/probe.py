@@ -95,7 +95,7 @@ def probe(env: ProbedEnv, machine: Machine, seconds: float) -> Probed:
         return give_up_at_s - (1 - OF_SIDE_BY_SIDE) * seconds - time.monotonic()
 
     if measured.alone.own_s < SHORT_S and first.is_whole:
-        each = min(most_each(machine), first.needed.most_each(left_s()))
+        each = min(most_each(measured, machine), first.needed.most_each(left_s()))
         if each > 1:
             several = _session(env, SessionSize(each=each), OF_ALONE * seconds, give_up_at_s)
             sessions.append(several)

@@ -1,4 +1,4 @@
-"""How many workers and copies the sessions of a probe have, so that they fit into its time. Pure.
+"""How many workers and copies the sessions of a probe have, so that they fit into its time and its memory. Pure.
 
 Rule: an estimate assumes the worst case: the copies of a worker start, reset and step one after another, and all of this
 computes, so that more workers than cores take turns.
@@ -48,11 +48,14 @@ class Needed(NamedTuple):
         return SPARE * self.seconds * turns * size.each / self.size.each <= left_s
 
 
-def most_each(machine: Machine) -> int:
+def most_each(measured: Measurements, machine: Machine) -> int:
     """How many copies to step in each worker if steps are short, so that a worker for each core is still allowed."""
     most = COPIES_OF_SHORT
     if machine.most_copies:
         most = min(most, machine.most_copies // machine.cores)
+    if machine.free_bytes is not None:
+        room = OF_MEMORY * machine.free_bytes / machine.cores - WORKER_BYTES
+        most = min(most, int(room / _copy_bytes(measured)))
     return max(1, most)
 
 
@@ -61,7 +64,7 @@ def numbers_of_workers(measured: Measurements, machine: Machine, each: int) -> I
     alone = measured.alone
     limit = max(MOST_AT_LEAST, MOST_PER_CORE * machine.cores)
     if machine.free_bytes is not None:
-        limit = min(limit, int(OF_MEMORY * machine.free_bytes / max(measured.worker_bytes, WORKER_BYTES)))
+        limit = min(limit, int(OF_MEMORY * machine.free_bytes / (WORKER_BYTES + each * _copy_bytes(measured))))
     if machine.most_copies:
         limit = min(limit, machine.most_copies // each)
     # Try more copies than cores only if steps spend time waiting rather than computing.
@@ -72,3 +75,8 @@ def numbers_of_workers(measured: Measurements, machine: Machine, each: int) -> I
         workers *= GROWTH
     if limit > 1:
         yield limit
+
+
+def _copy_bytes(measured: Measurements) -> int:
+    """Memory of a copy in a worker."""
+    return max(1, measured.worker_bytes - WORKER_BYTES)
