@@ -25,6 +25,8 @@ class AllowedCopies(NamedTuple):
     """on all machines together"""
     why: str = "with those of evaluations"
     """the reason for `of_run`"""
+    apart: bool = False
+    """whether several copies in one worker did not work"""
 
     @classmethod
     def of(cls, max_env_copies: int, per_machine: int) -> AllowedCopies:
@@ -32,10 +34,15 @@ class AllowedCopies(NamedTuple):
         return cls(min([number for number in (max_env_copies, per_machine) if number], default=0), max_env_copies)
 
     def after(self, measured: Measurements) -> AllowedCopies:
-        """No more copies than have worked side by side, if more have failed."""
+        """What these measurements allow.
+
+        If more copies have failed than worked side by side, only the latter number; if several have failed in one worker, as
+        few as possible there.
+        """
+        allowed = self._replace(apart=bool(measured.failed_in_one_worker))
         if not measured.copies_failed or 0 < self.here <= measured.copies_worked:
-            return self
-        return AllowedCopies(measured.copies_worked, measured.copies_worked, MORE_FAILED)
+            return allowed
+        return allowed._replace(here=measured.copies_worked, of_run=measured.copies_worked, why=MORE_FAILED)
 
     @property
     def training(self) -> int:
@@ -49,11 +56,15 @@ class AllowedCopies(NamedTuple):
         if self.of_run > 1:  # evaluations need a second one
             found.append(ChosenSetting("max_env_copies", self.of_run, self.why))
         if self._evaluating < EVALUATION_COPIES:
+            few = "as few as possible"
             train = f"so that {self.training} of {counted(self.here, 'copy', 'copies')} train"
-            found.append(ChosenSetting("eval_copies", self._evaluating, train if self.here > 1 else "as few as possible"))
+            found.append(ChosenSetting("eval_copies", self._evaluating, train if self.here > 1 else few))
         return found
 
     @property
     def _evaluating(self) -> int:
-        """How many copies play evaluations: the default number, or 1 if that is more than a third of the allowed ones."""
-        return EVALUATION_COPIES if not self.here or self.here >= 3 * EVALUATION_COPIES else 1
+        """How many copies of a worker play evaluations: the default number, or 1 if that is more than a third of the allowed
+        ones, or if several copies in one worker did not work.
+        """
+        enough = not self.here or self.here >= 3 * EVALUATION_COPIES
+        return EVALUATION_COPIES if enough and not self.apart else 1

@@ -80,6 +80,8 @@ class Measurements(msgspec.Struct, frozen=True, kw_only=True):
     """the largest number of copies that were stepped side by side without a problem"""
     copies_failed: int = 0
     """the smallest number of copies, more than `copies_worked`, that had a problem side by side; 0 if there is none"""
+    failed_in_one_worker: int = 0
+    """the smallest number of copies, more than one, that had a problem in the same worker; 0 if there is none"""
     reset_s: float = 0.0
     """mean wall time of a reset"""
     reset_cpu_s: float = 0.0

@@ -193,6 +193,12 @@ def _advice(sizes: Sizes, situation: Situation, rate: float) -> list[str]:
             f"evaluations need a second copy, but {measured.copies_failed} did not work side by side: the evaluation of "
             "this command fails unless a second copy works"
         )
+    elif measured.failed_in_one_worker:
+        lines.append(
+            f"evaluations need a second copy in a worker, but {measured.failed_in_one_worker} in one worker did not work: "
+            "the evaluation of this command fails unless 2 work. If the environment allows only one copy in each process, "
+            "use OwnProcess, as in docs/how-to/named_simulators.md"
+        )
     if machine.load > BUSY * machine.cores:
         lines.append(
             f"other programs use the {counted(machine.cores, 'core')} (load average {number_in_words(machine.load)}): "

@@ -144,7 +144,8 @@ def candidates(learning: Learning, measured: Measurements, machine: Machine) -> 
     """All sizes of a run to choose from."""
     at_once = copies_at_once(measured, machine, learning.acting_bytes).number
     for envs in _numbers_of_envs(measured, machine, learning, at_once):
-        for workers in sorted({1, min(machine.cores, envs), min(at_once, envs)}):
+        numbers = {envs} if measured.failed_in_one_worker else {1, min(machine.cores, envs), min(at_once, envs)}
+        for workers in sorted(numbers):
             for lanes in sorted({_lanes_for(workers, envs), envs}):
                 for lag in LAGS:
                     yield Sizes(workers=workers, envs=envs, lanes=lanes, max_lag=lag, rollout_steps=learning.steps(envs))
@@ -157,7 +158,7 @@ def _lanes_for(workers: int, envs: int) -> int:
 
 def _numbers_of_envs(measured: Measurements, machine: Machine, learning: Learning, at_once: int) -> list[int]:
     """The numbers of env copies to consider, ascending."""
-    if not measured.alone.computes:
+    if not measured.alone.computes or measured.failed_in_one_worker:  # a worker for each copy
         return sorted({min(learning.envs * 2**n, at_once) for n in range(at_once.bit_length() + 1)})
     most = machine.most_copies or max(MOST_ENVS, learning.envs)
     if machine.free_bytes is not None:
@@ -205,6 +206,8 @@ def reasons(
 
 def _why_workers(sizes: Sizes, measured: Measurements, machine: Machine) -> str:
     share = measured.alone.cpu_share
+    if measured.failed_in_one_worker:
+        return "several copies in one worker did not work, so each copy has a worker of its own"
     if measured.alone.computes and sizes.workers == machine.cores:
         return f"a step computes for {min(share, 1.0):.0%} of its time, so there is one for each core"
     if sizes.workers == sizes.envs > 1:
@@ -219,7 +222,7 @@ def _why_envs(sizes: Sizes, learning: Learning, situation: Situation) -> str:
     at_once = copies_at_once(measured, situation.machine, situation.overheads.acting_bytes)
     if sizes.envs == situation.machine.most_copies:
         return _at_most(situation.machine)
-    if not measured.alone.computes:
+    if not measured.alone.computes or measured.failed_in_one_worker:
         return at_once.why if sizes.envs == at_once.number else "more would hardly be faster, because of the updates"
     if sizes.envs > max(learning.envs, situation.machine.cores):
         return "steps are so short that a worker should step several copies at a time"

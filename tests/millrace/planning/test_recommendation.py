@@ -120,6 +120,26 @@ def test_a_failure_limits_copies_only_if_there_were_more_of_them_than_worked_and
     assert AllowedCopies.of(8, 6).after(failed).training == 3
 
 
+@pytest.mark.parametrize("learning", [PPO, REPLAY])
+@pytest.mark.parametrize(("wait_s", "cpu_s"), [(0.01, 1e-4), (0.0, 0.003), (0.0, 1e-5)])
+@pytest.mark.parametrize(("cores", "failed"), [(8, 0), (16, 0), (4, 8)])
+def test_if_several_copies_failed_in_one_worker_each_copy_that_trains_has_a_worker_of_its_own(
+    cores: int, failed: int, wait_s: float, cpu_s: float, learning: Learning
+) -> None:
+    found = measured(
+        wait_s=wait_s, cpu_s=cpu_s, tried=cores, copies_worked=cores, copies_failed=failed, failed_in_one_worker=8
+    )
+    allowed = AllowedCopies.of(0, 0).after(found)
+    where = situation(found, machine=Machine(cores=cores, free_bytes=64 << 30, most_copies=allowed.training))
+    sizes = chosen(where, learning)
+    assert sizes.workers == sizes.lanes == sizes.envs > 1
+    assert sizes.workers <= cores
+    settings = (*reasons(sizes, learning, where, lambda sizes: rate(sizes, where)), *allowed.settings)
+    values = {each.name: each.value for each in settings}
+    assert values["eval_copies"] == 1
+    assert "worker of its own" in {each.name: each.why for each in settings}["workers"]
+
+
 def test_if_the_learner_is_the_limit_no_more_copies_are_chosen_than_it_can_use() -> None:
     slow = msgspec.structs.replace(OVERHEADS, update_s=0.02)
     found = chosen(situation(measured(wait_s=0.05), slow), REPLAY)

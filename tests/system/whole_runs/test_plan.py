@@ -20,6 +20,7 @@ from millrace.cli.main import main
 from millrace.learner.config.command_line import read_config
 from millrace.planning.measurements import Machine
 from millrace.planning.probe import LEAST_STEPS, ProbedEnv, probe
+from millrace.planning.probe_sizes import COPIES_OF_SHORT
 from millrace.protocol.errors import RunError, UsageError
 
 TOY = "tests.support.envs.toy"
@@ -179,16 +180,45 @@ def test_slow_copies_are_tried_only_as_far_as_the_time_allows_and_limit_nothing(
     began_s = time.monotonic()
     measured = probe(ProbedEnv(Slow, {slow: 1.5}, ()), Machine(cores=2), seconds=2 * BRIEF_S).measured
     assert time.monotonic() - began_s < 2 * BRIEF_S + ENDS_WITHIN_S
-    assert (measured.copies_failed, measured.findings) == (0, ())
+    assert (measured.copies_failed, measured.failed_in_one_worker, measured.findings) == (0, 0, ())
 
 
 def test_a_session_that_takes_longer_than_the_time_left_is_not_a_failure_and_ends_with_the_time() -> None:
     began_s = time.monotonic()
     measured = probe(ProbedEnv(Slow, {"another_s": 60.0}, ()), Machine(cores=2), seconds=2 * BRIEF_S).measured
     assert time.monotonic() - began_s < 2 * BRIEF_S + ENDS_WITHIN_S
-    assert measured.copies_failed == 0
+    assert (measured.copies_failed, measured.failed_in_one_worker) == (0, 0)
     (line,) = measured.findings
     assert re.fullmatch(r"[2-8] copies in one worker were not measured, because the time was up .*--seconds", line)
+
+
+class OneInEachProcess(gymnasium.Env[Any, Any]):
+    """Short steps. A process may make only one copy."""
+
+    observation_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
+    action_space = gymnasium.spaces.Discrete(2)
+    made = False
+
+    def __init__(self) -> None:
+        if OneInEachProcess.made:
+            raise RuntimeError("cannot create multiple simulators in a process")
+        OneInEachProcess.made = True
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action: Any) -> Any:
+        return np.zeros(1, np.float32), 0.0, False, False, {}
+
+
+def test_an_environment_that_allows_one_copy_in_each_process_is_found_out() -> None:
+    measured = probe(ProbedEnv(OneInEachProcess, {}, ()), Machine(cores=2), seconds=2 * BRIEF_S).measured
+    assert measured.copies_worked == 2
+    assert 2 <= measured.failed_in_one_worker <= COPIES_OF_SHORT
+    (line,) = measured.findings
+    assert line.startswith(f"{measured.failed_in_one_worker} copies in one worker: ")
+    assert "multiple simulators" in line
 
 
 def test_if_no_step_can_be_made_the_error_says_why() -> None:
