@@ -16,6 +16,7 @@ from enum import Enum, auto
 from typing import NamedTuple
 
 from millrace.protocol.bounds import MOST_OTHER_KEYS
+from millrace.protocol.key_limit import KeyLimit
 
 VALUES = {"NONE", "NEWTRUE", "NEWFALSE", "BININT", "BININT1", "BININT2", "LONG1", "LONG4", "BINFLOAT", "BINUNICODE"}
 CONTAINERS = {"EMPTY_LIST", "EMPTY_DICT"}
@@ -71,7 +72,7 @@ def rehearse(content: bytes) -> None:
     marks = list[int]()
     notes = dict[int, _Made]()
     bytes_left = len(content)
-    squares_left = MOST_OTHER_KEYS**2
+    limit = KeyLimit()
     values_left = MOST_REPEATED + REPEATED_PER_BYTE * len(content)
     for opcode, argument, _ in pickletools.genops(content):
         match opcode.name, argument:
@@ -92,10 +93,10 @@ def rehearse(content: bytes) -> None:
             case "APPEND", _:
                 _add(stack, len(stack) - 1)
             case "SETITEMS", _:
-                squares_left = _set_items(stack, marks.pop(), squares_left)
+                _set_items(stack, marks.pop(), limit)
             case "SETITEM", _:
-                squares_left = _set_items(stack, len(stack) - 2, squares_left)
-            case "BINPUT" | "LONG_BINPUT", int(note):
+                _set_items(stack, len(stack) - 2, limit)
+            case "BINPUT" | "LONG_BINPUT", int(note) if note <= len(notes):  # others could collide in torch's dict of notes
                 notes[note] = stack[-1]
             case "BINGET" | "LONG_BINGET", int(note):
                 notes[note].used_again = True
@@ -116,6 +117,8 @@ def rehearse(content: bytes) -> None:
                     raise Unfit("it has more bytes objects than fit into the file")
                 stack.append(_Made(_DictKind.ORDERED if called.value == _Function(ORDERED) else None))
             case "BUILD", _ if (stack[-2].value, stack[-1].value) == (_DictKind.ORDERED, _DictKind.PLAIN):
+                if stack[-1].numbers:  # torch copies them, as often as the file says
+                    raise Unfit("expected attributes with names, got a number as a name")
                 _add(stack, len(stack) - 1)  # attributes, such as a module's `_metadata`
             case name, _:
                 got = str(argument).replace(" ", ".") if name == "GLOBAL" else f"the opcode {name}"
@@ -141,23 +144,17 @@ def _may_be_key(key: object) -> bool:
     return type(key) is str or (type(key) is int and abs(key) < MOST_KEY)
 
 
-def _set_items(stack: list[_Made], first: int, squares_left: int) -> int:
-    """Move keys and values, from index `first` on, into the dict below them. Raises `Unfit` for a key that isn't allowed.
-
-    In all dicts together, the squares of the numbers of keys that are numbers may add up to `squares_left`. Returns how much
-    of it is left.
-    """
+def _set_items(stack: list[_Made], first: int, limit: KeyLimit) -> None:
+    """Move keys and values, from index `first` on, into the dict below them. Raises `Unfit` for a key that isn't allowed."""
     keys = [key.value for key in stack[first::2]]
     if not all(map(_may_be_key, keys)):
         raise Unfit("expected tensors and plain data, got a key that is neither text nor a small number")
     filled = stack[first - 1]
-    squares_left += filled.numbers**2
-    filled.numbers += sum(type(key) is int for key in keys)
-    squares_left -= filled.numbers**2
-    if squares_left < 0:
-        raise Unfit(f"expected dicts with at most {MOST_OTHER_KEYS:,} numbers as keys, got more")
+    numbers = filled.numbers + sum(type(key) is int for key in keys)
+    if not limit.allows(numbers, filled.numbers):
+        raise Unfit(f"expected dicts with at most {MOST_OTHER_KEYS:,} numbers as keys, and few such dicts, got more")
+    filled.numbers = numbers
     _add(stack, first)
-    return squares_left
 
 
 def _check_storage(storage: object) -> None:

@@ -3,10 +3,11 @@
 A value is plain if it is None, a bool, int, float, complex, str, bytes, list, tuple, dict, or a numpy scalar or array of
 bools, numbers, text, bytes, dates or durations, or a numpy array of plain objects. Strings with a lone surrogate, which
 UTF-8 cannot encode, integers with more decimal digits than Python converts, and dicts whose keys could make them slow
-(`_KeyLimit`) are not plain. A value that isn't plain raises `TypeError`; if the caller asks for it, the value is instead
+(`_too_slow`) are not plain. A value that isn't plain raises `TypeError`; if the caller asks for it, the value is instead
 sent as its `repr` and arrives as a `ReprString`, which cannot be confused with a string. For such a caller, subclasses of
-dict, list and tuple are plain too: they arrive as dicts, lists and tuples. Other numbers, other sequences, buffers, and
-objects with numpy's protocol, such as tensors, arrive as numpy scalars or arrays if numpy reads numbers from them.
+dict, list and tuple are plain too: they arrive as dicts, lists and tuples. Other numbers, buffers, and objects with
+numpy's protocol, such as tensors, arrive as numpy scalars or arrays if numpy reads numbers from them; any other sequence
+arrives as a list.
 """
 
 from __future__ import annotations
@@ -14,7 +15,11 @@ from __future__ import annotations
 import math
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from enum import IntEnum
+from functools import partial
+from itertools import islice
 from typing import Any
 
 import msgpack
@@ -22,6 +27,7 @@ import numpy as np
 
 from millrace.protocol.bounds import MOST_OTHER_KEYS, MOST_WITH_ONE_HASH
 from millrace.protocol.errors import BadMessage, safe_repr
+from millrace.protocol.key_limit import KeyLimit
 
 DTYPE_KINDS = "biufcSUmM"
 NUMBER_KINDS = "biuf"
@@ -29,7 +35,18 @@ NUMPY_PROTOCOL = ("__array__", "__array_interface__", "__array_struct__")
 MAX_DEPTH = 32
 MAX_REPR = 1000  # characters
 
-_TUPLE, _PAIRS, _ARRAY, _SCALAR, _OBJECTS, _INT, _COMPLEX, _REPR = range(1, 9)
+
+class _Code(IntEnum):
+    """Codes of msgpack's extensions: the types that msgpack itself doesn't have."""
+
+    TUPLE = 1
+    PAIRS = 2  # a dict with keys that msgpack doesn't take
+    ARRAY = 3
+    SCALAR = 4
+    OBJECTS = 5
+    INT = 6
+    COMPLEX = 7
+    REPR = 8
 
 
 class ReprString(str):
@@ -38,37 +55,17 @@ class ReprString(str):
     __slots__ = ()
 
 
-class _KeyLimit:
-    """Limits the time that the dicts in one value take because of their keys.
-
-    Keys can be chosen so that each collides with all others in its dict. Therefore, the time that a dict takes can grow with
-    the square of the number of its keys, and the squares of all dicts are added up. If keys have the same hash, Python also
-    compares them with each other, however long they are. Text doesn't count, because Python's hashes of text are secret.
-    """
-
-    def __init__(self) -> None:
-        self._squares_left = MOST_OTHER_KEYS**2
-
-    def too_slow(self, keys: Iterable[object]) -> bool:
-        """Whether a dict with these keys would exceed the limit. If not, it counts from now on."""
-        others = [key for key in keys if not isinstance(key, str)]
-        squares = len(others) ** 2
-        if squares > self._squares_left:
-            return True
-        if len(others) > MOST_WITH_ONE_HASH and max(Counter(map(hash, others)).values()) > MOST_WITH_ONE_HASH:
-            return True
-        self._squares_left -= squares
-        return False
-
-
-TOO_SLOW = f"more than {MOST_OTHER_KEYS:,} keys that aren't text, or more than {MOST_WITH_ONE_HASH} with the same hash"
+TOO_SLOW = (
+    f"more than {MOST_OTHER_KEYS:,} keys that aren't text, more than {MOST_WITH_ONE_HASH} with the same hash, "
+    "or too many such dicts"
+)
 
 
 def pack(value: object, use_repr: bool = False) -> bytes:
     """Convert a plain value to bytes. For any other value, packs numbers or its `repr` if `use_repr`; otherwise, raises
     `TypeError`.
     """
-    return _pack(_to_msgpack(value, "", use_repr, _KeyLimit(), 0))
+    return _pack(_Packer(use_repr).convert(value))
 
 
 def unpack(data: bytes | memoryview) -> Any:
@@ -77,7 +74,7 @@ def unpack(data: bytes | memoryview) -> Any:
     The result has at most `MAX_DEPTH` levels, so it is safe to traverse recursively.
     """
     try:
-        value = _unpack(data, _KeyLimit(), 0)
+        value = _unpack(data, KeyLimit(), 0)
         _check_depth(value, 0)
         return value
     except BadMessage:
@@ -91,77 +88,101 @@ def _pack(value: object) -> bytes:
     return packed
 
 
-def _to_msgpack(value: Any, where: str, use_repr: bool, limit: _KeyLimit, depth: int) -> Any:
-    """Convert a value to types that msgpack knows. Types are compared exactly, so that no subclass arrives as its base
-    class.
-
-    `where` is the value's path in errors. Raises `TypeError` for a value that isn't plain, unless `use_repr`.
+@dataclass(frozen=True, slots=True)
+class _Packer:
+    """Converts one value to types that msgpack knows. Types are compared exactly, so that no subclass arrives as its base
+    class; with `use_repr`, subclasses of list, tuple and dict do.
     """
-    if depth > MAX_DEPTH:
-        raise TypeError(f"{where or 'value'}: expected at most {MAX_DEPTH} levels, got more")
-    kind = type(value)
-    if value is None or kind in (bool, float, bytes) or (kind is str and _is_encodable(value)):
-        return value
-    if kind is int and -(2**63) <= value < 2**64:
-        return value
-    if kind is int and (digits := _digits(value)) is not None:
-        return msgpack.ExtType(_INT, digits)
-    if kind is list or (use_repr and isinstance(value, list)):
-        return [_to_msgpack(inner, f"{where}[{i}]", use_repr, limit, depth + 1) for i, inner in enumerate(value)]
-    if kind is tuple or (use_repr and isinstance(value, tuple)):
-        inside = [_to_msgpack(inner, f"{where}[{i}]", use_repr, limit, depth + 1) for i, inner in enumerate(value)]
-        return msgpack.ExtType(_TUPLE, _pack(inside))
-    if (kind is dict or (use_repr and isinstance(value, dict))) and not limit.too_slow(value):
-        inside = [
-            _to_msgpack(inner, f"{where}.{key}" if where else str(key), use_repr, limit, depth + 1)
-            for key, inner in value.items()
-        ]
+
+    use_repr: bool
+    limit: KeyLimit = field(default_factory=KeyLimit)
+
+    def convert(self, value: Any, where: str = "", depth: int = 0) -> Any:
+        """`where` is the value's path in errors. Raises `TypeError` for a value that isn't plain, unless `use_repr`."""
+        if depth > MAX_DEPTH:
+            raise TypeError(f"{where or 'value'}: expected at most {MAX_DEPTH} levels, got more")
+        kind = type(value)
+        if value is None or kind in (bool, float, bytes) or (kind is str and _is_encodable(value)):
+            return value
+        if kind is int and -(2**63) <= value < 2**64:
+            return value
+        if kind is int and (digits := _digits(value)) is not None:
+            return msgpack.ExtType(_Code.INT, digits)
+        if self._is_a(list, value):
+            return self._items(value, where, depth)
+        if self._is_a(tuple, value):
+            return msgpack.ExtType(_Code.TUPLE, _pack(self._items(value, where, depth)))
+        if self._is_a(dict, value) and not _too_slow(value, self.limit):
+            return self._dict(value, where, depth)
+        if kind is complex:
+            return msgpack.ExtType(_Code.COMPLEX, _pack([value.real, value.imag]))
+        if kind is np.ndarray and value.dtype.kind in DTYPE_KINDS:
+            return msgpack.ExtType(_Code.ARRAY, _pack([value.dtype.str, list(value.shape), value.tobytes()]))
+        if kind is np.ndarray and value.dtype.kind == "O":
+            items = self._items(value.ravel().tolist(), where, depth)
+            return msgpack.ExtType(_Code.OBJECTS, _pack([list(value.shape), items]))
+        if isinstance(value, np.generic) and value.dtype.kind in DTYPE_KINDS:
+            return msgpack.ExtType(_Code.SCALAR, _pack([value.dtype.str, value.tobytes()]))
+        if self.use_repr:
+            return self._other(value, where, depth)
+        got = {
+            str: "text with a lone surrogate",
+            int: "an integer with too many digits",
+            dict: f"dicts with {TOO_SLOW}",
+        }.get(kind, kind.__name__)
+        raise TypeError(f"{where or 'value'}: expected plain data (numbers, strings, lists, dicts, arrays), got {got}")
+
+    def _is_a(self, kind: type, value: object) -> bool:
+        return type(value) is kind or (self.use_repr and isinstance(value, kind))
+
+    def _items(self, values: Iterable[Any], where: str, depth: int) -> list[Any]:
+        return [self.convert(each, f"{where}[{i}]", depth + 1) for i, each in enumerate(values)]
+
+    def _dict(self, value: dict[Any, Any], where: str, depth: int) -> Any:
+        inside = [self.convert(each, f"{where}.{key}" if where else str(key), depth + 1) for key, each in value.items()]
         if all(type(key) is str and _is_encodable(key) for key in value):
             return dict(zip(value, inside, strict=True))
-        keys = [_key(key, f"{where} key", use_repr, limit, depth + 1) for key in value]
-        return msgpack.ExtType(_PAIRS, _pack([keys, inside]))
-    if kind is complex:
-        return msgpack.ExtType(_COMPLEX, _pack([value.real, value.imag]))
-    if isinstance(value, np.ndarray) and kind is np.ndarray:
-        if value.dtype.kind in DTYPE_KINDS:
-            return msgpack.ExtType(_ARRAY, _pack([value.dtype.str, list(value.shape), value.tobytes()]))
-        if value.dtype.kind == "O":
-            inside = [
-                _to_msgpack(inner, f"{where}[{i}]", use_repr, limit, depth + 1)
-                for i, inner in enumerate(value.ravel().tolist())
-            ]
-            return msgpack.ExtType(_OBJECTS, _pack([list(value.shape), inside]))
-    if isinstance(value, np.generic) and value.dtype.kind in DTYPE_KINDS:
-        return msgpack.ExtType(_SCALAR, _pack([value.dtype.str, value.tobytes()]))
-    if use_repr:
-        numbers = _numbers(value)
-        return _repr(value) if numbers is None else _to_msgpack(numbers, where, use_repr, limit, depth)
-    got = {
-        str: "text with a lone surrogate",
-        int: "an integer with too many digits",
-        dict: f"dicts with {TOO_SLOW}",
-    }.get(kind, kind.__name__)
-    raise TypeError(f"{where or 'value'}: expected plain data (numbers, strings, lists, dicts, arrays), got {got}")
+        keys = [self._key(key, f"{where} key", depth + 1) for key in value]
+        return msgpack.ExtType(_Code.PAIRS, _pack([keys, inside]))
+
+    def _key(self, key: Any, where: str, depth: int) -> Any:
+        """Convert a key of a dict. A key that isn't plain becomes its `repr`, because an array or a list can't be a key."""
+        try:
+            return replace(self, use_repr=False).convert(key, where, depth)
+        except TypeError:
+            if self.use_repr:
+                return _repr(key)
+            raise
+
+    def _other(self, value: Any, where: str, depth: int) -> Any:
+        """Convert a value that isn't plain: to numbers, to a list, or else to its `repr`."""
+        if (numbers := _numbers(value)) is not None:
+            return self.convert(numbers, where, depth)
+        if (listed := _listed(value)) is not None:
+            return self._items(listed, where, depth)
+        return _repr(value)
 
 
-def _key(key: Any, where: str, use_repr: bool, limit: _KeyLimit, depth: int) -> Any:
-    """Convert a key of a dict. A key that isn't plain becomes its `repr`, because an array can't be a key."""
-    try:
-        return _to_msgpack(key, where, False, limit, depth)
-    except TypeError:
-        if use_repr:
-            return _repr(key)
-        raise
+def _too_slow(keys: Iterable[object], limit: KeyLimit) -> bool:
+    """Whether a dict with these keys would take too long. If not, they count from now on.
+
+    If keys have the same hash, Python also compares them with each other, however long they are.
+    """
+    others = [key for key in keys if not isinstance(key, str)]
+    if len(others) > MOST_WITH_ONE_HASH and max(Counter(map(hash, others)).values()) > MOST_WITH_ONE_HASH:
+        return True
+    return not limit.allows(len(others))
 
 
 def _numbers(value: Any) -> Any:
-    """The scalar or array that numpy reads from a number or sequence of another type, from a buffer, or from an object with
-    numpy's protocol.
+    """The scalar or array that numpy reads from a number of another type, from a buffer, or from an object with numpy's
+    protocol.
 
-    None for other objects, because their items may never end, or if numpy doesn't read numbers from the value.
+    None for anything else. numpy would also read sequences, but it copies each text at the length of the longest, and some
+    sequences never end.
     """
     try:
-        if not isinstance(value, int | float | Sequence) and not any(hasattr(value, name) for name in NUMPY_PROTOCOL):
+        if not isinstance(value, int | float) and not any(hasattr(value, name) for name in NUMPY_PROTOCOL):
             memoryview(value)  # raises TypeError if the value isn't a buffer
         array = np.asarray(value)
         return array[()] if array.dtype.kind in NUMBER_KINDS else None
@@ -169,8 +190,18 @@ def _numbers(value: Any) -> Any:
         return None
 
 
+def _listed(value: Any) -> list[Any] | None:
+    """The items of a sequence of another type, as many as its length says. None for text, bytes and anything else."""
+    if not isinstance(value, Sequence) or isinstance(value, str | bytes):
+        return None
+    try:
+        return list(islice(value, len(value)))
+    except Exception:  # user-defined objects may raise anything
+        return None
+
+
 def _repr(value: Any) -> msgpack.ExtType:
-    return msgpack.ExtType(_REPR, safe_repr(value)[:MAX_REPR].encode(errors="backslashreplace"))
+    return msgpack.ExtType(_Code.REPR, safe_repr(value)[:MAX_REPR].encode(errors="backslashreplace"))
 
 
 def _is_encodable(text: str) -> bool:
@@ -192,13 +223,10 @@ def _digits(value: int) -> bytes | None:
         return None
 
 
-def _unpack(data: bytes | memoryview, limit: _KeyLimit, depth: int) -> Any:
+def _unpack(data: bytes | memoryview, limit: KeyLimit, depth: int) -> Any:
     if depth > MAX_DEPTH:
         raise BadMessage(f"plain value: expected at most {MAX_DEPTH} levels, got more")
-
-    def extension(code: int, inside: bytes) -> Any:
-        return _from_extension(code, inside, limit, lambda inner: _unpack(inner, limit, depth + 1))
-
+    extension = partial(_from_extension, limit=limit, depth=depth + 1)
     return msgpack.unpackb(data, ext_hook=extension, strict_map_key=True)
 
 
@@ -218,17 +246,17 @@ def _check_depth(value: object, depth: int) -> None:
             pass
 
 
-def _from_extension(code: int, data: bytes, limit: _KeyLimit, inner: Callable[[bytes], Any]) -> Any:
+def _from_extension(code: int, data: bytes, limit: KeyLimit, depth: int) -> Any:
     match code:
-        case 1:  # _TUPLE
-            return tuple(inner(data))
-        case 2:  # _PAIRS
-            keys, values = inner(data)
-            if limit.too_slow(keys):
+        case _Code.TUPLE:
+            return tuple(_unpack(data, limit, depth))
+        case _Code.PAIRS:
+            keys, values = _unpack(data, limit, depth)
+            if _too_slow(keys, limit):
                 raise BadMessage(f"plain value: got dicts with {TOO_SLOW}")
             return dict(zip(keys, values, strict=True))
-        case 3:  # _ARRAY
-            dtype, shape, raw = inner(data)
+        case _Code.ARRAY:
+            dtype, shape, raw = _unpack(data, limit, depth)
             kind = _dtype(dtype)
             if len(raw) != math.prod(shape) * kind.itemsize:
                 raise BadMessage(f"array {dtype}{shape}: expected {math.prod(shape) * kind.itemsize} bytes, got {len(raw)}")
@@ -236,21 +264,21 @@ def _from_extension(code: int, data: bytes, limit: _KeyLimit, inner: Callable[[b
                 raise BadMessage(f"array {dtype}{shape}: expected elements of a byte or more")
             _check_characters(raw, kind)
             return np.frombuffer(raw, kind).reshape(shape).copy() if raw else np.zeros(shape, kind)
-        case 4:  # _SCALAR
-            dtype, raw = inner(data)
+        case _Code.SCALAR:
+            dtype, raw = _unpack(data, limit, depth)
             kind = _dtype(dtype)
             _check_characters(raw, kind)
             return np.frombuffer(raw, kind)[0] if kind.itemsize else kind.type()
-        case 5:  # _OBJECTS
-            shape, values = inner(data)
+        case _Code.OBJECTS:
+            shape, values = _unpack(data, limit, depth)
             array = np.empty(len(values), object)
             array[:] = values
             return array.reshape(shape)
-        case 6:  # _INT
+        case _Code.INT:
             return int(data)
-        case 7:  # _COMPLEX
-            return complex(*inner(data))
-        case 8:  # _REPR
+        case _Code.COMPLEX:
+            return complex(*_unpack(data, limit, depth))
+        case _Code.REPR:
             return ReprString(data.decode())
         case _:
             raise BadMessage(f"plain value: expected a known extension, got {code}")

@@ -168,8 +168,8 @@ LIMITS: Mapping[tuple[ModuleType, str], str] = {
     (bounds, "MAX_SAVED_BYTES"): "bytes of the state of one env copy that its environment has saved",
     (lane_past, "MAX_RANDOM_BYTES"): "bytes of a `RandomState`",
     (bounds, "MAX_SEEDS"): "episodes of one Evaluate",
-    (bounds, "MOST_OTHER_KEYS"): "keys of one dict in `plain_values` that aren't strings; several dicts together may have "
-    "as many as take the same time, which grows with the square of the number",
+    (bounds, "MOST_OTHER_KEYS"): "keys of one dict in `plain_values` that aren't strings",
+    (bounds, "MOST_KEYS_SQUARED"): "sum of the squares of these numbers over all dicts in one value",
     (
         bounds,
         "MOST_WITH_ONE_HASH",
