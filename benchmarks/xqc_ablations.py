@@ -13,6 +13,7 @@ from collections.abc import Iterable, Sequence
 from itertools import chain
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from benchmarks.markdown_tables import table
@@ -97,7 +98,8 @@ class ScaledByDeviation(XQC):
 
     def scaled(self, reward: Floats) -> Floats:
         """See `GradientDescent`."""
-        return self.rewards.scaled(reward)
+        divided: Floats = (reward / self.rewards.std).astype(np.float32)
+        return divided
 
 
 def own(kind: type[XQC]) -> tuple[str]:

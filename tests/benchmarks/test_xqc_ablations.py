@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from benchmarks.wall_clock_curves import Curve
-from benchmarks.xqc_ablations import VARIANTS, command, returns_table, variant_of
+from benchmarks.xqc_ablations import VARIANTS, ScaledByDeviation, command, returns_table, variant_of
+from tests.learner.algorithms.test_continuous import made
 
 ENV = "HalfCheetah-v5"
 
@@ -30,3 +32,12 @@ def test_the_table_has_a_line_for_each_variant_that_was_trained() -> None:
         "| XQC | 100 (100 to 100, 2 seeds) | 300 (300 to 300, 2 seeds) |  |  |",
         "| an actor that learns at every step | 200 (one seed) |  |  |  |",
     ]
+
+
+def test_rewards_by_their_deviation_alone_have_no_bound() -> None:
+    bounded = made("xqc", return_bound=5)
+    free = ScaledByDeviation(bounded.config, bounded.policy, total_steps=10_000, seed=0)
+    rewards = np.ones(1, np.float32)
+    for algorithm in (bounded, free):
+        algorithm.rewards.may_last(rewards, np.full(1, 0.99))  # its value, 100, exceeds the bound of 5
+    assert (bounded.scaled(rewards), free.scaled(rewards)) == (pytest.approx(0.05), 1)
