@@ -53,6 +53,7 @@ class RunFiles:
         """Called after a checkpoint is written."""
         self._metrics = MetricsLog(run.folder.path, self._state.env_steps, self._state.version)
         self._schedule = checkpoint.CheckpointSchedule(run.config.checkpoint_every_s, time.monotonic())
+        self._complete = False  # whether training has ended, and its results are written
         self._saved: tuple[object, ...] | None = None  # `_position` at the newest checkpoint
         self._saved_env_steps = self._policy_env_steps = self._state.env_steps if self._state.version else None
 
@@ -136,6 +137,7 @@ class RunFiles:
         self._folder.writes.write("summary", lambda: self._folder.write_summary(self._summary(reason, cut_short)))
         if not cut_short:
             self._folder.writes.confirm()
+            self._complete = True
 
     def continues(self) -> str:
         """One line that says where a resumed run continues, and how many updates are lost."""
@@ -147,13 +149,16 @@ class RunFiles:
         return line
 
     def saved(self, *, elsewhere: bool) -> str:
-        """One line that says how much is saved, and how to resume the run; empty if nothing has been learned yet.
+        """One line that says how much is saved, and how to resume the run unless it is complete; empty if nothing has been
+        learned yet.
 
         For `elsewhere`, see `resume_command`. A run whose environment was passed as a function can continue only in Python.
         """
         if not self._state.version:
             return ""
         folder = self._folder.shown
+        if self._complete:
+            return f"the run is complete: {folder}"
         if self._saved_env_steps is None:
             return f"no checkpoint could be written to {shlex.quote(str(folder))}"
         newest = f"{self._saved_env_steps:,} env steps are saved"
