@@ -160,7 +160,7 @@ def quickest(rows: Sequence[Row]) -> list[tuple[Program | None, float]]:
         best = min(rows, key=lambda row: row.median(step_s), default=None)
         if best is None or best.median(step_s) == math.inf:
             continue
-        sure = best.median(step_s) <= min(row.least(step_s) for row in rows)
+        sure = all(best.median(step_s) <= row.least(step_s) for row in rows if row is not best)
         program = best.program if sure else None
         if not found or found[-1][0] != program:
             found.append((program, step_s))
