@@ -29,6 +29,7 @@ import torch
 
 from millrace.learner.algorithms.replay.episode_paths import NO_SLOT, EpisodePaths
 from millrace.learner.algorithms.replay.hindsight import Goals, Hindsight
+from millrace.learner.algorithms.replay.priorities import Priorities
 from millrace.learner.algorithms.replay.rewinding import Remembered, Rewinding
 from millrace.learner.algorithms.replay.shared_channels import SharedChannels
 from millrace.learner.algorithms.replay.sum_tree import SumTree
@@ -40,7 +41,6 @@ from millrace.protocol.random_streams import Purpose, generator
 from millrace.protocol.rollout import Batch
 from millrace.protocol.specs import ActionSpec, Leaf
 
-PRIORITY_OFFSET = 1e-6  # added to each error, so that every transition can be drawn again
 DRAWN_AT_ONCE = 1 << 20  # transitions are drawn together up to this many bytes, so that they stay in the cache
 DISCRETE = ActionSpec("discrete", (), "int64")
 
@@ -167,7 +167,6 @@ class ReplayBuffer(Rewinding[Overwritten]):
         self._transition_bytes = 2 * self._content.bytes // size  # a drawn transition has two observations
         self._n_step = n_step
         self._gamma = gamma
-        self._alpha = alpha
         self._seed = seed
         self.generator = generator(seed, self._purpose)  # the source of random numbers for all samples
         self._obs = tuple(self._room(leaf) for leaf in observation)
@@ -178,10 +177,9 @@ class ReplayBuffer(Rewinding[Overwritten]):
         self._terminated: Bools = self._row["terminated"]
         self._follows: Ints = self._row["follows"]  # slot of the next observation; its own slot if that is not stored
         self._is_row: Bools = self._row["is_row"]
-        self._tree = None if alpha is None else SumTree(size)
+        self._priorities = None if alpha is None else Priorities(size, alpha)
         self._hindsight = hindsight
         self._paths = None if hindsight is None else EpisodePaths(size)
-        self._highest = 1.0  # the highest priority so far, which new transitions get
         self._written = 0  # number of slots ever written; modulo the size, it is the next slot
         self._rows = 0
         self._remembered: Remembered | None = None
@@ -247,8 +245,8 @@ class ReplayBuffer(Rewinding[Overwritten]):
         self._keep(slot[0][continues], ())
         self._rows -= int(np.count_nonzero(self._is_row[new]))
         self._is_row[new] = False
-        if self._tree is not None:
-            self._tree.set(new, 0.0)
+        if self._priorities is not None:
+            self._priorities.tree.set(new, 0.0)
         if self._paths is not None:
             before = np.full(needed.shape, NO_SLOT)  # [T+1, N] slot of the row that led to each observation
             before[1:][valid] = slot[:-1][valid]
@@ -263,8 +261,8 @@ class ReplayBuffer(Rewinding[Overwritten]):
         self._follows[rows] = np.where(leads[valid], slot[1:][valid], rows)
         self._is_row[rows] = True
         self._rows += len(rows)
-        if self._tree is not None and self._alpha is not None:
-            self._tree.set(rows, self._highest**self._alpha)
+        if self._priorities is not None:
+            self._priorities.add(rows)
         self._newest[lane] = np.where(goes_on[-1], written[-1], NO_SLOT)
 
     def _make_mask(self, choices: int) -> None:
@@ -309,7 +307,12 @@ class ReplayBuffer(Rewinding[Overwritten]):
 
         `beta` sets how far importance weights correct for the priorities: 1 corrects fully.
         """
-        slots, row, weight = self._uniform(count) if self._tree is None else self._by_priority(self._tree, count, beta)
+        if self._priorities is None:
+            slots, row = self._uniform(count)
+            weight = np.ones(count, np.float32)
+        else:
+            slots, weight = self._priorities.draw(self.generator, count, self._rows, beta)
+            row = self._row[slots]
         goals = None if self._hindsight is None else self._other_goals(self._hindsight.share, slots)
         reward, discount, last = self._follow(row, goals)
         return Sample(
@@ -349,16 +352,12 @@ class ReplayBuffer(Rewinding[Overwritten]):
             drawn = self.sample(these * count, beta)
             yield from (drawn.part(slice(i * count, (i + 1) * count)) for i in range(these))
 
-    def _uniform(self, count: int) -> tuple[Ints, Array, Floats]:
+    def _uniform(self, count: int) -> tuple[Ints, Array]:
         used = min(self._written, self.size)
         slots = self.generator.integers(0, used, count)
         while not (found := (row := self._row[slots])["is_row"]).all():  # few rounds, because half of the slots have a row
             slots[~found] = self.generator.integers(0, used, np.count_nonzero(~found))
-        return slots, row, np.ones(count, np.float32)
-
-    def _by_priority(self, tree: SumTree, count: int, beta: float) -> tuple[Ints, Array, Floats]:
-        slots, weight = tree.draw_weighted(self.generator, count, self._rows, beta)
-        return slots, self._row[slots], weight
+        return slots, row
 
     def _follow(self, row: Array, goals: Goals | None) -> tuple[Doubles, Doubles, Ints]:
         """Follow each row for up to `n_step` steps. Returns the discounted reward, γᵏ (0 if terminated) and the last slot.
@@ -394,16 +393,13 @@ class ReplayBuffer(Rewinding[Overwritten]):
     @property
     def prioritized(self) -> bool:
         """Whether transitions are drawn by priority."""
-        return self._tree is not None
+        return self._priorities is not None
 
     def update_priorities(self, slots: Ints, error: Floats) -> None:
         """Set the priorities of the transitions in these slots [B] from their errors [B]. Call it before the next `add`."""
-        if self._tree is None or self._alpha is None:
-            return
-        priority = np.abs(error).astype(np.float64) + PRIORITY_OFFSET
-        self._highest = max(self._highest, float(priority.max()))
-        self._keep(slots, ())
-        self._tree.set(slots, priority**self._alpha)
+        if self._priorities is not None:
+            self._keep(slots, ())
+            self._priorities.update(slots, np.abs(error).astype(np.float64))
 
     # ---------------------------------------------------------------- rolling back
 
@@ -416,8 +412,8 @@ class ReplayBuffer(Rewinding[Overwritten]):
         self._row[old.slots] = old.rows
         for leaf, before in zip(self._per_observation(), old.leaves, strict=False):
             leaf[old.slots] = before
-        if self._tree is not None and old.weights is not None:
-            self._tree.set(old.slots, old.weights)
+        if self._priorities is not None and old.weights is not None:
+            self._priorities.tree.set(old.slots, old.weights)
 
     def _find_paths(self) -> None:
         """Recompute the paths of the stored rows. Called after anything other than `add` has changed these rows."""
@@ -429,7 +425,7 @@ class ReplayBuffer(Rewinding[Overwritten]):
     def _keep(self, slots: Ints, leaves: Sequence[Array | SharedChannels]) -> None:
         """If `remember` was called, save the contents of these slots, which are about to be overwritten."""
         if self._remembered is not None and len(slots):
-            weights = None if self._tree is None else self._tree.weights[slots]
+            weights = None if self._priorities is None else self._priorities.tree.weights[slots]
             self._overwritten.append(Overwritten(slots, self._row[slots], weights, tuple(leaf[slots] for leaf in leaves)))
 
     # ---------------------------------------------------------------- saving
@@ -437,7 +433,7 @@ class ReplayBuffer(Rewinding[Overwritten]):
     def _arrays(self) -> dict[str, Array]:
         """All arrays with one entry for each slot, by name."""
         own = {name: getattr(self, f"_{name}") for name in ("action", "reward", "terminated", "follows", "is_row")}
-        tree = {} if self._tree is None else {"weight": self._tree.weights}
+        tree = {} if self._priorities is None else {"weight": self._priorities.tree.weights}
         masks = {} if self._mask is None else {"mask": self._mask}
         leaves = {f"obs{i}": leaf for i, leaf in enumerate(self._obs) if not isinstance(leaf, SharedChannels)}
         return leaves | masks | own | tree
@@ -463,7 +459,6 @@ class ReplayBuffer(Rewinding[Overwritten]):
         if state["size"] != self.size:
             raise ValueError(f"replay_size: expected {state['size']}, got {self.size}")
         self._written = state["written"]
-        self._highest = state["highest"]
         used = min(self._written, self.size)
         self._is_row[used:] = False
         if "mask" in state["arrays"]:
@@ -475,9 +470,8 @@ class ReplayBuffer(Rewinding[Overwritten]):
         for name, array in self._arrays().items():
             if name != "weight":
                 array[:used] = state["arrays"][name].numpy()
-        if self._tree is not None:
-            self._tree.set(np.arange(self.size), 0.0)
-            self._tree.set(np.arange(used), state["arrays"]["weight"].numpy())
+        if self._priorities is not None:
+            self._priorities.load(state["arrays"]["weight"].numpy(), state["highest"])
         self._rows = int(np.count_nonzero(self._is_row))
         self._newest = {int(lane): written.numpy().copy() for lane, written in state["newest"].items()}
         self._find_paths()

@@ -11,6 +11,7 @@ from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
+from millrace.learner.algorithms.replay.priorities import Priorities
 from millrace.protocol.arrays import Ints
 
 KeptT = TypeVar("KeptT")
@@ -32,11 +33,17 @@ class Rewinding(ABC, Generic[KeptT]):
     generator: np.random.Generator
     _written: int
     _rows: int
-    _highest: float
+    _priorities: Priorities | None
+    """None if the buffer draws uniformly"""
     _newest: dict[int, Ints]
     _remembered: Remembered | None
     _overwritten: list[KeptT]
     """the contents saved since `remember`, oldest first"""
+
+    @property
+    def _highest(self) -> float:
+        """The highest priority so far; 1 without priorities."""
+        return 1.0 if self._priorities is None else self._priorities.highest
 
     def remember(self) -> None:
         """Remember the current state, for `roll_back`. From then on, slots are saved before they are written."""
@@ -51,7 +58,8 @@ class Rewinding(ABC, Generic[KeptT]):
         assert remembered is not None, "nothing was remembered"
         self._written = remembered.written
         self._rows = remembered.rows
-        self._highest = remembered.highest
+        if self._priorities is not None:
+            self._priorities.highest = remembered.highest
         self._newest = dict(remembered.newest)
         self.generator.bit_generator.state = remembered.generator
         for old in reversed(self._overwritten):

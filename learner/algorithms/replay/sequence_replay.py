@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from millrace.learner.algorithms.replay.replay_buffer import PRIORITY_OFFSET
+from millrace.learner.algorithms.replay.priorities import Priorities
 from millrace.learner.algorithms.replay.rewinding import Remembered, Rewinding
 from millrace.learner.algorithms.replay.sum_tree import SumTree
 from millrace.learner.algorithms.returns import EpisodeEnds, n_step_returns
@@ -85,7 +85,7 @@ class SequenceReplay(Rewinding[ReplacedSequences]):
         self._steps = steps
         self._n_step = n_step
         self._gamma = gamma
-        self._alpha = alpha
+        self.prioritized = alpha is not None  # whether sequences are drawn by priority
         T = steps
         shapes: dict[str, tuple[tuple[int, ...], Any]] = {
             f"obs{i}": ((T + 1, *leaf.shape), leaf.dtype) for i, leaf in enumerate(policy.observation)
@@ -107,8 +107,7 @@ class SequenceReplay(Rewinding[ReplacedSequences]):
         """Arrays with one entry for each slot, by name. `begins` is True where obs[t+1] begins an episode. `before` is the
         number of the previous sequence; sequences are numbered in the order in which they were written."""
         self.generator = generator(seed, Purpose.REPLAY)  # the source of random numbers for all samples
-        self._tree = None if alpha is None else SumTree(self.size)
-        self._highest = 1.0  # the highest priority so far, which new sequences get
+        self._priorities = None if alpha is None else Priorities(self.size, alpha)
         self._written = 0  # number of sequences ever written; modulo the size, it is the next slot
         self._rows = 0
         self._newest: dict[int, Ints] = {}  # by lane, [columns] the number of each column's newest sequence
@@ -123,12 +122,7 @@ class SequenceReplay(Rewinding[ReplacedSequences]):
     def bytes(self) -> int:
         """Memory of all slots, in bytes."""
         slot: int = sum(math.prod(shape) * np.dtype(dtype).itemsize for shape, dtype in self._shapes.values())
-        return self.size * slot + (0 if self._alpha is None else SumTree.memory_bytes(self.size))
-
-    @property
-    def prioritized(self) -> bool:
-        """Whether sequences are drawn by priority."""
-        return self._tree is not None
+        return self.size * slot + (SumTree.memory_bytes(self.size) if self.prioritized else 0)
 
     def _check_memory(self) -> None:
         free = available_bytes()
@@ -175,8 +169,8 @@ class SequenceReplay(Rewinding[ReplacedSequences]):
         self._rows += int(np.count_nonzero(arrays["valid"])) - int(np.count_nonzero(self.arrays["valid"][slots]))
         for name, array in arrays.items():
             self.arrays[name][slots] = array[used]
-        if self._tree is not None and self._alpha is not None:
-            self._tree.set(slots, self._highest**self._alpha)
+        if self._priorities is not None:
+            self._priorities.add(slots)
         self._written += len(used)
         # A seat that waited throughout this rollout gets no sequence, and its next rollout continues its previous sequence.
         waits = ~arrays["begins"].any(1)
@@ -215,11 +209,12 @@ class SequenceReplay(Rewinding[ReplacedSequences]):
         For `beta`, see `ReplayBuffer`.
         """
         sequences = max(FEWEST, count // self._steps)
-        if self._tree is None:
-            slots = self.generator.integers(0, min(self._written, self.size), sequences)
+        used = min(self._written, self.size)
+        if self._priorities is None:
+            slots = self.generator.integers(0, used, sequences)
             weight = np.ones(sequences, np.float32)
         else:
-            slots, weight = self._tree.draw_weighted(self.generator, sequences, min(self._written, self.size), beta)
+            slots, weight = self._priorities.draw(self.generator, sequences, used, beta)
         return self._drawn(slots, weight)
 
     def _drawn(self, slots: Ints, weight: Floats) -> SequenceSample:
@@ -256,30 +251,28 @@ class SequenceReplay(Rewinding[ReplacedSequences]):
 
     def update_priorities(self, slots: Ints, error: Floats) -> None:
         """Set the priorities of sequences from the errors [B] of their rows. `slots` [B] are the rows' slots."""
-        if self._tree is None or self._alpha is None:
+        if self._priorities is None:
             return
         sequences, of_row = np.unique(slots, return_inverse=True)
         size = np.abs(error).astype(np.float64)
         highest = np.zeros(len(sequences))
         np.maximum.at(highest, of_row, size)
         mean = np.bincount(of_row, size) / np.bincount(of_row)
-        priority = HIGHEST_SHARE * highest + (1 - HIGHEST_SHARE) * mean + PRIORITY_OFFSET
-        self._highest = max(self._highest, float(priority.max()))
         self._keep(sequences)
-        self._tree.set(sequences, priority**self._alpha)
+        self._priorities.update(sequences, HIGHEST_SHARE * highest + (1 - HIGHEST_SHARE) * mean)
 
     # ---------------------------------------------------------------- rolling back
 
     def _put_back(self, old: ReplacedSequences) -> None:
         for name, array in old.arrays.items():
             self.arrays[name][old.slots] = array
-        if self._tree is not None and old.weights is not None:
-            self._tree.set(old.slots, old.weights)
+        if self._priorities is not None and old.weights is not None:
+            self._priorities.tree.set(old.slots, old.weights)
 
     def _keep(self, slots: Ints, *, all_arrays: bool = False) -> None:
         """If `remember` was called, save the contents of these slots, which are about to be overwritten."""
         if self._remembered is not None and len(slots):
-            weights = None if self._tree is None else self._tree.weights[slots]
+            weights = None if self._priorities is None else self._priorities.tree.weights[slots]
             arrays = {name: array[slots] for name, array in self.arrays.items()} if all_arrays else {}
             self._overwritten.append(ReplacedSequences(slots, arrays, weights))
 
@@ -288,7 +281,7 @@ class SequenceReplay(Rewinding[ReplacedSequences]):
     def state_dict(self) -> dict[str, Any]:
         """A copy of the slots in use, as tensors and plain data."""
         used = min(self._written, self.size)
-        weights = {} if self._tree is None else {"weight": torch.tensor(self._tree.weights[:used])}
+        weights = {} if self._priorities is None else {"weight": torch.tensor(self._priorities.tree.weights[:used])}
         return {
             "size": self.size,
             "steps": self._steps,
@@ -308,18 +301,15 @@ class SequenceReplay(Rewinding[ReplacedSequences]):
             if expected != got:
                 raise ValueError(f"{name}: expected {expected}, got {got}")
         self._written = state["written"]
-        self._highest = state["highest"]
         used = min(self._written, self.size)
-        arrays = dict(state["arrays"])
-        weights = arrays.pop("weight", None)
+        arrays = state["arrays"]
         if "mask" in arrays and "mask" not in self.arrays:
             self._make_mask(arrays["mask"].shape[-1])
         for name, array in self.arrays.items():
             array[:used] = arrays[name].numpy()
         self.arrays["valid"][used:] = False
-        if self._tree is not None and weights is not None:
-            self._tree.set(np.arange(self.size), 0.0)
-            self._tree.set(np.arange(used), weights.numpy())
+        if self._priorities is not None and "weight" in arrays:
+            self._priorities.load(arrays["weight"].numpy(), state["highest"])
         self._rows = int(np.count_nonzero(self.arrays["valid"]))
         self._newest = {int(lane): numbers.numpy().copy() for lane, numbers in state["newest"].items()}
         self.generator.bit_generator.state = state["generator"]

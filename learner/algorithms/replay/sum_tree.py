@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from millrace.protocol.arrays import Doubles, Floats, Ints
+from millrace.protocol.arrays import Doubles, Ints
 
 
 class SumTree:
@@ -71,14 +71,3 @@ class SumTree:
     def draw(self, generator: np.random.Generator, count: int) -> Ints:
         """Draw `count` indices in proportion to their weights, one from each of `count` equal segments of the sum."""
         return self.find((np.arange(count) + generator.random(count)) * (self.total / count))
-
-    def draw_weighted(self, generator: np.random.Generator, count: int, entries: int, beta: float) -> tuple[Ints, Floats]:
-        """Draw `count` indices as `draw` does. Returns them and their importance-sampling weights [count].
-
-        `entries` is the number of indices that have a weight. P(i) = pᵢ^α / Σ p^α;  wᵢ = (entries · P(i))^−β, divided by the
-        largest w in the sample (Schaul et al. 2016, section 3.4).
-        """
-        index = self.draw(generator, count)
-        chance = self.weights[index] / self.total
-        weight = (entries * chance) ** -beta
-        return index, (weight / weight.max()).astype(np.float32)

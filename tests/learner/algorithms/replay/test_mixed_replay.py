@@ -78,12 +78,13 @@ def test_a_prior_row_leads_to_its_own_next_observation() -> None:
 def test_errors_of_prior_transitions_change_no_priority() -> None:
     made, _ = mixed(alpha=1.0)
     drawn = made.sample(40)
-    assert made._tree is not None
-    before = made._tree.weights.copy()
+    assert made._priorities is not None
+    weights = made._priorities.tree.weights  # a view
+    before = weights.copy()
     error = np.where(drawn.slots == PRIOR_SLOT, 1e6, 1.0).astype(np.float32)
     made.update_priorities(drawn.slots, error)
-    assert made._tree.weights.max() < 2
-    changed = np.flatnonzero(made._tree.weights != before)
+    assert weights.max() < 2
+    changed = np.flatnonzero(weights != before)
     assert set(changed) <= set(drawn.slots[drawn.slots != PRIOR_SLOT])
 
 

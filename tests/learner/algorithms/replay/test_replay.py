@@ -464,7 +464,7 @@ def test_the_memory_that_is_foretold_is_what_it_takes(alpha: float | None) -> No
     observation = (Leaf("", "box", (84, 84, 4), "uint8", divisor=255), Leaf("n", "discrete", (), "int64", (3,), (0,)))
     kept = ReplayBuffer(observation, size=50, n_step=1, gamma=GAMMA, seed=0, alpha=alpha)
     arrays = kept._row.nbytes + sum(leaf.nbytes for leaf in kept._obs)
-    tree = 0 if kept._tree is None else kept._tree._nodes.nbytes
+    tree = 0 if kept._priorities is None else kept._priorities.tree._nodes.nbytes
     assert kept.bytes == Content(observation, 50, alpha is not None).bytes == arrays + tree
 
 

@@ -212,8 +212,8 @@ def test_what_is_new_gets_the_highest_priority_ever_seen() -> None:
     given.into.update_priorities(np.array([0]), np.array([9.0], np.float32))
     given.into.update_priorities(np.array([0]), np.array([0.5], np.float32))
     given.into.add(given.use(0))
-    assert given.into._tree is not None
-    assert given.into._tree.weights[given.into._written - 1] == pytest.approx(9, rel=1e-5)
+    assert given.into._priorities is not None
+    assert given.into._priorities.tree.weights[given.into._written - 1] == pytest.approx(9, rel=1e-5)
 
 
 def equal(a: dict[str, Any], b: dict[str, Any]) -> bool:
