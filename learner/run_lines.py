@@ -16,11 +16,11 @@ from typing import Literal, NamedTuple
 from millrace.learner.config.presets import environment_name
 from millrace.learner.run_folder.last_line import resume_command
 from millrace.learner.run_folder.lease import Owner
+from millrace.learner.run_folder.living_owner import living_owner
 from millrace.learner.run_folder.progress_file import last_progress
 from millrace.learner.run_folder.regular_files import reason
 from millrace.learner.run_folder.results import ALL_STEPS_DONE, Summary, read_summary
 from millrace.learner.run_folder.run_format import RUN_FILE, check_format, is_run_folder, read_config
-from millrace.learner.run_folder.run_lock import living_owner
 from millrace.learner.run_folder.sentences import (
     duration,
     ending,

@@ -5,7 +5,7 @@ releases it when the process dies, however it dies. Machines that share the fold
 may still see the lock of a machine that died. Therefore, the owner also rewrites the file every few seconds (`lease.py`); an
 owner on another machine that stops doing so counts as dead. The lock of a dead owner is taken over. An owner that finds the
 file missing recreates it, unless it hasn't rewritten the file for so long that another process may have taken over the run
-and ended since. Commands that only read a run folder don't need the lock.
+and ended since. Commands that only read a run folder don't need the lock (`living_owner.py`).
 """
 
 from __future__ import annotations
@@ -13,8 +13,6 @@ from __future__ import annotations
 import fcntl
 import logging
 import os
-import secrets
-import socket
 import threading
 import time
 from collections.abc import Callable
@@ -27,17 +25,14 @@ from typing import NamedTuple, Self
 from msgspec.structs import replace
 
 from millrace.learner.run_folder.atomic_write import TEMPORARY
-from millrace.learner.run_folder.lease import WIDTH, LeaseWatch, Listens, Owner, Unreachable, Verdict, decoded
-from millrace.learner.run_folder.regular_files import open_regular, read, reason
-from millrace.protocol.address import is_local
+from millrace.learner.run_folder.lease import LeaseWatch, Listens, Owner, Unreachable, Verdict, decoded
+from millrace.learner.run_folder.owner_process import is_gone, new_owner
+from millrace.learner.run_folder.regular_files import open_regular, read
 from millrace.protocol.errors import RunError, RunTakenOver, UsageError
 
 log = logging.getLogger("millrace.learner")
 
 LOCK_FILE = "run.lock"
-BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
-NETWORK = Path("/proc/self/ns/net")
-NUMBERS = Path("/proc/self/ns/pid")
 
 
 class SystemLock(Enum):
@@ -59,12 +54,6 @@ class Pace(NamedTuple):
 
 
 PACE = Pace()
-WHY_UNREACHABLE = {
-    Unreachable.INPROC: "with --transport inproc it listens in its own process only; run it with --transport ipc",
-    Unreachable.KEYS_OF_THE_RUN: (
-        "with --transport tcp and --keys, the keys of its local workers are not in any file; run it with --transport ipc"
-    ),
-}
 JOIN_S = 5.0  # how long to wait for the thread at the end, because a file system that doesn't answer must not block the end
 
 
@@ -85,14 +74,7 @@ class RunLock:
         self._clock = clock
         self._sleep = sleep
         self._wall_clock = wall_clock
-        self._owner = Owner(
-            host=socket.gethostname(),
-            pid=os.getpid(),
-            boot_id=_boot(),
-            token=secrets.token_hex(8),
-            network_namespace=_namespace(NETWORK),
-            pid_namespace=_namespace(NUMBERS),
-        )
+        self._owner = new_owner()
         self._file = -1
         self._seen_s = 0.0  # wall-clock time of the last look at the file that showed that the run is still ours
         self._lost = ""  # why the run is no longer ours
@@ -248,7 +230,7 @@ class RunLock:
                     return
 
     def _refusal(self, owner: Owner | None) -> UsageError:
-        if owner is not None and _is_gone(owner):  # any process that can read the file can lock it
+        if owner is not None and is_gone(owner):  # any process that can read the file can lock it
             return UsageError(
                 f"run {self._folder}: {owner}, which trained it, is gone, but another process has locked "
                 f"{self._path}; end that process (`lslocks` shows it) or delete the file, then resume"
@@ -326,89 +308,3 @@ class RunLock:
         if self._file >= 0:
             os.close(self._file)
             self._file = -1
-
-
-class LearnerOfRun(NamedTuple):
-    """Where this machine can ask the learner of a run."""
-
-    address: str
-    keys: Path | None
-    """The learner's key folder, which may be on another machine; None if no key is needed."""
-    is_here: bool
-    """Whether the learner is on this machine and in this network. If so, `address` is its own address."""
-
-
-def learner_of_run(folder: Path) -> LearnerOfRun:
-    """Where the learner that now trains the run in this folder listens.
-
-    Raises `UsageError`, with a one-line message, if no learner trains the run, or if the learner cannot be asked from this
-    machine.
-    """
-    owner = living_owner(folder, time.time())
-    if not owner.address:
-        why = "it has not begun yet; try again" if owner.unreachable is None else WHY_UNREACHABLE[owner.unreachable]
-        raise UsageError(f"run {folder}: {owner} trains it and cannot be asked: {why}")
-    here = owner.boot_id == _boot() and (
-        not owner.address.startswith("tcp://") or owner.network_namespace == _namespace(NETWORK)
-    )
-    if not here and is_local(owner.address):
-        raise UsageError(f"run {folder}: {owner} trains it, and only that machine can reach it; ask there")
-    return LearnerOfRun(owner.here if here else owner.address, Path(owner.keys) if owner.keys else None, here)
-
-
-def living_owner(folder: Path, now: float) -> Owner:
-    """The process that seems to train the run in this folder, for display. `now` is wall-clock time.
-
-    A process on this machine is looked up by its process number. Any other, such as one in a container, counts as alive if
-    it rewrote the file in the last few seconds. If the clocks of two machines differ by much, the answer is wrong, so no
-    write depends on it. Raises `UsageError`, with a one-line message, if no process seems to train the run.
-    """
-    path = folder / LOCK_FILE
-    try:
-        owner = decoded(read(path, WIDTH))
-        age_s = now - path.lstat().st_mtime
-    except FileNotFoundError:
-        raise UsageError(f"run {folder}: {'no process trains it now' if folder.is_dir() else 'no such folder'}") from None
-    except OSError as error:
-        raise UsageError(f"run {folder}: {LOCK_FILE} cannot be read: {reason(error)}") from error
-    if owner is None:
-        raise UsageError(f"run {folder}: {LOCK_FILE} names no process; it is being written, or damaged: try again")
-    if _is_gone(owner) or (not _has_our_numbers(owner) and age_s >= PACE.dead_after):
-        raise UsageError(f"run {folder}: no process trains it now; {owner} did, and is gone")
-    return owner
-
-
-def _is_gone(owner: Owner) -> bool:
-    """Whether the owner's process has ended. False if that cannot be known."""
-    return _has_our_numbers(owner) and not _is_alive(owner.pid)
-
-
-def _has_our_numbers(owner: Owner) -> bool:
-    """Whether this process can look up the owner's process number, because both are in one container of one machine."""
-    return owner.boot_id == _boot() and owner.pid_namespace == _namespace(NUMBERS)
-
-
-def _is_alive(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:  # the process belongs to another user
-        return True
-    return True
-
-
-def _boot() -> str:
-    """The boot id of the running kernel; the host's name if that cannot be read."""
-    try:
-        return BOOT_ID.read_text().strip()
-    except OSError:
-        return f"host {socket.gethostname()}"
-
-
-def _namespace(kind: Path) -> str:
-    """The namespace of this kind to which this process belongs; empty if it is not known."""
-    try:
-        return os.readlink(kind)
-    except OSError:
-        return ""

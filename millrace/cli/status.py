@@ -23,9 +23,9 @@ from msgspec import Meta
 from millrace.flags.fields import Flag
 from millrace.flags.parse import parse_flags
 from millrace.learner.members.held_up import in_words
+from millrace.learner.run_folder.living_owner import learner_of_run
 from millrace.learner.run_folder.regular_files import read, reason
 from millrace.learner.run_folder.run_format import MOST_CONFIG_BYTES, is_run_folder, parse_toml
-from millrace.learner.run_folder.run_lock import learner_of_run
 from millrace.learner.run_folder.sentences import (
     bottleneck,
     lag_in_words,

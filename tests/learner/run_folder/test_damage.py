@@ -42,12 +42,13 @@ from millrace.learner.env_spaces import EnvSpaces
 from millrace.learner.resume_checks import naming_run, unless_finished
 from millrace.learner.run_folder.json_log import kept_log
 from millrace.learner.run_folder.lease import Owner
+from millrace.learner.run_folder.living_owner import learner_of_run
 from millrace.learner.run_folder.metrics_log import MetricsLog
 from millrace.learner.run_folder.newest_run import newest_run
 from millrace.learner.run_folder.progress_file import last_progress
 from millrace.learner.run_folder.run_folder import RunFolder
 from millrace.learner.run_folder.run_format import END, HEAD
-from millrace.learner.run_folder.run_lock import LOCK_FILE, Pace, RunLock, learner_of_run
+from millrace.learner.run_folder.run_lock import LOCK_FILE, Pace, RunLock
 from millrace.learner.run_folder.sentences import bottleneck, lag_in_words, went_wrong
 from millrace.learner.run_lines import RunLine, headline, in_sentences
 from millrace.learner.run_spec import run_spec

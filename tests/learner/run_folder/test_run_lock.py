@@ -18,7 +18,8 @@ import pytest
 from msgspec.structs import replace
 
 from millrace.learner.run_folder.lease import WIDTH, LeaseWatch, Listens, Owner, Unreachable, Verdict, decoded
-from millrace.learner.run_folder.run_lock import LOCK_FILE, LearnerOfRun, Pace, RunLock, learner_of_run, living_owner
+from millrace.learner.run_folder.living_owner import LearnerOfRun, learner_of_run, living_owner
+from millrace.learner.run_folder.run_lock import LOCK_FILE, Pace, RunLock
 from millrace.protocol.errors import RunError, RunTakenOver, UsageError
 
 ELSEWHERE = Owner(host="far", pid=77, boot_id="another kernel", token="theirs")
