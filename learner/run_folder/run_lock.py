@@ -43,6 +43,30 @@ class SystemLock(Enum):
     NOBODYS = "nobody, because the file system has no locks"
 
 
+class Claim(Enum):
+    """How a process that wants the lock may get it."""
+
+    REFUSED = "another process has it"
+    NEW = "nobody had it"
+    AT_ONCE = "its owner is dead"
+    AFTER_WAIT = "it is not known whether its owner is alive"
+
+
+def claim(locked: SystemLock, owner: Owner | None, boot_id: str, *, made: bool) -> Claim:
+    """How this process may get the lock. `owner` is the owner that the file names, and `boot_id` is this machine's boot id.
+
+    `made` is True if this process has created the file.
+    """
+    here = owner is not None and owner.boot_id == boot_id
+    if locked is SystemLock.OTHERS and (here or owner is None):
+        return Claim.REFUSED
+    if made:
+        return Claim.NEW
+    if locked is SystemLock.OURS and here:
+        return Claim.AT_ONCE  # because the kernel has released the system's lock of the owner, which is dead
+    return Claim.AFTER_WAIT
+
+
 class Pace(NamedTuple):
     """How often an owner rewrites its lock, and how long an observer waits for that, in seconds."""
 
@@ -158,25 +182,25 @@ class RunLock:
         if not self._is_open_file():
             return False
         owner = decoded(self._read_open_file())
-        here = owner is not None and owner.boot_id == self._owner.boot_id
-        if locked is SystemLock.OTHERS and (here or owner is None):
-            raise self._refusal(owner)
-        if made:
-            self._write()
-            return True
-        elsewhere = not here or locked is SystemLock.NOBODYS
-        if elsewhere:
-            self._wait_until_dead(owner)
-            if not self._is_open_file():
-                return False
-        if locked is SystemLock.OTHERS:
-            self._replace_file()
-        else:
-            self._write()
-        if elsewhere:
-            self._sleep(self._pace.confirm_after)
-            if not self._is_ours():
-                raise self._refusal(decoded(self._read_open_file()))
+        match claim(locked, owner, self._owner.boot_id, made=made):
+            case Claim.REFUSED:
+                raise self._refusal(owner)
+            case Claim.NEW:
+                self._write()
+                return True
+            case Claim.AT_ONCE:
+                self._write()
+            case Claim.AFTER_WAIT:
+                self._wait_until_dead(owner)
+                if not self._is_open_file():
+                    return False
+                if locked is SystemLock.OTHERS:
+                    self._replace_file()
+                else:
+                    self._write()
+                self._sleep(self._pace.confirm_after)
+                if not self._is_ours():
+                    raise self._refusal(decoded(self._read_open_file()))
         log.warning("run %s: %s held its lock and is gone; this process takes over", self._folder, owner or "a process")
         return True
 

@@ -19,7 +19,7 @@ from msgspec.structs import replace
 
 from millrace.learner.run_folder.lease import WIDTH, LeaseWatch, Listens, Owner, Unreachable, Verdict, decoded
 from millrace.learner.run_folder.living_owner import LearnerOfRun, learner_of_run, living_owner
-from millrace.learner.run_folder.run_lock import LOCK_FILE, Pace, RunLock
+from millrace.learner.run_folder.run_lock import LOCK_FILE, Claim, Pace, RunLock, SystemLock, claim
 from millrace.protocol.errors import RunError, RunTakenOver, UsageError
 
 ELSEWHERE = Owner(host="far", pid=77, boot_id="another kernel", token="theirs")
@@ -77,6 +77,22 @@ def test_an_observer_judges_by_its_own_clock() -> None:
         assert watch.judge(b"1", began + 30.0) is Verdict.DEAD
         assert watch.judge(b"2", began + 31.0) is Verdict.ALIVE
         assert watch.judge(b"", began + 1.0) is Verdict.ALIVE
+
+
+@pytest.mark.parametrize(
+    ("locked", "owners"),
+    [
+        (SystemLock.OURS, {"here": Claim.AT_ONCE, "far": Claim.AFTER_WAIT, "unknown": Claim.AFTER_WAIT}),
+        (SystemLock.OTHERS, {"here": Claim.REFUSED, "far": Claim.AFTER_WAIT, "unknown": Claim.REFUSED}),
+        (SystemLock.NOBODYS, {"here": Claim.AFTER_WAIT, "far": Claim.AFTER_WAIT, "unknown": Claim.AFTER_WAIT}),
+    ],
+)
+def test_only_the_system_s_lock_of_this_machine_decides_at_once(locked: SystemLock, owners: dict[str, Claim]) -> None:
+    """A file that this process has just made is its own, unless another process on this machine locked it first."""
+    for boot_id, expected in owners.items():
+        owner = None if boot_id == "unknown" else replace(ELSEWHERE, boot_id=boot_id)
+        assert claim(locked, owner, "here", made=False) is expected
+        assert claim(locked, owner, "here", made=True) is (Claim.REFUSED if expected is Claim.REFUSED else Claim.NEW)
 
 
 def test_every_rewrite_replaces_the_whole() -> None:
