@@ -72,19 +72,12 @@ class Tally:
         return {} if self.pool is None else self.pool.metrics()
 
     def stop_reason(self) -> str | None:
-        """Why the run should end now; None if it should continue.
-
-        If training has ended, the reason comes from the returns with which it ended. If the run was resumed with settings
-        for which these returns give no reason to stop, the current returns decide.
-        """
-        ended_with = self.state.ended_with
-        return self._ended_by() or (ended_with and self._reason(ended_with)) or self._reason(self._returns())
+        """Why the run should end now; None if it should continue."""
+        return self._ended_by() or self._reason(self._deciding())
 
     def training_ended(self) -> None:
         """Record the returns with which training ended, so that later evaluations don't change why it ended."""
-        ended_with = self.state.ended_with
-        if ended_with is None or self._reason(ended_with) is None:
-            self.state.ended_with = self._returns()
+        self.state.ended_with = self._deciding()
 
     def decided_by_evaluation(self) -> DecidingReturns | None:
         """The returns with which the run ends, if it ends because of an evaluation; otherwise None.
@@ -145,8 +138,17 @@ class Tally:
         after_next = self.state.env_steps + self._steps_per_update if self.state.version else 0
         return reason_to_stop(self._config, returns, env_steps_after_next_update=after_next)
 
+    def _deciding(self) -> DecidingReturns:
+        """The returns that decide whether the run stops: the current ones, unless training has ended with others.
+
+        The current returns also decide if the run was resumed with settings for which the returns at the end of its training
+        give no reason to stop.
+        """
+        ended_with = self.state.ended_with
+        return self._returns() if ended_with is None or self._reason(ended_with) is None else ended_with
+
     def _returns(self) -> DecidingReturns:
-        """The current returns that decide whether the run stops."""
+        """The current returns."""
         state = self.state
         newest = state.newest_evaluation
         return DecidingReturns(

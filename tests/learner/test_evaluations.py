@@ -290,6 +290,17 @@ def test_with_a_higher_target_a_resumed_run_trains_on() -> None:
     assert tally.stop_reason() == "target return 0.5 reached by the policy of 200 env steps", "the final one"
 
 
+def test_with_a_target_that_only_the_evaluation_after_training_reached_a_resumed_run_ends() -> None:
+    state = RunState()
+    settings: dict[str, Any] = {"eval_workers": 1, "steps": 1_000_000}
+    ended(Fakes(6.0, 7.0, 5.5), state, target_return=5.0, **settings)
+    tally, _ = Fakes().evaluations(100, state, target_return=6.5, **settings)
+    assert tally.stop_reason() == "target return 6.5 reached"
+    tally.training_ended()
+    assert state.ended_with is not None
+    assert state.ended_with.evaluation == 7.0
+
+
 @pytest.mark.parametrize(("pending", "expected"), [(5, [1, 2]), (3, None)])
 def test_weights_that_are_evaluated_again_have_the_attributes_of_their_version(pending: int, expected: Any) -> None:
     """Workers take weights of one version once: those that training publishes after it are the same."""
