@@ -113,6 +113,16 @@ class Measurements(msgspec.Struct, frozen=True, kw_only=True):
         """Mean time of a step if a core is free, plus its share of a reset."""
         return self.alone.own_s + self.reset_s / self.ends_every
 
+    @property
+    def copy_bytes(self) -> int:
+        """Memory of a copy, without that of its worker; at least 1."""
+        return max(1, self.worker_bytes - WORKER_BYTES)
+
+    @property
+    def best_apart(self) -> bool:
+        """Whether each copy should have its own worker, because steps mostly wait or several copies in one worker failed."""
+        return not self.alone.computes or bool(self.failed_in_one_worker)
+
     def costs(self, workers: int) -> StepCosts:
         """The costs measured with this number of workers or the next larger one; if neither was tried, with the largest."""
         return next((each for each in self.side_by_side if each.workers >= workers), self.side_by_side[-1])

@@ -55,7 +55,7 @@ def most_each(measured: Measurements, machine: Machine) -> int:
         most = min(most, machine.most_copies // machine.cores)
     if machine.free_bytes is not None:
         room = OF_MEMORY * machine.free_bytes / machine.cores - WORKER_BYTES
-        most = min(most, int(room / _copy_bytes(measured)))
+        most = min(most, int(room / measured.copy_bytes))
     return max(1, most)
 
 
@@ -64,7 +64,7 @@ def numbers_of_workers(measured: Measurements, machine: Machine, each: int) -> I
     alone = measured.alone
     limit = max(MOST_AT_LEAST, MOST_PER_CORE * machine.cores)
     if machine.free_bytes is not None:
-        limit = min(limit, int(OF_MEMORY * machine.free_bytes / (WORKER_BYTES + each * _copy_bytes(measured))))
+        limit = min(limit, int(OF_MEMORY * machine.free_bytes / (WORKER_BYTES + each * measured.copy_bytes)))
     if machine.most_copies:
         limit = min(limit, machine.most_copies // each)
     # Try more copies than cores only if steps spend time waiting rather than computing.
@@ -75,8 +75,3 @@ def numbers_of_workers(measured: Measurements, machine: Machine, each: int) -> I
         workers *= GROWTH
     if limit > 1:
         yield limit
-
-
-def _copy_bytes(measured: Measurements) -> int:
-    """Memory of a copy in a worker."""
-    return max(1, measured.worker_bytes - WORKER_BYTES)

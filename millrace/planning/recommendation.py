@@ -158,13 +158,12 @@ def _lanes_for(workers: int, envs: int) -> int:
 
 def _numbers_of_envs(measured: Measurements, machine: Machine, learning: Learning, at_once: int) -> list[int]:
     """The numbers of env copies to consider, ascending."""
-    if not measured.alone.computes or measured.failed_in_one_worker:  # a worker for each copy
+    if measured.best_apart:
         return sorted({min(learning.envs * 2**n, at_once) for n in range(at_once.bit_length() + 1)})
     most = machine.most_copies or max(MOST_ENVS, learning.envs)
     if machine.free_bytes is not None:
-        of_copy = max(1, measured.worker_bytes - WORKER_BYTES)
         of_workers = LEARNER_BYTES + at_once * (WORKER_BYTES + learning.acting_bytes)
-        most = max(1, min(most, int((OF_MEMORY * machine.free_bytes - of_workers) / of_copy)))
+        most = max(1, min(most, int((OF_MEMORY * machine.free_bytes - of_workers) / measured.copy_bytes)))
     least = -(-learning.envs // machine.cores) * machine.cores  # rounded up to a multiple of the number of cores
     return sorted({min(least * 2**n, most) for n in range(most.bit_length() + 1)})
 
@@ -222,7 +221,7 @@ def _why_envs(sizes: Sizes, learning: Learning, situation: Situation) -> str:
     at_once = copies_at_once(measured, situation.machine, situation.overheads.acting_bytes)
     if sizes.envs == situation.machine.most_copies:
         return _at_most(situation.machine)
-    if not measured.alone.computes or measured.failed_in_one_worker:
+    if measured.best_apart:
         return at_once.why if sizes.envs == at_once.number else "more would hardly be faster, because of the updates"
     if sizes.envs > max(learning.envs, situation.machine.cores):
         return "steps are so short that a worker should step several copies at a time"

@@ -19,6 +19,7 @@ from millrace.planning.measurements import ActionKind, Machine, Overheads
 from millrace.planning.recommendation import (
     ChosenSetting,
     Learning,
+    candidates,
     choose_algorithm,
     choose_replay_size,
     copies_at_once,
@@ -40,8 +41,10 @@ def test_more_waiting_never_means_fewer_copies_or_workers(learning: Learning) ->
 
 
 def test_steps_that_wait_get_a_worker_and_a_lane_for_each_copy_that_was_tried() -> None:
-    found = chosen(situation(measured(wait_s=0.01)))
+    where = situation(measured(wait_s=0.01))
+    found = chosen(where)
     assert (found.workers, found.envs, found.lanes) == (TRIED, TRIED, TRIED)
+    assert max(each.envs for each in candidates(PPO, where.measured, where.machine)) == TRIED
 
 
 @pytest.mark.parametrize("cores", [1, 2, 5, 16])
