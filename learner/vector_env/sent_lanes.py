@@ -172,12 +172,7 @@ class SentLanes:
 
     def take(self) -> Ready:
         """Take the lanes that are ready. From now on they count as having come back."""
-        ready = Ready(dict(sorted(self._results.items())), self._losses)
-        self._results = {}
-        self._losses = {}
-        for lane in ready.results:
-            del self.sent[lane]
-        return ready
+        return self.take_some(self._results)
 
     def take_some(self, lanes: Iterable[int]) -> Ready:
         """Take whichever of these lanes are ready; they now count as having come back. Others are left for later."""
