@@ -21,7 +21,8 @@ from millrace.learner.open_hub import open_hub
 from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan, OnRows, PlayedEpisode
 from millrace.learner.rollouts.hub import GOODBYE_IF_CUT_SHORT_S, Hub
 from millrace.learner.rollouts.opponent_pool import OpponentPool, PoolSettings, teams_of
-from millrace.learner.run_folder.run_folder import RunFolder, StoredPolicy, Which
+from millrace.learner.run_folder.policy_files import StoredPolicy
+from millrace.learner.run_folder.run_folder import RunFolder, Which
 from millrace.protocol.arrays import Floats
 from millrace.protocol.bounds import MAX_FACTS
 from millrace.protocol.env_spec import EnvLike, EnvSpec

@@ -19,8 +19,9 @@ from millrace.learner.config.hyperparameters import OffPolicyConfig, QLearningCo
 from millrace.learner.config.layers import config_of_run
 from millrace.learner.config.resume_rules import Change, OnResume, changes, refusal
 from millrace.learner.env_spaces import EnvSpaces
+from millrace.learner.run_folder.policy_files import StoredPolicy
 from millrace.learner.run_folder.results import ALL_STEPS_DONE, DecidingReturns
-from millrace.learner.run_folder.run_folder import RunFolder, StoredPolicy
+from millrace.learner.run_folder.run_folder import RunFolder
 from millrace.protocol.bounds import one_line
 from millrace.protocol.envs.found_names import moved
 from millrace.protocol.errors import UsageError

@@ -6,7 +6,7 @@
       metrics.jsonl         a row per update (metrics_log.py)
       tensorboard/          the same for TensorBoard, if requested
       checkpoints/          from which the run can be resumed (checkpoint.py)
-      policy.safetensors    the arrays of the acting policy, by name
+      policy.safetensors    the arrays of the acting policy, by name (policy_files.py)
       best.safetensors      the same for the best policy in the run's own evaluations
       observation*.png      what the policy sees, if that is an image (image_sample.py)
       policy.json           the meaning of the policy's arrays, with which other programs can act
@@ -16,7 +16,7 @@
       workers/              the logs of local worker processes
       run.lock              who trains the run now (run_lock.py)
 
-Rule: files are written atomically. The same policy gives the same bytes. Nothing is pickled.
+Rule: files are written atomically. Nothing is pickled.
 """
 
 from __future__ import annotations
@@ -27,20 +27,24 @@ import re
 import shutil
 import stat
 import time
-import zlib
 from collections.abc import Mapping
 from contextlib import suppress
 from itertools import count
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, Protocol
+from typing import Literal, Protocol
 
 import msgspec
-import numpy as np
-from msgspec import Meta
-from safetensors import SafetensorError
-from safetensors.numpy import load, save
 
 from millrace.learner.run_folder.atomic_write import TEMPORARY, Writes, write_file
+from millrace.learner.run_folder.policy_files import (
+    PolicyDescription,
+    StoredPolicy,
+    decode_arrays,
+    decode_description,
+    encode_arrays,
+    encode_description,
+    stored_policy,
+)
 from millrace.learner.run_folder.regular_files import MOST_BYTES, read, reason
 from millrace.learner.run_folder.results import SUMMARY_FILE, Summary, read_summary
 from millrace.learner.run_folder.run_format import (
@@ -57,16 +61,11 @@ from millrace.learner.run_folder.run_format import (
 )
 from millrace.learner.run_folder.run_lock import RunLock
 from millrace.protocol.arrays import Floats
-from millrace.protocol.bounds import INVALID, MAX_FACTS, Line, Name, Natural, one_line
-from millrace.protocol.env_spec import Scalar
+from millrace.protocol.bounds import INVALID, one_line
 from millrace.protocol.errors import RunError, UsageError
 from millrace.protocol.own_module import refuse_modules_in
-from millrace.protocol.policy.layout import Field, buffer_layout, named_views, parameter_layout, total_size
-from millrace.protocol.policy.possible import why_impossible
-from millrace.protocol.space_spec import MAX_SEATS
-from millrace.protocol.specs import PolicySpec, RunSpec, facts_of_all_seats
+from millrace.protocol.specs import RunSpec
 
-POLICY_FORMAT = 2
 Which = Literal["final", "best"]
 UNREADABLE = (OSError, *INVALID)  # the exceptions that reading a damaged file raises
 
@@ -83,48 +82,6 @@ class Interrupted(KeyboardInterrupt):
         super().__init__(str(run))
         self.run = run
         self.complete = complete
-
-
-class ArrayPosition(msgspec.Struct, frozen=True):
-    """The position of one array in the flat parameters of the policy. `offset` counts float32 numbers."""
-
-    name: str
-    shape: tuple[int, ...]
-    offset: int
-
-
-class PolicyDescription(msgspec.Struct, frozen=True, kw_only=True):
-    """policy.json: the meaning of the arrays in policy.safetensors."""
-
-    format: int
-    env: Line
-    env_kwargs: dict[str, Scalar]
-    policy: PolicySpec
-    arrays: tuple[ArrayPosition, ...]
-    buffers: tuple[str, ...]
-    """the names of the arrays that are not parameters: mean and standard deviation for observation normalization"""
-    wrappers: tuple[Line, ...] = ()
-    """the wrappers of every env copy, the innermost first"""
-    facts: Annotated[tuple[Name, ...], Meta(max_length=MAX_FACTS)] = ()
-    """the names of the numbers that the run logs for each episode"""
-    masked: bool = False
-    """whether the environment says which actions are allowed"""
-    eval_env_kwargs: dict[str, Scalar] = {}
-    """keyword arguments of evaluation copies, in addition to `env_kwargs`; they override those of the same name"""
-    seats: Annotated[tuple[Name, ...], Meta(max_length=MAX_SEATS)] = ()
-    """the names of the environment's agents; empty for a gymnasium environment"""
-    teams: Annotated[tuple[tuple[Natural, ...], ...], Meta(max_length=MAX_SEATS)] = ()
-    """the seats of each team, if the policy was trained against opponents"""
-
-
-class StoredPolicy(NamedTuple):
-    """A policy read from its files. Reading imports no module that the files name; acting imports the encoder's module."""
-
-    card: PolicyDescription
-    parameters: Floats
-    """the parameters [P] float32, for `Policy.load`"""
-    buffers: Floats
-    """the buffers, float32, for `Policy.load`"""
 
 
 class RunSettings(Protocol):
@@ -313,32 +270,9 @@ class RunFolder:
         self._write(CONFIG_FILE, f"{HEAD}{config.to_toml()}{END}".encode("utf-8", "surrogateescape"))
 
     def write_policy(self, run: RunSpec, parameters: Floats, buffers: Floats, which: Which = "final") -> None:
-        """Write the arrays and policy.json.
-
-        `parameters` [P] begins with the acting parameters; the rest, such as the critic's, is not written.
-        """
-        spec = run.policy
-        env = run.env
-        acting, _ = parameter_layout(spec)
-        arrays = named_views(parameters[: total_size(acting)], acting) | named_views(buffers, buffer_layout(spec))
-        description = PolicyDescription(
-            format=POLICY_FORMAT,
-            env=env.id,
-            env_kwargs=env.kwargs,
-            policy=spec,
-            arrays=_array_positions(acting),
-            buffers=tuple(named_views(buffers, buffer_layout(spec))),
-            wrappers=env.wrappers,
-            facts=facts_of_all_seats(run.info_keys, run.seats),
-            masked=run.masked,
-            eval_env_kwargs=env.eval_kwargs,
-            seats=run.seats,
-            teams=run.teams,
-        )
-        contiguous = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
-        checksum = str(zlib.crc32(_split(save(contiguous))[1]))
-        self._write(POLICY_ARRAYS[which], save(contiguous, metadata={"crc32": checksum}))
-        self._write(POLICY_JSON, msgspec.json.format(msgspec.json.encode(description), indent=2) + b"\n")
+        """Write the arrays and policy.json. For `parameters` and `buffers`, see `encode_arrays`."""
+        self._write(POLICY_ARRAYS[which], encode_arrays(run.policy, parameters, buffers))
+        self._write(POLICY_JSON, encode_description(run))
 
     def read_policy(self, which: Which = "final") -> StoredPolicy:
         """Read policy.json and the arrays.
@@ -351,39 +285,21 @@ class RunFolder:
             expected = f"expected the best policy, {POLICY_ARRAYS[which]}, got none"
             raise UsageError(f"run {self.path}: {expected}; only a run with eval_every has one: take the final policy")
         try:
-            description = _decode_description(read(self.path / POLICY_JSON))
-            content = read(self.path / POLICY_ARRAYS[which], MOST_BYTES)
-            arrays = load(content)
-            if not _checksum_matches(content):
-                raise ValueError(f"{POLICY_ARRAYS[which]}: its checksum does not match")
-        except (*UNREADABLE, SafetensorError, KeyError) as error:  # KeyError is raised for a dtype that numpy lacks
+            description = decode_description(read(self.path / POLICY_JSON))
+            arrays = decode_arrays(read(self.path / POLICY_ARRAYS[which], MOST_BYTES), POLICY_ARRAYS[which])
+        except UNREADABLE as error:
             raise UsageError(f"policy of run {self.path} cannot be read: {one_line(reason(error))}") from error
         if (encoder := description.policy.encoder) is not None:
             refuse_modules_in(self.path, [encoder.factory])
-        if description.format != POLICY_FORMAT:
-            raise UsageError(
-                f"policy of run {self.path}: expected format {POLICY_FORMAT}, got {description.format}; "
-                "install the millrace that wrote it"
-            )
-        acting, _ = parameter_layout(description.policy)
-        buffers = buffer_layout(description.policy)
-        names = tuple(field.name for field in buffers)
-        if description.buffers != names:
-            got = one_line(repr(description.buffers))
-            raise UsageError(f"policy of run {self.path}: {POLICY_JSON}: buffers: expected {names}, got {got}")
-        expected_shapes = {field.name: field.shape for field in (*acting, *buffers)}
-        for name in sorted(arrays.keys() | expected_shapes.keys()):
-            shape = arrays[name].shape if name in arrays else "nothing"
-            if name not in expected_shapes or shape != expected_shapes[name] or arrays[name].dtype != np.float32:
-                expected = f"float32 {expected_shapes[name]}" if name in expected_shapes else "no such array"
-                raise UsageError(f"policy of run {self.path}: {name}: expected {expected}, got {shape}")
-        parameters = _flat([arrays[field.name] for field in acting])
-        return StoredPolicy(description, parameters, _flat([arrays[name] for name in names]))
+        try:
+            return stored_policy(description, arrays)
+        except UsageError as error:
+            raise UsageError(f"policy of run {self.path}: {error}") from error
 
     def policy_description(self) -> PolicyDescription | None:
         """The content of policy.json; None if that file is missing or cannot be read."""
         try:
-            return _decode_description(read(self.path / POLICY_JSON))
+            return decode_description(read(self.path / POLICY_JSON))
         except UNREADABLE:
             return None
 
@@ -412,43 +328,6 @@ class RunFolder:
         write_file(self.path / name, lambda file: file.write(content))
 
 
-def _split(content: bytes) -> tuple[bytes, bytes]:
-    """Split a safetensors file into its head and its numbers."""
-    begin = 8 + int.from_bytes(content[:8], "little")
-    return content[8:begin], content[begin:]
-
-
-def _checksum_matches(content: bytes) -> bool:
-    """Whether the numbers of a safetensors file match its checksum. True for a file without a checksum."""
-    head, numbers = _split(content)
-    match msgspec.json.decode(head):
-        case {"__metadata__": {"crc32": checksum}}:
-            return bool(checksum == str(zlib.crc32(numbers)))
-    return True
-
-
-def _decode_description(text: bytes) -> PolicyDescription:
-    """Decode policy.json. JSON has no infinity, so null stands for a missing bound. Raises one of `UNREADABLE`."""
-    fields = msgspec.json.decode(text, type=dict[str, Any])
-    match fields:
-        case {"policy": {"action": {"low": list(low), "high": list(high)} as action}}:
-            action["low"] = [-np.inf if bound is None else bound for bound in low]
-            action["high"] = [np.inf if bound is None else bound for bound in high]
-    description = msgspec.convert(fields, PolicyDescription)
-    if why := why_impossible(description.policy):
-        raise ValueError(f"{POLICY_JSON}: {why}")
-    return description
-
-
 def as_folder_name(env: str) -> str:
     """The name of an environment or an algorithm as part of a folder's name."""
     return re.sub(r"[^A-Za-z0-9._]+", "-", env.removeprefix("__main__:")).strip("-.") or "env"
-
-
-def _array_positions(fields: tuple[Field, ...]) -> tuple[ArrayPosition, ...]:
-    starts = [total_size(fields[:i]) for i in range(len(fields))]
-    return tuple(ArrayPosition(field.name, field.shape, start) for field, start in zip(fields, starts, strict=True))
-
-
-def _flat(arrays: list[Floats]) -> Floats:
-    return np.concatenate([array.ravel() for array in arrays]) if arrays else np.zeros(0, np.float32)
