@@ -22,6 +22,28 @@ from millrace.protocol.rollout import Rollout
 MOST_ATTEMPTS = 3  # copies start afresh once this many attempts to continue their lane have each lost a worker
 
 
+@dataclass(frozen=True)
+class TakenRollouts:
+    """What the learner remembers of a lane's rollouts: a fold over them, in the order of their rounds. Never changed."""
+
+    newest: tuple[int, int] | None = None
+    """Incarnation and sequence number of the newest rollout; None if none was taken since the learner began."""
+    history: LaneHistory | None = None
+    """History of the rollouts; None if none was taken since the run began. Copy it before you change it."""
+
+    def after(
+        self, incarnation: int, rollout: Rollout, attributes: bytes, histories: LaneHistories
+    ) -> tuple[TakenRollouts, Bools]:
+        """These rollouts and the next one. Also returns [N], True for env copies that had started afresh when it began."""
+        history = histories.begin() if self.history is None else self.history.copy()
+        misses_one = rollout.sequence > 0 and self.newest != (incarnation, rollout.sequence - 1)
+        if misses_one:  # the rollout between was rejected, so nothing is known to continue
+            history.forget()
+        anew = history.add(rollout, attributes)
+        taken = TakenRollouts((incarnation, rollout.sequence), history)
+        return taken, np.ones_like(anew) if misses_one else anew
+
+
 @dataclass
 class TicketedLane(PlacedLane):
     """A lane on which workers collect rollouts."""
@@ -36,12 +58,10 @@ class TicketedLane(PlacedLane):
     """The smallest sequence number of this incarnation whose rollout has not arrived."""
     out_of_order: set[int] = field(default_factory=set)
     """Larger sequence numbers whose rollouts have arrived."""
-    newest_taken: tuple[int, int] | None = None
-    """Incarnation and sequence number of the rollout that was taken last; None if none was taken since the learner began."""
-    history: LaneHistory | None = None
-    """History of the rollouts that were taken; None if none was taken since the run began."""
-    before_taken: tuple[tuple[int, int] | None, LaneHistory | None] = (None, None)
-    """`newest_taken` and `history` before the newest rollout was taken, in case its update is undone."""
+    taken: TakenRollouts = TakenRollouts()
+    """The rollouts that updates took."""
+    before: TakenRollouts = TakenRollouts()
+    """`taken` without the newest rollout, in case its update is undone."""
     failures: int = 0
     """How many times its environment has failed since its last rollout arrived."""
     continued_in_vain: bool = False
@@ -50,6 +70,11 @@ class TicketedLane(PlacedLane):
     """
     losses: int = 0
     """How many times its worker was lost while collecting, since its last rollout arrived."""
+
+    @property
+    def history(self) -> LaneHistory | None:
+        """History of the rollouts that were taken; None if none was taken since the run began."""
+        return self.taken.history
 
     @property
     def busy(self) -> int:
@@ -81,16 +106,12 @@ class TicketedLane(PlacedLane):
         `waiting` has the rollouts that follow the history, in order. Each entry consists of the incarnation, the rollout,
         and the attributes of the env copies.
         """
-        history = None if self.history is None else self.history.copy()
-        newest = self.newest_taken
+        taken = self.taken
         for incarnation, rollout, attributes in waiting:
-            history = history or histories.begin()
-            if _misses_one(newest, incarnation, rollout):
-                history.forget()
-            history.add(rollout, attributes)
-            newest = incarnation, rollout.sequence
+            taken, _ = taken.after(incarnation, rollout, attributes, histories)
+        history = taken.history
         if attempts := self._attempts:
-            history = history or histories.begin()
+            history = histories.begin() if history is None else history.copy()
             history.start_anew(attempts, from_past=self.continued_in_vain)
         return None if history is None else history.past(self.number)
 
@@ -101,35 +122,27 @@ class TicketedLane(PlacedLane):
 
         `from_past` says whether the rollout's worker was told to continue the lane's past.
         """
-        sequence = rollout.sequence
-        continues = self.newest_taken == (incarnation, sequence - 1)
-        begins = sequence == 0 and not (from_past and rollout.memory)
-        self.before_taken = (self.newest_taken, None if self.history is None else self.history.copy())
-        if self.history is None:
-            self.history = histories.begin()
-        if _misses_one(self.newest_taken, incarnation, rollout):
-            self.history.forget()
-        self.newest_taken = (incarnation, sequence)
-        anew = self.history.add(rollout, attributes)
-        return anew if (continues or sequence == 0) and not begins else np.ones_like(anew)
+        self.before = self.taken
+        self.taken, anew = self.taken.after(incarnation, rollout, attributes, histories)
+        begins = rollout.sequence == 0 and not (from_past and rollout.memory)
+        return np.ones_like(anew) if begins else anew
 
     def put_back(self) -> None:
         """Undo the newest `take`."""
-        self.newest_taken, self.history = self.before_taken
+        self.taken = self.before
 
     def lost(self, *, failed: bool) -> None:
         """Record that the lane's worker was lost while collecting or, if `failed`, because its environment failed."""
-        if not self.failures and not self.losses:
-            self.continued_in_vain = False
         if not self._attempts and not self.next_sequence:
             self.continued_in_vain = True
         self.losses += not failed
         self.failures += failed
 
     def went_on(self) -> None:
-        """Reset the counts of failures and losses, because a rollout was accepted."""
+        """Forget failures and losses, because a rollout was accepted."""
         self.failures = 0
         self.losses = 0
+        self.continued_in_vain = False
 
     @property
     def _attempts(self) -> int:
@@ -142,11 +155,6 @@ class TicketedLane(PlacedLane):
         while self.next_sequence in self.out_of_order:
             self.out_of_order.remove(self.next_sequence)
             self.next_sequence += 1
-
-
-def _misses_one(newest: tuple[int, int] | None, incarnation: int, rollout: Rollout) -> bool:
-    """Whether the rollout between `newest` (`TicketedLane.newest_taken`) and this one was rejected."""
-    return rollout.sequence > 0 and newest != (incarnation, rollout.sequence - 1)
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from millrace.learner.members.member import Member
 from millrace.learner.members.membership import Outgoing
 from millrace.learner.rollouts.lag_rule import Rounds
 from millrace.learner.rollouts.lane_history import LaneHistories
-from millrace.learner.rollouts.lanes import Ticket, TicketedLane
+from millrace.learner.rollouts.lanes import TakenRollouts, Ticket, TicketedLane
 from millrace.learner.rollouts.ledger import Ledger
 from millrace.learner.rollouts.opponent_pool import OpponentPool
 from millrace.protocol.arrays import Bools
@@ -62,7 +62,7 @@ class RolloutDealer:
             TicketedLane(
                 n,
                 incarnations[n] if n < len(incarnations) else 0,
-                history=self.histories.of(n),
+                taken=TakenRollouts(history=self.histories.of(n)),
             )
             for n in range(lanes)
         ]

@@ -13,7 +13,7 @@ from millrace.learner.members.membership import Membership, Outgoing
 from millrace.learner.rollouts.collecting_member import CollectingMember
 from millrace.learner.rollouts.lag_rule import Rounds
 from millrace.learner.rollouts.lane_history import LaneHistories
-from millrace.learner.rollouts.lanes import Ticket, TicketedLane
+from millrace.learner.rollouts.lanes import TakenRollouts, Ticket, TicketedLane
 from millrace.learner.rollouts.ledger import Ledger
 from millrace.learner.rollouts.rollout_dealer import AcceptedRollout, RolloutDealer
 from millrace.learner.rollouts.sent_weights import Confirmed, SentAfter, SentWeights, Standing, WeightsHeld
@@ -48,7 +48,8 @@ SAVED: dict[type, set[str]] = {
     CollectingMember: {"peer", "hello", "session", "join_number", "heard_s", "lanes", "tickets", "replies"}
     | {"strikes", "takeovers", "welcomed", "describes"},
     TicketedLane: {"number", "incarnation", "owner", "moving", "due", "dealt", "outstanding", "next_sequence"}
-    | {"out_of_order", "history"},
+    | {"out_of_order", "taken"},
+    TakenRollouts: {"history"},
     Ticket: {"number", "lane", "incarnation", "sequence", "round", "version", "peer", "opponent", "past"},
     LanePlacement: {"_lanes", "_unplaced", "_settled", "_waiting_for"},
     Rounds: {"next", "_versions", "_saved"},
@@ -72,13 +73,8 @@ NOT_SAVED: dict[type, set[str]] = {
         "activity_s",
     }
     | {"in_env_code_s", "speed", "first_step_s", "ended_steps", "supervisor"},
-    TicketedLane: {
-        "newest_taken",
-        "before_taken",
-        "failures",
-        "losses",
-        "continued_in_vain",
-    },  # they mark rollouts as fresh; no update is undone here, and no worker is lost three times
+    TicketedLane: {"before", "failures", "losses", "continued_in_vain"},  # no update is undone, no worker lost three times
+    TakenRollouts: {"newest"},  # it marks rollouts as fresh
     Ticket: set(),
     LanePlacement: {"_tie_break"},
     Rounds: {"max_lag"},

@@ -17,7 +17,7 @@ from millrace.learner.members.membership import Membership
 from millrace.learner.rollouts.collecting_member import CollectingMember
 from millrace.learner.rollouts.evaluation_dealer import EvaluationDealer
 from millrace.learner.rollouts.lag_rule import Rounds
-from millrace.learner.rollouts.lanes import Ticket, TicketedLane
+from millrace.learner.rollouts.lanes import TakenRollouts, Ticket, TicketedLane
 from millrace.learner.rollouts.rollout_dealer import RolloutDealer
 from millrace.learner.rollouts.sent_weights import SentWeights, WeightsHeld
 from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
@@ -115,6 +115,7 @@ def test_every_field_of_the_program_is_in_the_state_or_left_out_on_purpose() -> 
         coordinator.weights,
         coordinator.weights.held,
         coordinator.rollouts.lanes[0],
+        coordinator.rollouts.lanes[0].taken,
         Ticket(0, 0, 0, 0, 0, 0, b"w0"),
         coordinator._placement,
         coordinator.rollouts.rounds,
@@ -123,9 +124,10 @@ def test_every_field_of_the_program_is_in_the_state_or_left_out_on_purpose() -> 
         session._current.rollouts,
         RolloutLane(0),
     ]
-    types = TicketCoordinator, Membership, CollectingMember, RolloutDealer, SentWeights, WeightsHeld, TicketedLane, Ticket
+    types = TicketCoordinator, Membership, CollectingMember, RolloutDealer, SentWeights, WeightsHeld
+    of_lanes = TicketedLane, TakenRollouts, Ticket
     more = LanePlacement, Rounds, Session, _SessionState, HeldRollouts, RolloutLane
-    assert [type(each) for each in objects] == [*types, *more]
+    assert [type(each) for each in objects] == [*types, *of_lanes, *more]
     assert {type(each): set(vars(each)) for each in objects} == known
     wait = DescribeCoordinator(WAIT, 0, worker_timeout_s=TIMEOUT_S, decliners_to_end=0)
     assert set(vars(wait)) == of_describing.SAVED | of_describing.NOT_SAVED
