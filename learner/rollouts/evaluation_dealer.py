@@ -20,6 +20,7 @@ import heapq
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import msgspec
 
@@ -109,15 +110,24 @@ def evaluation_of(played: Sequence[PlayedEpisode], facts: Sequence[str] = ()) ->
     return msgspec.structs.replace(evaluation, facts=means, matches=matches)
 
 
+class TakenAnswer(NamedTuple):
+    """What became of an answer."""
+
+    ended: bool = False
+    """Whether the worker's ticket has ended. If not, the worker no longer had the ticket, and the answer is ignored."""
+    accepted: bool = False
+    """Whether the answer's episodes count."""
+    why: str = ""
+    """What is wrong with the answer; empty if nothing is."""
+
+
 class EvaluationDealer:
     """The tickets of the evaluation that is pending, if there is one."""
 
     def __init__(self, run: RunSpec) -> None:
         """`run` describes the form of rows and episodes."""
-        self.held: dict[int, Member] = {}
-        """the tickets that workers hold, by number"""
-        self.second: dict[int, Member] = {}
-        """the second worker of each ticket in `held` that has one, by number"""
+        self.playing: dict[int, list[Member]] = {}
+        """by the number of each ticket that is being played, its worker, then the second worker if `share` added one"""
         self.most_copies: int | None = None
         """limit on the env copies that play, of all workers together (one worker may always play); None for no limit"""
         self._run = run
@@ -158,7 +168,7 @@ class EvaluationDealer:
     @property
     def players(self) -> list[Member]:
         """The workers that hold tickets."""
-        return list({member.peer: member for member in [*self.held.values(), *self.second.values()]}.values())
+        return list({member.peer: member for members in self.playing.values() for member in members}.values())
 
     def begin(self, plan: EvaluationPlan, version: int, on_rows: OnRows | None = None, *, beside: bool = False) -> None:
         """Begin to evaluate this version, alongside training if `beside`. Then call `deal` to give out the tickets."""
@@ -187,11 +197,11 @@ class EvaluationDealer:
 
         Returns its episodes in the order of the seeds; if it isn't done, only those that have been played.
         """
-        for number, member in [*self.held.items(), *self.second.items()]:
-            del member.tickets[number]
+        for number, members in self.playing.items():
+            for member in members:
+                del member.tickets[number]
         self._plan = None
-        self.held = {}
-        self.second = {}
+        self.playing = {}
         self._rows = {}
         answers = [answer for _, answer in sorted(self._played.items())]
         return [PlayedEpisode(*both) for answer in answers for both in zip(answer.episodes, answer.cut, strict=True)]
@@ -212,7 +222,7 @@ class EvaluationDealer:
                 plenty = most == 1 or len(self._undealt) > len(members)
                 if self._undealt and plenty and holds[member.peer] < most:
                     number = self._first + heapq.heappop(self._undealt)
-                    self.held[number] = member
+                    self.playing[number] = [member]
                     holds[member.peer] += 1
                     out += self.send(member, [number])
         return out
@@ -224,41 +234,41 @@ class EvaluationDealer:
         who = [member for member in active if member.hello.evaluates or not self.beside or self.most_copies is None]
         holds = self._held_by()
         idle = [member for member in self._who_may_play(who, plan) if not holds[member.peer]]
-        alone = sorted(self.held.keys() - self.second.keys())
+        alone = [number for number, members in self.playing.items() if len(members) == 1]
         if not idle or not alone:
             return []
-        self.second[alone[0]] = idle[0]
-        return self.send(idle[0], alone[:1])
+        oldest = min(alone)
+        self.playing[oldest].append(idle[0])
+        return self.send(idle[0], [oldest])
 
     def send(self, member: Member, tickets: Iterable[int]) -> list[Outgoing]:
         """Make the orders for the evaluation's tickets among these."""
-        return [(member.peer, self._order(member, number)) for number in tickets if number in self.held]
+        return [(member.peer, self._order(member, number)) for number in tickets if number in self.playing]
 
-    def take_in(self, member: Member, answer: Evaluated) -> str:
-        """Accept an answer.
-
-        Returns what is wrong with it, or an empty string. The ticket of a wrong answer goes to another worker.
-        """
+    def take_in(self, member: Member, answer: Evaluated) -> TakenAnswer:
+        """Accept an answer. If its episodes can't be used, they are played again."""
         if not self._plays(member, answer.ticket):
-            return ""  # the answer is a repeat, or arrived after the end or after another worker's answer
+            return TakenAnswer()  # the answer is a repeat, or arrived after the end or after another worker's answer
         index = answer.ticket - self._first
         if why := self._wrong(answer, len(self._seeds[index])):
             self.lose(member, answer.ticket)
-            return f"evaluation of ticket {answer.ticket}: {why}"
+            return TakenAnswer(ended=True, why=f"evaluation of ticket {answer.ticket}: {why}")
         rows = self._rows.get((index, member.peer), {})
         if self._on_rows is not None:
             if [_end(rows.get(n, ())) for n in range(len(answer.episodes))] != [one.length for one in answer.episodes]:
                 self.lose(member, answer.ticket)  # a message with rows was lost, so the episodes are played again
-                return ""
+                return TakenAnswer(ended=True)
             assert self._plan is not None
             for episode, messages in sorted(rows.items()):
                 for message in messages:
                     self._on_rows(index * self._plan.copies + episode, message)
-        if member is self.second.get(answer.ticket):
-            self._late.add(self.held[answer.ticket].session)
-        self._end(answer.ticket)
+        members = self.playing.pop(answer.ticket)
+        if members[0] is not member:
+            self._late.add(members[0].session)
+        for each in members:
+            self._forget(each, answer.ticket)
         self._played[index] = answer
-        return ""
+        return TakenAnswer(ended=True, accepted=True)
 
     def take_rows(self, member: Member, rows: EpisodeRows) -> str:
         """Store rows until their answer arrives.
@@ -281,22 +291,20 @@ class EvaluationDealer:
 
     def lose(self, member: Member, number: int) -> None:
         """Record that a member no longer plays this ticket. If nobody else plays it, it will be dealt again."""
-        other = self.held[number] if self.second.get(number) is member else self.second.get(number)
-        if other is None:
-            heapq.heappush(self._undealt, self._end(number))
-            return
         self._forget(member, number)
-        del self.second[number]
-        self.held[number] = other
+        self.playing[number].remove(member)
+        if not self.playing[number]:
+            del self.playing[number]
+            heapq.heappush(self._undealt, number - self._first)
 
     # ---------------------------------------------------------------- inside
 
     def _plays(self, member: Member, number: int) -> bool:
-        return self.held.get(number) is member or self.second.get(number) is member
+        return member in self.playing.get(number, ())
 
     def _held_by(self) -> Counter[bytes]:
         """How many tickets each worker holds."""
-        return Counter(member.peer for member in [*self.held.values(), *self.second.values()])
+        return Counter(member.peer for members in self.playing.values() for member in members)
 
     def _who_may_play(self, members: Sequence[Member], plan: EvaluationPlan) -> list[Member]:
         """The workers among these that may play. A worker that was late may play only if all were late.
@@ -309,13 +317,6 @@ class EvaluationDealer:
         if self.most_copies is None:
             return players
         return players[: self._most_workers or max(1, self.most_copies // plan.copies)]
-
-    def _end(self, number: int) -> int:
-        """Take the ticket from all workers, and drop its rows. Returns its index."""
-        for member in (self.held.pop(number), self.second.pop(number, None)):
-            if member is not None:
-                self._forget(member, number)
-        return number - self._first
 
     def _forget(self, member: Member, number: int) -> None:
         """Take the ticket from this member, and drop its rows."""

@@ -250,14 +250,12 @@ class TicketCoordinator(Coordinator[CollectingMember]):
 
     def _take_evaluated(self, member: CollectingMember, answer: Evaluated) -> list[Outgoing]:
         """Accept episodes of an evaluation, unless they had arrived before."""
-        held = len(member.tickets)
-        played = self.evaluation.episodes_played
-        why = self.evaluation.take_in(member, answer)
-        if len(member.tickets) < held:
+        taken = self.evaluation.take_in(member, answer)
+        if taken.ended:
             member.ended_steps += sum(episode.length for episode in answer.episodes)
-        if self.evaluation.episodes_played > played:
+        if taken.accepted:
             self.events.append(EpisodesArrived(member.hello.worker))
-        return self._unusable(member, why) if why else []
+        return self._unusable(member, taken.why) if taken.why else []
 
     def _heartbeat(self, member: CollectingMember, heartbeat: Heartbeat) -> list[Outgoing]:
         self.rollouts.ledger.late_actions += member.new_late_actions(heartbeat)

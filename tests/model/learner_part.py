@@ -158,7 +158,7 @@ class Learner:
         """Which versions the orders of which workers name."""
         members, evaluation = self.coordinator.members.values(), self.coordinator.evaluation
         versions = {number: {each.version, each.opponent} for number, each in self.coordinator.rollouts.held.items()}
-        versions |= {number: {evaluation.version} for number in evaluation.held}
+        versions |= {number: {evaluation.version} for number in evaluation.playing}
         every = ((member, version) for member in members for number in member.tickets for version in versions[number])
         return [(member, version) for member, version in every if version is not None]
 

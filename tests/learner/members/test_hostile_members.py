@@ -415,7 +415,7 @@ def test_work_between_two_failures_ends_the_row(between: str) -> None:
             noisy.hub.publish(noisy.coordinator.version + 1, PARAMETERS, BUFFERS)
         elif between != "nothing":
             noisy.hub.begin_evaluation(EvaluationPlan((1,), copies=1, most_steps=9))
-            (asked,) = noisy.coordinator.evaluation.held
+            (asked,) = noisy.coordinator.evaluation.playing
             noisy.hears(
                 "honest", example(Evaluated, session=session, ticket=asked, episodes=(Episode(0.0, 1, 0.0),), cut=(False,))
             )

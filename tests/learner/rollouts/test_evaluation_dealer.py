@@ -141,7 +141,7 @@ def test_an_answer_of_other_matches_is_refused_and_its_ticket_is_dealt_again(
     learner = Learner(lanes=1, **TEAMS)
     order, evaluation = asked(learner), learner.coordinator.evaluation
     wrong = against(order, opponents, score)
-    why = evaluation.take_in(learner.coordinator.members[A], wrong)
+    why = evaluation.take_in(learner.coordinator.members[A], wrong).why
     assert re.fullmatch(f"evaluation of ticket {order.ticket}: {says}", why), why
     (again,) = orders(evaluation.deal(learner.coordinator.membership.active()))
     assert again == msgspec.structs.replace(order, keep=())
@@ -155,7 +155,8 @@ def test_without_teams_an_answer_names_no_opponents() -> None:
     learner = Learner(lanes=1, facts=("score",))
     order = asked(learner)
     assert order.opponents == order.teams == ()
-    why = learner.coordinator.evaluation.take_in(learner.coordinator.members[A], against(order, (0, 0, -1, -1, 0, 0)))
+    wrong = against(order, (0, 0, -1, -1, 0, 0))
+    why = learner.coordinator.evaluation.take_in(learner.coordinator.members[A], wrong).why
     assert why == f"evaluation of ticket {order.ticket}: episode: expected no opponent, got 0"
 
 

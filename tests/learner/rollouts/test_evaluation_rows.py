@@ -91,6 +91,20 @@ def test_rows_before_an_answer_that_they_do_not_fit_are_played_again() -> None:
     assert played.strikes() == 0, "the network may lose a message"
 
 
+def test_the_env_steps_of_each_answer_that_ends_a_ticket_count_even_if_they_are_played_again() -> None:
+    played = Played()
+    member = played.learner.coordinator.members[A]
+    played.order = played.order_in(played.learner.says(A, played.answer(2)), A)  # its rows are missing
+    assert member.ended_steps == 2
+    too_long = MOST_STEPS + 1
+    played.order = played.order_in(played.learner.says(A, played.answer(too_long)), A)
+    assert (member.ended_steps, member.strikes) == (2 + too_long, 1)
+    played.learner.says(A, played.rows(0))
+    for _ in range(2):  # the second time, the ticket has ended
+        played.learner.says(A, played.answer(1))
+        assert member.ended_steps == 3 + too_long
+
+
 def test_what_another_worker_says_of_a_ticket_changes_nothing() -> None:
     played = Played()
     session = played.learner.session(B)

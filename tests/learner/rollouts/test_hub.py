@@ -155,7 +155,7 @@ def test_a_wait_for_an_evaluation_without_env_steps_names_who_is_waited_for(
     def poll_while_it_works(timeout_s: float) -> bool:
         steps = int(10 * min(link.now, steps_until_s))
         if answers or link.now < steps_until_s:
-            ticket = next(iter(hub.coordinator.evaluation.held))
+            ticket = next(iter(hub.coordinator.evaluation.playing))
             link.inbox.append((b"w0", msgspec.structs.replace(heartbeat, versions=(0,), tickets=(ticket,), steps=steps)))
         link.now += timeout_s
         return poll(timeout_s)
@@ -223,7 +223,7 @@ def test_only_an_answer_that_is_used_shows_that_the_environment_works() -> None:
     shown = list[str | None]()
     hub._failures.evaluated = shown.append  # type: ignore[method-assign, assignment]
     hub.begin_evaluation(EvaluationPlan((1,), copies=1, most_steps=9))
-    (ticket,) = hub.coordinator.evaluation.held
+    (ticket,) = hub.coordinator.evaluation.playing
     answer = example(Evaluated, session=1, ticket=ticket, episodes=(Episode(0.0, 1, 0.0),), cut=(False,))
     strangers = [(b"w7", answer), (b"w0", msgspec.structs.replace(answer, ticket=ticket + 1))]
     for peer, message in [*strangers, (b"w0", answer)]:

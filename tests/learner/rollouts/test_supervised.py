@@ -359,11 +359,11 @@ def test_a_worker_holds_a_second_ticket_of_an_evaluation_only_while_there_are_pl
     learner = about_to_evaluate()
     plan = EvaluationPlan(seeds=tuple(range(tickets)), copies=1, most_steps=10)
     learner.balanced(learner.coordinator.begin_evaluation(plan))
-    dealt = dict(learner.coordinator.evaluation.held)
-    assert Counter(member.peer for member in dealt.values()) == {A: shares[0], B: shares[1]}
+    dealt = {number: list(members) for number, members in learner.coordinator.evaluation.playing.items()}
+    assert Counter(member.peer for (member,) in dealt.values()) == {A: shares[0], B: shares[1]}
     for peer in (A, B, A, B):
         learner.beats(peer)
-        assert learner.coordinator.evaluation.held == dealt
+        assert learner.coordinator.evaluation.playing == dealt
 
 
 @pytest.mark.parametrize(("most", "evaluators"), [(0, {A, B}), (5, {A, B}), (4, {A}), (1, {A})])

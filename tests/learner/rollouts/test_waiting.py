@@ -120,7 +120,7 @@ def test_env_steps_of_a_rollout_that_has_come_and_of_an_evaluation_are_not_count
     run.learner.delivers(0)
     assert coordinator.collected() == 1
     run.learner.take()
-    (ticket,) = coordinator.evaluation.held
+    (ticket,) = coordinator.evaluation.playing
     episode = Episode(1.0, 5, 0.0)
     run.learner.says(A, example(Evaluated, session=run.learner.session(A), ticket=ticket, episodes=(episode,), cut=(False,)))
     coordinator.evaluation.end()

@@ -24,10 +24,10 @@ from tests.support.conversation.fake_ends import fake_rows
 if TYPE_CHECKING:
     from tests.model.evaluation.evaluating import Evaluating
 
-SAVED = {"_plan", "version", "_first", "_seeds", "_undealt", "held", "_played", "_rows", "beside"}
+SAVED = {"_plan", "version", "_first", "_seeds", "_undealt", "playing", "_played", "_rows", "beside"}
 """What of `EvaluationDealer` is saved. `_seeds` follow from the plan."""
-NOT_SAVED = {"_run", "_on_rows", "most_copies", "_most_workers", "second", "_late"}
-"""A second worker is asked only after ten minutes, so there is none here."""
+NOT_SAVED = {"_run", "_on_rows", "most_copies", "_most_workers", "_late"}
+"""A second worker is asked only after ten minutes, so there is none here, and nobody is late."""
 
 
 class EvaluatingLearner(Learner):
@@ -187,13 +187,13 @@ def loaded(content: Content, settings: Evaluating) -> EvaluatingLearner:
     for worker, mine in held:
         member = learner.coordinator.members[peer_of(worker.value)]
         for index, sent_at in mine:
-            tickets.held[tickets._first + index] = member
+            tickets.playing[tickets._first + index] = [member]
             member.tickets[tickets._first + index] = sent_at.value
             named = learner.coordinator.weights.held.named.setdefault(member.peer, {})
             named[tickets._first + index] = {version}
     tickets._played = {index: evaluated(0, tickets._first + index, returns) for index, returns in played}
     for index, episode, of_session, step in rows:
-        holder = tickets.held[tickets._first + index]
+        (holder,) = tickets.playing[tickets._first + index]
         come = tickets._rows.setdefault((index, holder.peer), {}).setdefault(episode, [])
         come.append(fake_rows(of_session.value, tickets._first + index, episode, step))
     learner.barrier, learner.rows = 0 if barrier is None else barrier.value, list(of_learner)

@@ -21,7 +21,7 @@ MUTATIONS = {
         None, TICKETS, "version=self.version,", "version=max(0, self.version - 1),"
     ),
     "a ticket that was put back is lost": Mutation(
-        None, TICKETS, "heapq.heappush(self._undealt, self._end(number))", "self._end(number)"
+        None, TICKETS, "heapq.heappush(self._undealt, number - self._first)", "pass"
     ),
     "tickets for rollouts are dealt during an evaluation": Mutation(
         None,
@@ -60,7 +60,10 @@ MUTATIONS = {
         Rule.ROWS_FIRST, TICKETS, "!= [one.length for one in answer.episodes]:", "== []:"
     ),
     "an evaluation that was played again is forgotten": Mutation(
-        None, TICKETS, "self.lose(member, answer.ticket)  # a message", "self._end(answer.ticket)  # a message"
+        None,
+        TICKETS,
+        "self.lose(member, answer.ticket)  # a message",
+        "self._forget(self.playing.pop(answer.ticket)[0], answer.ticket)  # a message",
     ),
     "an answer to an order to evaluate is not sent again": Mutation(
         Rule.EVALUATE_ONCE, HELD, "return self.answered.get(ticket)", "return None"

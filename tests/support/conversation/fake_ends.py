@@ -527,7 +527,7 @@ class World:
                 self.issued_at_barrier = self.coordinator.rollouts.ledger.issued
             if self.faults.shares and (self.due or not evaluation.beside) and self.random.random() < self.faults.shares:
                 self.to_workers(self.coordinator.share_evaluation())
-                self.shared += len(evaluation.second)
+                self.shared += sum(len(members) > 1 for members in evaluation.playing.values())
             return self.due or not evaluation.beside
         plan, self.plan = self.plan, None
         played = evaluation.end()

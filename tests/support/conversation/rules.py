@@ -43,7 +43,8 @@ def check_tickets(coordinator: TicketCoordinator, max_lag: int, *, shares: bool 
         assert rollouts.lanes[each.lane].owner == each.peer, (
             f"{Rule.LANE_MOVES}: a ticket of a lane that its worker does not own"
         )
-    held = sorted([*rollouts.held, *coordinator.evaluation.held, *coordinator.evaluation.second])
+    playing = [number for number, of_ticket in coordinator.evaluation.playing.items() for _ in of_ticket]
+    held = sorted([*rollouts.held, *playing])
     assert held == sorted(number for member in members.values() for number in member.tickets), (
         f"{Rule.TICKET_NUMBERS}: a ticket has two holders"
     )
@@ -60,11 +61,11 @@ def check_evaluation(coordinator: TicketCoordinator, *, shares: bool = False) ->
     if not tickets.pending:
         return
     assert tickets.version in coordinator.weights.kept, "the weights of an evaluation were dropped"
-    held = [number - tickets._first for number in tickets.held]
+    held = [number - tickets._first for number in tickets.playing]
     every = sorted([*tickets._undealt, *held, *tickets._played])
     assert every == list(range(len(tickets._seeds))), "a ticket of an evaluation is not in one place"
-    assert tickets.second.keys() <= tickets.held.keys(), "a ticket is with a second worker only"
-    for number, member in [*tickets.held.items(), *tickets.second.items()]:
+    assert all(len(of_ticket) in (1, 2) for of_ticket in tickets.playing.values()), "a ticket is with nobody, or with three"
+    for number, member in [(number, member) for number, of_ticket in tickets.playing.items() for member in of_ticket]:
         assert members.get(member.peer) is member, "a ticket of an evaluation is with a worker that is gone"
         assert number in member.tickets, "a worker does not know its ticket of an evaluation"
     collects = [member for member in tickets.players if not member.hello.evaluates]
