@@ -344,7 +344,7 @@ class MemberServer:
         return self._encoded[1]
 
     def _log_events(self, cause: bytes | None) -> None:
-        told = ""  # the worker whose failure was just logged
+        warned_of = ""  # the worker whose failure was the last to be logged as a warning
         for event in self._membership.take_events():
             match event:
                 case RolloutArrived() | EpisodesArrived():
@@ -352,34 +352,49 @@ class MemberServer:
                 case RolloutRejected(peer, why):
                     self.member_log.warn_limited(peer, f"worker {name_for_people(peer)}: {why}")
                 case _:
-                    told = self._log_event(event, cause, told)
+                    expected = self._is_expected(event, warned_of)
+                    if isinstance(event, Failed) and not expected:
+                        warned_of = event.worker
+                    why_gone = self._why_gone(event)
+                    if why_gone is not None:
+                        self._last_turned_away = why_gone
+                    self._log_event(event, cause, expected=expected)
             self._hub.happened(event)
 
-    def _log_event(self, event: LoggedEvent, cause: bytes | None, told: str) -> str:
-        """Log an event. `told` is the worker whose failure was logged last. Returns its new value."""
-        line = describe(event)
-        expected = isinstance(event, WorkerJoined | WorkerToldToRejoin | NamelessHello)
+    def _log_event(self, event: LoggedEvent, cause: bytes | None, *, expected: bool) -> None:
+        if isinstance(event, WorkerJoined) and not self._settings.log_joins:
+            return
+        lines = describe(event)
+        if isinstance(event, Failed) and expected:
+            lines = lines.partition("\n")[0]  # the exception that the hub raises has the traceback
+        self.member_log.log_event(logging.INFO if expected else logging.WARNING, event, lines, cause)
+
+    def _is_expected(self, event: LoggedEvent, warned_of: str) -> bool:
+        """Whether an event needs no warning. A failure that makes a worker leave gets one warning, not two."""
+        match event:
+            case WorkerJoined() | WorkerToldToRejoin() | NamelessHello() | LaneContinued(new_episodes=0):
+                return True
+            case WorkerLeft(worker):
+                return worker == warned_of or self._was_asked_to_leave(event)
+            case EnvironmentRaised() | PolicyRaised():
+                return not self._settings.log_tracebacks
+            case _:
+                return False
+
+    def _why_gone(self, event: LoggedEvent) -> str | None:
+        """Why a worker may be missing after this event, as the words after its name; None if the event is no reason."""
         match event:
             case WorkerRefused(_, why) | NamelessHello(_, why):
-                self._last_turned_away = f"was refused: {one_line(why)}"
+                return f"was refused: {one_line(why)}"
             case WorkerStartFailed(_, why):
-                self._last_turned_away = why
-            case WorkerLeft(worker, why, _, on_purpose):
-                expected = on_purpose and self._membership.draining is not None
-                self._last_turned_away = self._last_turned_away if expected else why
-                expected = expected or worker == told
-            case EnvironmentRaised() | PolicyRaised() if not self._settings.log_tracebacks:
-                line = line.partition("\n")[0]
-                expected = True
-            case Failed(worker):
-                told = worker
-            case LaneContinued(new_episodes=0):
-                expected = True
+                return why
+            case WorkerLeft(_, why) if not self._was_asked_to_leave(event):
+                return why
             case _:
-                pass
-        if self._settings.log_joins or not isinstance(event, WorkerJoined):
-            self.member_log.log_event(logging.INFO if expected else logging.WARNING, event, line, cause)
-        return told
+                return None
+
+    def _was_asked_to_leave(self, event: WorkerLeft) -> bool:
+        return event.on_purpose and self._membership.draining is not None
 
 
 def status_frames(status: Status) -> Sequence[Buffer]:

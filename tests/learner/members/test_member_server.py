@@ -11,7 +11,7 @@ from typing import cast
 import pytest
 
 from millrace.learner.members.describe_coordinator import DescribeCoordinator, Unknown
-from millrace.learner.members.events import Event
+from millrace.learner.members.events import Event, LaneContinued
 from millrace.learner.members.member import Member
 from millrace.learner.members.member_server import (
     ASK_PROCESSES_S,
@@ -303,10 +303,24 @@ def test_how_workers_come_and_go_is_a_warning_only_if_somebody_should_look(caplo
     assert level(hello(2)) == "INFO"
     served.coordinator.drain("done")
     assert level(Goodbye(3, "done", ())) == "INFO"
+    assert "(the last one left: told to stop)" in str(served.server.no_workers(1, 1.0)), "the second time, it was asked to"
+    caplog.clear()
+    served.ended.append(WorkerExit("w0", 1, "was killed", failed=False))
+    served.server.listen(POLL_S)
+    assert [record.levelname for record in caplog.records] == ["WARNING"], "it did not leave because it was asked to"
     served = Served(ServerSettings(log_joins=False, log_tracebacks=False))
     assert level(hello(1)) == "", "it joins the run in a moment"
     assert level(example(Failure, session=2, error="boom", traceback="its traceback")) == "INFO WARNING"
     assert caplog.messages == ["worker w1 (host): boom", "worker w1 failed"], "whoever raises the error shows its traceback"
+
+
+def test_that_a_lane_continues_is_a_warning_only_if_an_episode_is_abandoned(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO)
+    served = Served()
+    caplog.clear()
+    served.coordinator.membership.events += [LaneContinued("w0", 0, 5, new_episodes) for new_episodes in (0, 1)]
+    served.server.send(())
+    assert [record.levelname for record in caplog.records] == ["INFO", "WARNING"]
 
 
 def test_what_a_connection_had_sent_that_a_newer_one_replaced_is_no_warning(caplog: pytest.LogCaptureFixture) -> None:
