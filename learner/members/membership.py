@@ -179,41 +179,24 @@ class Membership(Generic[M]):
 
     def join(self, peer: bytes, hello: Hello, now: float) -> tuple[list[Outgoing], M | None]:
         """Answer a Hello. Returns the answer, and the member if one joined."""
-        if not worker_name(peer):
-            self.events.append(NamelessHello(hello.worker, NAMELESS))
-            return [(peer, Refuse(NAMELESS))], None
-        why = ""
-        if hello.protocol != PROTOCOL_VERSION:  # rule OTHER_PROTOCOL
-            why = f"protocol: expected {PROTOCOL_VERSION}, got {hello.protocol}; install the learner's version of millrace"
-        elif hello.worker.encode() != worker_name(peer):
-            why = f"name: expected {name_for_people(peer)!r}, as in its routing id, got {hello.worker[:40]!r}"
-        if why:
-            self.events.append(WorkerRefused(hello.worker, why))
-            return [(peer, Refuse(one_line(why)))], None
-        refused, why = self._refused.get(peer, (-1, ""))
-        if refused == hello.process_nonce:
-            return [(peer, Refuse(why))], None
-        if self.draining is not None:
-            return [(peer, Drain(one_line(self.draining)))], None  # rule HELLO_WHILE_DRAINING
-        member = self.members.get(peer)
+        turned_away = self._turned_away(peer, hello)
+        if turned_away is not None:
+            return turned_away, None
         takeovers = 0
-        if member is None and len(self.members) >= MAX_MEMBERS:
-            why = f"workers: expected at most {MAX_MEMBERS} at one learner"
-            self.events.append(WorkerRefused(hello.worker, why))
-            return [(peer, Refuse(why))], None
-        if member is not None:
-            same_process = member.hello.process_nonce == hello.process_nonce
-            if same_process and hello.attempt == member.hello.attempt:  # rule REPEATED_HELLO
-                member.heard_s = now
-                return [self._welcome(member)], None
-            if same_process and hello.attempt < member.hello.attempt:
+        earlier = self.members.get(peer)
+        if earlier is not None:
+            same_process = earlier.hello.process_nonce == hello.process_nonce
+            if same_process and hello.attempt == earlier.hello.attempt:  # rule REPEATED_HELLO
+                earlier.heard_s = now
+                return [self._welcome(earlier)], None
+            if same_process and hello.attempt < earlier.hello.attempt:
                 return [], None
-            takeovers = member.takeovers + (not same_process)
+            takeovers = earlier.takeovers + (not same_process)
             if not same_process and takeovers >= MOST_TAKEOVERS:
                 why = f"another process, on {hello.host}, joined as {hello.worker}; give each worker a name of its own"
-                self._remember_refusal(member, why)
+                self._remember_refusal(earlier, why)
             # rule LATER_HELLO
-            self.remove(member, TimedOut, "began again" if same_process else f"replaced by process {hello.pid}")
+            self.remove(earlier, TimedOut, "began again" if same_process else f"replaced by process {hello.pid}")
         member = self._member_class(peer, hello, self._next_session, self._joins, now, joined_s=now, takeovers=takeovers)
         self._next_session += 1
         self._joins += 1
@@ -347,6 +330,26 @@ class Membership(Generic[M]):
             out.append((member.peer, Drain(one_line(reason))))
         return out
 
+    def _turned_away(self, peer: bytes, hello: Hello) -> list[Outgoing] | None:
+        """The answer to a Hello that is turned away, whatever session its worker has; None for any other Hello."""
+        if not worker_name(peer):
+            self.events.append(NamelessHello(hello.worker, NAMELESS))
+            return [(peer, Refuse(NAMELESS))]
+        if why := _mistake(peer, hello):
+            return self._refuse_hello(peer, hello, why)
+        nonce, why = self._refused.get(peer, (-1, ""))
+        if nonce == hello.process_nonce:
+            return [(peer, Refuse(why))]
+        if self.draining is not None:
+            return [(peer, Drain(one_line(self.draining)))]  # rule HELLO_WHILE_DRAINING
+        if peer not in self.members and len(self.members) >= MAX_MEMBERS:
+            return self._refuse_hello(peer, hello, f"workers: expected at most {MAX_MEMBERS} at one learner")
+        return None
+
+    def _refuse_hello(self, peer: bytes, hello: Hello, why: str) -> list[Outgoing]:
+        self.events.append(WorkerRefused(hello.worker, why))
+        return [(peer, Refuse(one_line(why)))]
+
     def _fail(self, member: M, failure: Failure) -> None:
         """Remove a member that reports a failure of the environment's code or of the user's policy."""
         by_policy = failure.of_policy and self.has_policy_code
@@ -377,6 +380,15 @@ class Membership(Generic[M]):
 
     def _remember_refusal(self, member: M, why: str) -> None:
         _remember(self._refused, member.peer, (member.hello.process_nonce, one_line(why)))
+
+
+def _mistake(peer: bytes, hello: Hello) -> str:
+    """What is wrong with a Hello; empty if nothing is."""
+    if hello.protocol != PROTOCOL_VERSION:  # rule OTHER_PROTOCOL
+        return f"protocol: expected {PROTOCOL_VERSION}, got {hello.protocol}; install the learner's version of millrace"
+    if hello.worker.encode() != worker_name(peer):
+        return f"name: expected {name_for_people(peer)!r}, as in its routing id, got {hello.worker[:40]!r}"
+    return ""
 
 
 def _remember(table: dict[K, V], key: K, value: V) -> None:
