@@ -74,12 +74,8 @@ class DescribeCoordinator(Coordinator[Member]):
         return self._deal()
 
     def ask_more(self) -> list[Outgoing]:
-        """Have more workers describe the environment, because no description has arrived for a long time.
-
-        If no worker was asked, because none has joined, the first one that joins will still be the only one.
-        """
-        if self.membership.active():
-            self._double()
+        """Have more workers describe the environment, because no description has arrived for a long time."""
+        self._double()
         return self._deal()
 
     def status(self, progress: RunProgress, now: float) -> Status:

@@ -87,31 +87,33 @@ class Lobby:
 
         Raises `UsageError` if a worker started by this program, or each of `launched_workers`, reports that there is no such
         environment or gives a description that is not accepted. Raises `EnvironmentFailed` if the environment fails too
-        often, and `NoWorkers` or `Stalled` if a deadline passes.
+        often, and `NoWorkers` or `Stalled` if a deadline passes. Time without workers is no stall, nor is it part of
+        `described_in_s`.
         """
         coordinator = self._coordinator
         server = self._server
         stall_timeout_s = self._settings.stall_timeout_s
         members = coordinator.members
-        began_s = self._clock()
-        has_joined = False  # whether any worker has
+        began_s = self._clock()  # since then, there has always been a worker that could describe the environment
         wait = LongWait(began_s)
+        wait_for_answer = LongWait(began_s)
         server.send(coordinator.ask(unknown))
         while coordinator.described is None:
             server.listen(POLL_S)
             check_interrupt()
             self._check()
             now = self._clock()
-            has_joined = has_joined or bool(members)
-            if not has_joined:
-                began_s = now  # the first worker that joins will describe the environment
+            if not members:
+                began_s = now
+                wait_for_answer = LongWait(now)
             # Time in the environment's code doesn't count, because those calls have their own timeouts, with better errors.
             busy_s = max((member.in_env_code_s for member in members.values()), default=began_s)
-            if now - max(began_s, busy_s) > stall_timeout_s and members:
+            if now - max(began_s, busy_s) > stall_timeout_s:
                 told = server.what_workers_do()
                 raise Stalled(f"no description of the environment within {stall_timeout_s:.0f} s; {told}")
             if wait.due(now):
                 log.warning("no env steps for %.0f s: %s", wait.seconds(now), server.what_workers_do())
+            if wait_for_answer.due(now):
                 server.send(coordinator.ask_more())
         self.described_in_s = max(self.described_in_s, self._clock() - began_s)
         return coordinator.described

@@ -172,15 +172,6 @@ def test_when_no_description_comes_for_long_another_one_is_asked_as_well() -> No
     assert made.described.observation_space == spaces.Discrete(3)
 
 
-def test_a_long_time_without_workers_has_no_more_of_them_asked() -> None:
-    made = coordinator()
-    for _ in range(3):
-        assert made.ask_more() == []
-    for name in (A, B):
-        join(made, name)
-    assert [bool(made.members[name].tickets) for name in (A, B)] == [True, False]
-
-
 def test_an_order_that_a_heartbeat_shows_to_be_lost_is_sent_again() -> None:
     made = coordinator()
     session = join(made, A)
@@ -501,24 +492,60 @@ def test_of_two_descriptions_the_one_that_took_longer_counts() -> None:
     assert lobby.described_in_s == pytest.approx(3.0, abs=0.2)
 
 
-def test_the_time_before_the_first_worker_joined_is_no_time_of_a_description() -> None:
-    """Nor does a run stall that waited longer for workers than for what they describe."""
+def joins(link: FakeLink, name: bytes, at_s: float) -> Callable[[], None]:
+    """A function that, when called after `at_s` for the first time, sends a worker's Hello to the learner."""
+    joined: list[bool] = []
+
+    def join_once() -> None:
+        if not joined and link.now >= at_s:
+            link.inbox.append((name, hello(name)))
+            joined.append(True)
+
+    return join_once
+
+
+@pytest.mark.parametrize("first_joins", [True, False], ids=["after a lost worker", "as the first worker"])
+def test_time_without_workers_is_neither_a_stall_nor_time_of_a_description(first_joins: bool) -> None:
     link = FakeLink()
     settings = replace(SETTINGS, stall_timeout_s=20)
     lobby = Lobby(cast(LearnerLink, link), FakeProcesses(expected=1), settings, lambda: link.now)
     joins_s = link.now + 50.0
-    joined: list[bool] = []
+    others = [joins(link, A, link.now)] if first_joins else []  # it stays silent after its Hello
+    turns = [*others, joins(link, B, joins_s)]
 
     def join_and_describe() -> None:
-        if not joined and link.now >= joins_s:
-            link.inbox.append((A, hello(A)))
-            joined.append(True)
-        for member in lobby._coordinator.members.values():
-            if member.tickets and link.now >= joins_s + 3.0:
-                link.inbox.append((A, Described(member.session, max(member.tickets), DESCRIPTION)))
+        for turn in turns:
+            turn()
+        for peer, member in lobby._coordinator.members.items():
+            if peer == B and member.tickets and link.now >= joins_s + 3.0:
+                link.inbox.append((B, Described(member.session, max(member.tickets), DESCRIPTION)))
 
     lobby.describe(Unknown(ENV), join_and_describe)
     assert lobby.described_in_s == pytest.approx(3.0, abs=0.2)
+
+
+def test_more_workers_describe_only_once_those_that_joined_have_had_time_to() -> None:
+    """The log mentions the wait earlier, because it counts the time without workers too."""
+    link = FakeLink()
+    lobby = Lobby(cast(LearnerLink, link), FakeProcesses(expected=2), SETTINGS, lambda: link.now)
+    joins_s = link.now + 29.5  # half a second before the first line in the log
+    turns = [joins(link, A, joins_s), joins(link, B, joins_s + 0.1)]
+    asked: list[tuple[float, int]] = []  # since both joined, and how many workers are asked
+
+    def join_and_stay() -> None:
+        for turn in turns:
+            turn()
+        members = lobby._coordinator.members
+        link.inbox += [(peer, example(Heartbeat, session=member.session)) for peer, member in members.items()]
+        link.now += 0.05
+        asked.append((link.now - joins_s, sum(bool(member.tickets) for member in members.values())))
+        if link.now >= joins_s + 32.0:
+            raise Ends
+
+    with pytest.raises(Ends):
+        lobby.describe(Unknown(ENV), join_and_stay)
+    assert {workers for seconds, workers in asked if 1.0 < seconds < 29.5} == {1}
+    assert asked[-1][1] == 2
 
 
 def test_a_start_whose_workers_all_die_after_the_description_ends_at_once() -> None:
