@@ -89,9 +89,8 @@ class ResetAhead(gymnasium.Wrapper[Any, Any, Any, Any]):
                 env = self._make() if instance is None else instance
                 self._second = env
                 first = env.reset(seed=seed)
-                for name, value in self._late.items():
-                    _set(env, name, value)
-                self._late = {}
+                for name in list(self._late):  # if one can't be set, a later reset sets the rest
+                    _set(env, name, self._late.pop(name))
                 prepared.set_result((env, *first))
             except BaseException as error:
                 prepared.set_exception(error)
@@ -103,8 +102,9 @@ class ResetAhead(gymnasium.Wrapper[Any, Any, Any, Any]):
         """See `gymnasium.Wrapper.set_wrapper_attr`. An attribute of the environment is set on both instances.
 
         Waits for a reset in progress. The other instance gets a copy of the value, because an instance may change its value.
-        If the other instance lacks the attribute, because `reset` creates it, the instance gets it after its first reset.
-        Raises `AttributeError` if the instance lacks it even then.
+        If the other instance lacks the attribute, because `reset` creates it, the instance gets it after its first reset. If
+        the instance lacks it even then, raises `AttributeError`, or lets a later `reset` raise it if that first reset
+        hasn't happened yet.
         """
         if hasattr(self, name) or not self.env.has_wrapper_attr(name):
             return super().set_wrapper_attr(name, value, force=force)
@@ -112,6 +112,7 @@ class ResetAhead(gymnasium.Wrapper[Any, Any, Any, Any]):
         if self._prepared is None and not other.has_wrapper_attr(name):
             self._late[name] = deepcopy(value)
         else:
+            self._late.pop(name, None)  # an older value, if the reset after which it was to be set has failed
             _set(other, name, deepcopy(value))
         return playing.set_wrapper_attr(name, value)
 

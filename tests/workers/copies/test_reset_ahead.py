@@ -245,6 +245,41 @@ def test_an_attribute_that_the_other_instance_lacks_after_its_reset_is_an_error(
     copies.close()
 
 
+def test_only_one_reset_raises_an_error_for_an_attribute_that_the_other_instance_lacks() -> None:
+    """The attributes that were set with it reach the other instance."""
+    env = ResetAhead(gymnasium.make("tests/Windy-v0"))
+    episode(env, 1)
+    for name in ("gust", "wind"):
+        assert env.set_wrapper_attr(name, 3.0, force=False)
+    episode(env)
+    with pytest.raises(AttributeError, match="expected an attribute gust of both instances of ResetAhead"):
+        env.reset()
+    winds = []
+    for _ in range(4):
+        env.reset()
+        env.instances()  # the other one is reset as well
+        winds.append([each.wind for each in Traced.made if isinstance(each, Windy)])
+    env.close()
+    assert winds[0] == [0.0, 3.0], "set before the first reset of the second instance"
+
+
+def test_a_reset_that_is_tried_again_sets_no_older_value_of_an_attribute() -> None:
+    env = ResetAhead(gymnasium.make("tests/Windy-v0"))
+    env.reset(seed=1)
+    env.set_wrapper_attr("wind", 4.0, force=False)
+    Traced.fails = True
+    env.reset()
+    env.instances()  # the reset in the thread has failed, but has created the attribute
+    env.set_wrapper_attr("wind", 5.0, force=False)
+    Traced.fails = False
+    with pytest.raises(RuntimeError, match="no reset today"):
+        env.reset()
+    env.reset()
+    _, other = env.instances()
+    env.close()
+    assert other.get_wrapper_attr("wind") == 0.0, "the reset's own value, as in every reset"
+
+
 @pytest.mark.parametrize("agents", [1, 2])
 def test_a_copy_that_resets_ahead_is_never_created_anew(agents: int) -> None:
     copies = copies_of(agents, restart_episodes=1)
