@@ -6,7 +6,8 @@ worker of its own. This can't be known before the run, so the workers are watche
 Rule: a worker counts as computing if any of its threads or processes is running or ready to run, so a worker that lacks a
 core isn't taken for one that waits. A simulator may compute outside of its worker's session, as a server on this machine or
 in a container. Therefore, the cores must have been idle as well. Only the time between two looks at which workers collected
-counts, because an update on these cores, or on a GPU, says nothing about steps.
+counts, because an update on these cores, or on a GPU, says nothing about steps. An update that is shorter than the time
+between two looks may still count, and if many do, the suggestion may be missing or wrong.
 
 Rule: more workers are only suggested. If some joined during the run, lanes would move to them, and episodes that can't be
 replayed would end, so results would depend on the time of joining.
