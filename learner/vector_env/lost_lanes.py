@@ -15,7 +15,6 @@ from millrace.protocol.random_streams import Purpose, env_seed
 
 RESET_ATTEMPTS = 3
 """How many times a reset is tried if every attempt loses a worker."""
-UNKNOWN_REASON = "its worker is gone"
 
 
 class LostLanes:
@@ -47,18 +46,17 @@ class LostLanes:
         """Record that these lanes answered an order. If they waited for a reset, that order was the reset."""
         self._awaiting_reset -= lanes
 
-    def forget(self, lanes: Iterable[int]) -> None:
-        """Forget earlier losses of these lanes, because they begin new episodes."""
-        for lane in lanes:
-            self._unreported.pop(lane, None)
+    def forget(self, lane: int) -> None:
+        """Forget an earlier loss of this lane, if there was one, because all its copies have begun new episodes."""
+        self._unreported.pop(lane, None)
 
     def report(self, unanswered: Sequence[int]) -> dict[int, str]:
-        """Report the lanes that were lost instead of answering this step. Returns the reasons, by lane.
+        """Report lanes that were lost instead of answering this step. Returns the reasons, by lane.
 
         From now on, these lanes wait for a reset. A lane that was lost after it answered this step is reported in the next
         step.
         """
-        reported = {lane: self._unreported.pop(lane, UNKNOWN_REASON) for lane in unanswered}
+        reported = {lane: self._unreported.pop(lane) for lane in unanswered}
         self.expect_reset(reported)
         return reported
 

@@ -17,7 +17,7 @@ from gymnasium.error import AlreadyPendingCallError, NoAsyncCallError
 from millrace.learner.vector_env.batch_arrays import BatchArrays
 from millrace.learner.vector_env.batch_layout import BatchLayout
 from millrace.learner.vector_env.lane_orders import packed, step_order
-from millrace.learner.vector_env.lost_lanes import UNKNOWN_REASON, LostLanes, replacement_seeds, worker_lost
+from millrace.learner.vector_env.lost_lanes import LostLanes, replacement_seeds, worker_lost
 from millrace.learner.vector_env.order_coordinator import MakeOrder
 from millrace.learner.vector_env.sent_lanes import (
     AfterLoss,
@@ -95,10 +95,9 @@ class SendRecv:
         self.check_back(by_lane)
         self._check_whole(by_lane)
         resets = {lane: self._asked_reset(lane, chosen, seeds, options) for lane, chosen in by_lane.items()}
-        whole = {lane for lane, chosen in by_lane.items() if len(chosen) == layout.size(lane)}
         for n in copies:
             parts.seeds[n] = seeds[n] if seeds[n] is not None else parts.seeds[n]
-        if len(whole) == len(layout.lanes):
+        if len(copies) == layout.count:
             hub.listen()  # a loss that is noticed now needs no report, because the copies are reset
         parts.lost_lanes.add(hub.coordinator.take_lost())
         now = self._watched.look(hub.now())
@@ -106,7 +105,6 @@ class SendRecv:
             for lane, reset in resets.items():
                 self._sent.send([lane], Sent(reset, now))
                 hub.send_order(lane, reset.order())
-                parts.lost_lanes.forget({lane} & whole)  # only now, because an interrupt may come before the order
         except BaseException:  # such as Ctrl-C
             self.abandon(list(resets))
             raise
@@ -213,27 +211,18 @@ class SendRecv:
     def abandon(self, lanes: Sequence[int]) -> None:
         """Stop waiting for these lanes. Those whose step was under way count as reported if they were lost meanwhile.
 
-        If a lane was lost, and no worker has got its reset, the next step reports the loss.
+        If a lane was lost before its reset was answered, the next step reports the loss.
         """
         sent = self._sent
-        under_way = [lane for lane in sent.under_way if lane in lanes]
-        steps = [lane for lane in under_way if sent.sent[lane].asked is Asked.STEP]
-        hidden = [lane for lane in under_way if isinstance(sent.sent[lane].asked, AskedReset) and self._is_hidden(lane)]
+        steps = [lane for lane in sent.under_way if lane in lanes and sent.sent[lane].asked is Asked.STEP]
         for lane in lanes:
             self._to_raise.pop(lane, None)
         self._parts.hub.forget(sent.give_up(lanes))
         lost_lanes = self._parts.lost_lanes
-        lost_lanes.add({lane: UNKNOWN_REASON for lane in hidden if lane not in lost_lanes.unreported})
         lost_lanes.add(self._parts.hub.coordinator.take_lost())
         lost_lanes.report([lane for lane in steps if lane in lost_lanes.unreported])
 
     # ---------------------------------------------------------------- inside
-
-    def _is_hidden(self, lane: int) -> bool:
-        """Whether this lane, which was to be reset, is lost, no result has reported it, and no worker has got the reset."""
-        parts = self._parts
-        began = bool(parts.ever_reset[parts.layout.copies(lane)].any())
-        return began and not parts.hub.coordinator.lanes[lane].started and lane not in parts.lost_lanes.awaiting_reset
 
     def _order_steps(
         self,
@@ -341,7 +330,13 @@ class SendRecv:
         parts.lost_lanes.answered({lane})
         if isinstance(asked, AskedReset):
             parts.ever_reset[[parts.layout.copies(lane)[n] for n in asked.copies]] = True
+            if len(asked.copies) == parts.layout.size(lane) and not self._is_lost_again(lane, answer):
+                parts.lost_lanes.forget(lane)  # nothing is left to report, because all copies were reset
         return bytes(answer.infos.data)
+
+    def _is_lost_again(self, lane: int, answer: Stepped) -> bool:
+        """Whether the copies that gave this answer have been lost since."""
+        return answer.incarnation != self._parts.hub.coordinator.lanes[lane].incarnation
 
     def _give_up_late(self, timeout_s: float) -> None:
         """Treat workers that take too long as lost. Raises `NoWorkers` if a lane had no worker all that time."""
@@ -371,8 +366,6 @@ class SendRecv:
                     sent.drop(lane)
                 case AfterLoss.RESET_AGAIN:
                     assert isinstance(asked, AskedReset)
-                    if len(asked.copies) == len(copies):
-                        parts.lost_lanes.forget([lane])  # nothing is left to report, because all copies are reset
                     self._reset_instead(lane, asked, {})
                 case AfterLoss.RESET_NEW_COPIES:
                     self._warn(lane, parts.lost_lanes.report([lane])[lane])

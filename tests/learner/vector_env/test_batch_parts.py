@@ -13,7 +13,7 @@ import millrace
 from millrace.learner.vector_env.batch_layout import BatchLayout
 from millrace.learner.vector_env.calls import _descriptions
 from millrace.learner.vector_env.infos import unpack_infos
-from millrace.learner.vector_env.lost_lanes import UNKNOWN_REASON, LostLanes, replacement_seeds
+from millrace.learner.vector_env.lost_lanes import LostLanes, replacement_seeds
 from millrace.learner.vector_env.settings import VectorEnvSettings
 from millrace.protocol.envs.description import describe_env
 from millrace.protocol.errors import BadMessage
@@ -69,8 +69,8 @@ def test_what_describes_no_copy_is_refused(sent: object) -> None:
 
 def test_each_loss_is_reported_once_and_then_the_lane_awaits_a_reset() -> None:
     lanes = LostLanes()
-    lanes.add({1: "worker w1 was killed"})
-    assert lanes.report([0, 1]) == {0: UNKNOWN_REASON, 1: "worker w1 was killed"}
+    lanes.add({0: "worker w0 left", 1: "worker w1 was killed"})
+    assert lanes.report([0, 1]) == {0: "worker w0 left", 1: "worker w1 was killed"}
     assert not lanes.unreported
     assert lanes.awaiting_reset == {0, 1}
     lanes.answered({1})

@@ -4,8 +4,8 @@ Rule: each call does what `ZmqVectorEnv` does before it waits, looks after each 
 under way any more.
 
 Rules of safety: each result is that of the order it was asked for, from copies that executed every order before it once;
-copies of a lost lane are reset before they step; a step resets a lane only after its loss was reported; and a worker that is
-heard answers in time.
+copies of a lost lane are reset before they step; a step resets a lane only after its loss was reported; after one fault, a
+reset is tried again; and a worker that is heard answers in time.
 """
 
 from __future__ import annotations
@@ -77,6 +77,7 @@ class Caller:
     def __init__(self, coordinator: OrderCoordinator, settings: Stepping, now: float) -> None:
         self.operations, self.now = settings.calls, now
         self.timeout_s = settings.call_timeout_s
+        self.faults = settings.faults
         self.oldest = settings.most_ticks
         self.coordinator, self.server = coordinator, Server()
         link, clock = cast(LearnerLink, FakeLink()), lambda: self.now
@@ -134,6 +135,8 @@ class Caller:
             self.told |= {self.parts.layout.lane_of(n) for n in ready.losses}
             self.at += 1
         except (NoWorkers, WorkerLost) as error:
+            gave_up_reset = isinstance(error, WorkerLost) and self.operations[self.at] == "reset"
+            assert not gave_up_reset or self.faults > 1, "a reset is given up after one fault"
             self.send_recv.abandon(self.parts.layout.lanes)
             self.told |= self.parts.lost_lanes.awaiting_reset  # by the error
             self.at += isinstance(error, WorkerLost) and self.operations[self.at] == "call"  # others are tried again
