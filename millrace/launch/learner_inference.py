@@ -132,7 +132,7 @@ class SteppingPool:
         settings = self._settings
         env = self._env = self._stepping.vector_env(described)
         before_wait = _BeforeWaits(env, settings.workers, settings.no_workers_timeout_s)
-        copies = SplitVectorEnv(env, settings.lanes, before_wait, env, settings.facts, masked=masked)
+        copies = SplitVectorEnv(env, settings.lanes, before_wait, settings.facts, masked=masked)
         self._thread = self._acting_thread(copies)
         processes = _ActingProcesses(self._thread, copies, env, self._stepping.expected)
         return Lobby(self._own.bound.link, processes, self._before)

@@ -1,13 +1,13 @@
 """One vector environment split into lanes: its workers step the env copies, and a collector chooses the actions.
 
 Rule: a lane returns, bit for bit, what a loop over its copies would return. The lane chooses its copies' seeds and actions,
-and the vector environment's autoreset is NextStep, like the loop's. If the vector environment can step some lanes while
-others wait, the lanes are stepped in two parts: the policy acts for one part while the copies of the other step.
+and the vector environment's autoreset is NextStep, like the loop's. The lanes are stepped in two parts: the policy acts for
+one part while the copies of the other step.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
 from typing import Any, Protocol, TypeVar
@@ -18,23 +18,25 @@ import numpy as np
 from millrace.protocol.arrays import Array, Bools
 from millrace.protocol.envs.action_masks import without_mask
 from millrace.protocol.envs.spaces import make_batched, make_flatten
-from millrace.protocol.errors import EnvironmentFailed, NoWorkers, WorkerLost
+from millrace.protocol.errors import NoWorkers, WorkerLost
 from millrace.protocol.policy.masks import MASK
 from millrace.protocol.specs import RunSpec
-from millrace.protocol.wire.plain_values import unpack
 from millrace.workers.copies.env_copies import EnvCopies, Leaves, StepResult
 from millrace.workers.copies.env_errors import CopyFailed, environment_failed
 from millrace.workers.copies.env_loop import Pulse
 from millrace.workers.copies.episode_facts import Facts, facts_of_info
 from millrace.workers.copies.mask_reader import MaskReader
+from millrace.workers.copies.set_attributes import CallsCopies, SetAttributes
 
-METHODS = ("close", "render", "reset", "step")  # every environment has these methods
 RESETS = 3  # how often copies are reset if each reset loses a worker, and with it the attributes that were set
 Result = TypeVar("Result")
 
 
-class HasInfosByRow(Protocol):
-    """A vector environment with gymnasium's methods that also has the infos as each copy returned them."""
+class StepsLanes(CallsCopies, Protocol):
+    """A vector environment that can step some of its lanes while others step.
+
+    It also has the infos as each copy returned them.
+    """
 
     num_envs: int
     single_observation_space: gymnasium.Space[Any]
@@ -46,18 +48,6 @@ class HasInfosByRow(Protocol):
 
     def reset(self, *, seed: Any = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
         """Begin episodes, in the copies that `options["reset_mask"]` selects."""
-
-    def step(self, actions: Any) -> Any:
-        """Step every copy."""
-
-
-class StepsSomeLanes(Protocol):
-    """A vector environment that can step some of its lanes while others step."""
-
-    calls: Any
-
-    def incarnations(self) -> Sequence[int]:
-        """For each copy, a number that rises when the copy is lost and a new one replaces it."""
 
     def begin_step(self, lanes: Sequence[int], actions: Any) -> None:
         """Order the copies of these lanes to step. `actions` has a row for every copy of the vector environment."""
@@ -74,23 +64,22 @@ class SplitVectorEnv:
 
     def __init__(
         self,
-        env: HasInfosByRow,
+        env: StepsLanes,
         lanes: int,
         before_wait: Callable[[Pulse], None] = lambda pulse: None,
-        some: StepsSomeLanes | None = None,
         facts: Sequence[str] = (),
         *,
         masked: bool = False,
     ) -> None:
-        """`before_wait` is called before each wait for the vector environment, with the `pulse` to call during the wait.
+        """`env` may have more lanes than `lanes`, for evaluation.
 
-        `some` is the same vector environment, if it can step some lanes while others wait; it may then have further lanes,
-        for evaluation. `facts` are the names of the numbers in `info` that describe an episode. If `masked`, read masks of
-        the allowed actions.
+        `before_wait` is called before each wait for the vector environment, with the `pulse` to call during the wait.
+        `facts` are the names of the numbers in `info` that describe an episode. If `masked`, read masks of the allowed
+        actions.
         """
         env.merge_infos = False  # in merged infos, all copies would have the same dtype and shape
         self.env = env
-        self.in_parts = 1 if some is None else min(lanes, 2)
+        self.in_parts = min(lanes, 2)
         """number of parts in which the lanes are stepped"""
         self.facts = facts
         observation = env.single_observation_space
@@ -101,15 +90,12 @@ class SplitVectorEnv:
         self._lanes = lanes
         self._count = 0  # number of copies per lane, set when the first lane is opened
         self._before_wait = before_wait
-        self._some = some
         self._actions: Array | None = None  # [num_envs, *action]
         self._read = make_flatten(self.observation_space)
         self._batched = make_batched(action)
         self._result: StepResult | None = None
         self._no_workers: NoWorkers | None = None
-        self._assigned: dict[tuple[int, str], tuple[slice, bytes]] = {}  # attributes that were set, by first copy and name
-        self._missing: set[tuple[int, str]] = set()  # attributes that replacements of lost copies lack
-        self._incarnations: Sequence[int] = ()  # of each copy, at the last look for such replacements
+        self._attributes = SetAttributes(env)
 
     def open_lane(self, run: RunSpec, lane: int, pulse: Pulse) -> EnvCopies:
         """The copies of this lane. Pass this method to a `Collector` as its `open_copies`."""
@@ -135,19 +121,13 @@ class SplitVectorEnv:
         in_order = actions[order].reshape(-1, *actions.shape[2:])  # [L · N, *action]
         lanes = [lanes[i] for i in order]
         if lanes not in [[*range(part.start, part.stop)] for part in self.parts(self._lanes)]:
-            raise ValueError(f"lanes: expected all {self._lanes} of the vector environment at once, got {lanes}")
-        if self._some is not None:
-            self._order(lanes, self._copies_of(lanes), in_order, pulse)
-            return
-        with self._errors_of_lanes():
-            returned = self._wait(lambda: self.env.step(self._batched(in_order)), pulse)
-        self._result = self._read_result(returned, slice(None))
+            raise ValueError(f"lanes: expected all lanes of one part, got {lanes}")
+        self._order(lanes, self._copies_of(lanes), in_order, pulse)
 
     def end(self, lanes: Sequence[int], pulse: Pulse) -> None:
         """Wait for the copies of these lanes. Then `SplitLane.step` returns their results."""
-        if self._some is not None:
-            with self._errors_of_lanes():
-                self._result = self._ended(lanes, self._copies_of(lanes), pulse)
+        with self._errors_of_lanes():
+            self._result = self._ended(lanes, self._copies_of(lanes), pulse)
 
     def step_evaluation(self, first: int, copies: Sequence[int], actions: Array, pulse: Pulse) -> None:
         """Step evaluation copies. `copies` are counted from the first evaluation copy, which is copy `first`."""
@@ -170,22 +150,18 @@ class SplitVectorEnv:
 
     def _order(self, lanes: Sequence[int], copies: list[int], actions: Array, pulse: Pulse) -> None:
         """Order these lanes to step with these actions. `copies` are the copies of the lanes."""
-        assert self._some is not None
-        begin_step = self._some.begin_step
-        self._assign_missing(copies, pulse)
+        self._set_missing(copies, pulse)
         if self._actions is None:
             self._actions = np.resize(actions, (self.env.num_envs, *actions.shape[1:]))  # arbitrary, but valid
         padded = self._actions
         padded[copies] = actions
-        self._wait(lambda: begin_step(lanes, self._batched(padded)), pulse)
+        self._wait(lambda: self.env.begin_step(lanes, self._batched(padded)), pulse)
 
     def _ended(self, lanes: Sequence[int], copies: list[int], pulse: Pulse) -> StepResult:
         """Wait for these lanes. `copies` are their copies. The result has a row for each copy of all lanes."""
-        assert self._some is not None
-        end_step = self._some.end_step
-        return self._read_result(self._wait(lambda: end_step(lanes), pulse), copies)
+        return self._read_result(self._wait(lambda: self.env.end_step(lanes), pulse), copies)
 
-    def _read_result(self, returned: Any, copies: slice | list[int]) -> StepResult:
+    def _read_result(self, returned: Any, copies: list[int]) -> StepResult:
         """The result of a step of these copies. It has a row for each copy of the vector environment."""
         observation, reward, terminated, truncated, _ = returned
         infos = self.env.infos_by_row
@@ -214,8 +190,7 @@ class SplitVectorEnv:
 
     def abandon(self) -> None:
         """Stop waiting for steps in progress, because a rollout was dropped."""
-        if self._some is not None:
-            self._some.abandon()
+        self.env.abandon()
 
     def result(self, copies: slice) -> StepResult:
         """The part of the last step's result that belongs to these copies."""
@@ -244,12 +219,12 @@ class SplitVectorEnv:
         options = {"reset_mask": mask}
         chosen = range(copies.start, copies.stop)
         for _ in range(RESETS):
-            self._assign_missing(chosen, pulse)
+            self._set_missing(chosen, pulse)
             observation, _ = self._wait(lambda: self.env.reset(seed=all_seeds, options=options), pulse)
-            if not self._lacking(chosen):
+            if not self._attributes.lacking(chosen):
                 break
         else:
-            names = ", ".join(sorted({name for _, name in self._lacking(chosen)}))
+            names = ", ".join(sorted({name for _, name in self._attributes.lacking(chosen)}))
             raise WorkerLost(
                 f"copies {copies.start} to {copies.stop - 1}: each of {RESETS} resets lost a worker, so new copies lack the "
                 f"attribute {names}"
@@ -261,54 +236,17 @@ class SplitVectorEnv:
 
     def assign(self, copies: slice, name: str, packed: bytes, pulse: Pulse) -> None:
         """Set an attribute of these copies, and of later replacements for lost ones."""
-        assert self._some is not None
-        if not self._assigned:
-            self._incarnations = self._some.incarnations()
-        self._assigned[copies.start, name] = copies, packed
-        self._missing.add((copies.start, name))
-        self._assign_missing(range(copies.start, copies.stop), pulse)
+        self._attributes.record(copies, name, packed)
+        self._set_missing(range(copies.start, copies.stop), pulse)
 
-    def _assign_now(self, copies: slice, name: str, packed: bytes) -> None:
-        chosen = range(copies.start, copies.stop)
-        try:
-            there = self._have(chosen, name)
-            if not there or name in METHODS:
-                what = "a method" if there else "none"
-                raise CopyFailed(None, line=f"expected an attribute of the environment that is called {name}, got {what}")
-            assert self._some is not None
-            self._some.calls.assign(chosen, name, [unpack(packed)] * len(chosen))
-        except EnvironmentFailed as error:
-            raise CopyFailed(None, f"set_env_attr {name}") from error
-
-    def _have(self, copies: Sequence[int], name: str) -> bool:
-        """Whether these copies have the attribute. Copies of a client in another language have no attributes."""
-        try:
-            assert self._some is not None
-            return all(self._some.calls.call(copies, "has_wrapper_attr", (name,), {}))
-        except AttributeError:
-            return False
-
-    def _assign_missing(self, chosen: Sequence[int], pulse: Pulse) -> None:
+    def _set_missing(self, chosen: Sequence[int], pulse: Pulse) -> None:
         """Before these copies are stepped or reset, set the attributes that they lack. Other copies are left for later.
 
         Other copies may be in the middle of a step. If a worker is lost meanwhile, the next step or reset tries again.
         """
-        for key in self._lacking(chosen):
-            copies, packed = self._assigned[key]
+        for key in self._attributes.lacking(chosen):
             with suppress(WorkerLost):
-                self._wait(partial(self._assign_now, copies, key[1], packed), pulse)
-                self._missing.discard(key)
-
-    def _lacking(self, chosen: Sequence[int]) -> list[tuple[int, str]]:
-        """The attributes that some of these copies lack, because they have replaced lost copies."""
-        if not self._assigned:
-            return []
-        assert self._some is not None
-        before = self._incarnations
-        self._incarnations = self._some.incarnations()
-        new = {n for n, (old, now) in enumerate(zip(before, self._incarnations, strict=True)) if old != now}
-        self._missing.update(key for key, (copies, _) in self._assigned.items() if _overlap(new, copies))
-        return [key for key in sorted(self._missing) if _overlap(chosen, self._assigned[key][0])]
+                self._wait(partial(self._attributes.set, key), pulse)
 
     def raise_if_no_workers(self) -> None:
         """Raise `NoWorkers` once, if a wait ended because no worker was left."""
@@ -324,10 +262,6 @@ class SplitVectorEnv:
         except NoWorkers as error:
             self._no_workers = error
             raise
-
-
-def _overlap(chosen: Iterable[int], copies: slice) -> bool:
-    return any(copies.start <= n < copies.stop for n in chosen)
 
 
 class SplitLane:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from typing import Any
 
 import msgspec
@@ -28,7 +27,7 @@ from millrace.workers.copies.split_vector_env import SplitVectorEnv
 from millrace.workers.evaluate.evaluator import Evaluator
 from tests.support.conversation.example_messages import example
 from tests.support.in_process.collectors import collect, no_pulse, random_collector, random_policy
-from tests.support.in_process.infos_by_row import InfosByRow
+from tests.support.in_process.infos_by_row import InfosByRow, split_in_one_part
 from tests.support.users_code.mask_envs import SIZES, InInfo, InObservation, Mixed, Parts
 
 ENVS: dict[str, Any] = {"InInfo": InInfo, "Parts": Parts, "Mixed": Mixed, "InObservation": InObservation}
@@ -50,7 +49,7 @@ def vectorized(run: RunSpec, lane: int, pulse: Any) -> VectorCopies:
 def split(run: RunSpec, lanes: int) -> tuple[SplitVectorEnv, Collector]:
     vector = InfosByRow([run.env.make] * run.copies * lanes)
     vector.reset()  # it cannot reset some copies before all of them
-    env = SplitVectorEnv(vector, lanes, masked=True)
+    env = split_in_one_part(vector, lanes, masked=True)
     return env, Collector(run, random_policy(run.policy), env.open_lane, env)
 
 
@@ -166,33 +165,15 @@ def test_a_wrong_mask_of_a_split_vector_environment_is_of_a_copy_of_its_lane() -
     run = masked_run("InInfo", N=2)
     vector = InfosByRow([InInfo, InInfo, InInfo, NoChoice])
     vector.reset()
-    env = SplitVectorEnv(vector, 2, masked=True)
+    env = split_in_one_part(vector, 2, masked=True)
     with pytest.raises(EnvironmentFailed, match="lane 1, copy 1, first reset: action_mask: expected"):
         collect(Collector(run, random_policy(run.policy), env.open_lane, env), run, lanes=range(2))
 
 
-class StepsAtTheEnd(InfosByRow):
-    """Begins no step before it is waited for, and steps all copies then."""
-
-    calls = None
-
-    def incarnations(self) -> Sequence[int]:
-        return [0] * self.num_envs
-
-    def begin_step(self, lanes: Sequence[int], actions: Any) -> None:
-        self.begun = actions
-
-    def end_step(self, lanes: Sequence[int]) -> Any:
-        return self.step(self.begun)
-
-    def abandon(self) -> None:
-        raise AssertionError("no rollout is dropped")
-
-
 def test_a_wrong_mask_of_the_evaluation_copies_of_a_vector_environment_is_of_a_copy_of_these() -> None:
-    vector = StepsAtTheEnd([NoChoice] * 4)
+    vector = InfosByRow([NoChoice] * 4)
     vector.reset()
-    split = SplitVectorEnv(vector, 2, some=vector, masked=True)
+    split = SplitVectorEnv(vector, 2, masked=True)
     with pytest.raises(CopyFailed) as caught:
         split.evaluation_lane(2).step(np.array([0]), no_pulse, [1])
     assert caught.value.copy == 1

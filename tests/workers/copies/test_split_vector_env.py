@@ -27,7 +27,7 @@ from millrace.workers.copies.env_loop import Pulse
 from millrace.workers.copies.split_vector_env import SplitVectorEnv
 from tests.support.in_process.any_order import any_order
 from tests.support.in_process.collectors import TOY, bits, collect, no_pulse, random_collector, random_policy, run_of
-from tests.support.in_process.infos_by_row import InfosByRow
+from tests.support.in_process.infos_by_row import InfosByRow, split_in_one_part
 
 LANES = 3
 RUNS = {
@@ -43,7 +43,7 @@ RUNS = {
 def split_collector(run: RunSpec) -> Iterator[Collector]:
     env = InfosByRow([run.env.make] * (LANES * run.copies))
     env.reset()  # SyncVectorEnv, unlike ZmqVectorEnv, takes a mask only after a first reset
-    split = SplitVectorEnv(env, LANES)
+    split = split_in_one_part(env, LANES)
     yield Collector(run, random_policy(run.policy), split.open_lane, split)
     env.close()
 
@@ -77,7 +77,7 @@ def test_lanes_are_collected_in_any_order_but_only_all_together() -> None:
     with split_collector(run) as split:
         actual, expected = (collect(collector, run, lanes=(2, 0, 1)) for collector in (split, loop))
         assert [bits(one) for one in actual] == [bits(other) for other in expected]
-        with pytest.raises(ValueError, match=r"expected all 3 of the vector environment at once, got \[0, 2\]"):
+        with pytest.raises(ValueError, match=r"expected all lanes of one part, got \[0, 2\]"):
             collect(split, run, 1, lanes=(0, 2))
 
 
@@ -90,7 +90,7 @@ def test_that_no_worker_is_left_is_raised_once_to_whoever_asks() -> None:
     run = RUNS["discrete"]
     env = WithoutWorkers([run.env.make] * (LANES * run.copies))
     env.reset()
-    split = SplitVectorEnv(env, LANES)
+    split = split_in_one_part(env, LANES)
     with pytest.raises(NoWorkers):
         collect(Collector(run, random_policy(run.policy), split.open_lane, split), run, lanes=range(LANES))
     with pytest.raises(NoWorkers, match=r"^waited 1 s for 1 worker$"):
@@ -125,7 +125,7 @@ def test_a_lost_step_is_in_no_valid_row(at: int) -> None:
     run = run_of(f"{TOY}Countdown-v0", T=3)
     env = LosesTwoCopies([run.env.make] * (LANES * run.copies), at)
     env.reset()
-    split = SplitVectorEnv(env, LANES)
+    split = split_in_one_part(env, LANES)
     collector = Collector(run, random_policy(run.policy), split.open_lane, split)
     by_lane = zip(*(collect(collector, run, k, lanes=range(LANES)) for k in range(4)), strict=True)
     assembler = EpisodeAssembler(lambda actions: (actions,))
@@ -225,14 +225,6 @@ def test_a_dropped_rollout_abandons_the_steps_under_way() -> None:
     abandoned = []
 
     class Abandons(InfosByRow):
-        calls = None
-
-        def incarnations(self) -> Sequence[int]:
-            return [0] * self.num_envs
-
-        def begin_step(self, lanes: Sequence[int], actions: Any) -> None:
-            pass
-
         def end_step(self, lanes: Sequence[int]) -> Any:
             raise NoWorkers("none")
 
@@ -241,7 +233,7 @@ def test_a_dropped_rollout_abandons_the_steps_under_way() -> None:
 
     env = Abandons([run.env.make] * (LANES * run.copies))
     env.reset()
-    split = SplitVectorEnv(env, LANES, some=env)
+    split = SplitVectorEnv(env, LANES)
     with pytest.raises(NoWorkers):
         collect(Collector(run, random_policy(run.policy), split.open_lane, split), run, lanes=range(LANES))
     assert abandoned
@@ -253,7 +245,7 @@ def test_replacements_of_lost_copies_get_the_attributes_when_their_part_is_stepp
     """A part may still step when copies of another part are lost."""
     run = run_of(f"{TOY}Informs-v0", N=1)
     with any_order(VectorEnvSettings(f"{TOY}Informs-v0", LANES, lanes=LANES), LANES, shared=shared) as (env, link):
-        split = SplitVectorEnv(env, LANES, some=env)
+        split = SplitVectorEnv(env, LANES)
         for n in range(LANES):
             lane = split.open_lane(run, n, no_pulse)
             lane.reset([n], no_pulse)
@@ -299,7 +291,7 @@ def test_copies_that_replace_lost_ones_in_a_reset_get_the_attributes_before_it(l
     name = f"{__name__}:LeveledLane-v0"
     run = run_of(name, N=2)
     with any_order(VectorEnvSettings(name, 2 * LANES, lanes=LANES), LANES, shared=shared) as (env, link):
-        split = SplitVectorEnv(env, LANES, some=env)
+        split = SplitVectorEnv(env, LANES)
         lanes = [split.open_lane(run, n, no_pulse) for n in range(LANES)]
         for lane in lanes:
             lane.assign("level", pack(5), no_pulse)
@@ -327,7 +319,7 @@ def test_no_episode_begins_in_copies_without_their_attributes(monkeypatch: pytes
     """Each of the three resets loses a worker, after the attributes were set."""
     name = f"{__name__}:LeveledLane-v0"
     with any_order(VectorEnvSettings(name, 2, lanes=1), 4, shared=False) as (env, link):
-        lane = SplitVectorEnv(env, 1, some=env).open_lane(run_of(name, N=2), 0, no_pulse)
+        lane = SplitVectorEnv(env, 1).open_lane(run_of(name, N=2), 0, no_pulse)
         lane.assign("level", pack(5), no_pulse)
         reset = env.reset
 
