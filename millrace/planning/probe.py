@@ -1,7 +1,8 @@
 """Steps an environment in workers, with random actions, and measures the time and memory that it needs.
 
-Rule: the environment's code runs in workers, never in this process. Everything has a deadline. An error before the first
-step is raised; a later one becomes a finding of one line.
+Rule: the environment's code runs in workers, never in this process. Each session has a deadline; if it isn't whole by then,
+its number of copies counts as not measured. An error before the first step is raised; a later one becomes a finding of one
+line.
 """
 
 from __future__ import annotations
@@ -24,9 +25,8 @@ from millrace.launch.crew import Crew
 from millrace.launch.vector import call_timeouts_of, start_vector_env
 from millrace.learner.vector_env.env import ZmqVectorEnv
 from millrace.learner.vector_env.settings import VectorEnvSettings
-from millrace.planning.in_words import counted
 from millrace.planning.measurements import ActionKind, Machine, Measurements, StepCosts
-from millrace.planning.probe_sizes import Needed, SessionSize, most_each, numbers_of_workers
+from millrace.planning.probe_sizes import SessionSize, most_each, numbers_of_workers
 from millrace.planning.random_actions import SEED, RandomActions, SeenMasks
 from millrace.planning.stopwatch import CopyTimes, read_notes
 from millrace.protocol.arrays import Array
@@ -40,9 +40,8 @@ from millrace.protocol.specs import ActionSpec
 LEAST_STEPS = 8  # number of steps that each copy takes, even if they last longer than planned
 WARM_UP = 2  # this many steps at the beginning of a copy aren't counted
 OF_ALONE = 0.15  # share of the time in which one copy steps alone
-OF_SIDE_BY_SIDE = 0.9  # share of the time after which no more copies are started
 EACH_S = 2.0  # how long each number of workers is measured
-GRACE_S = 1.0  # how long after the end of its time a session waits for the last steps
+GRACE_S = 1.0  # how long after its deadline a session waits for the last steps
 SHORT_S = 1e-3  # shorter steps are measured in workers with several copies, because a run steps them in this way
 OF_ITS_OWN = "if a copy needs a port, a folder or a licence of its own, see docs/how-to/simulators.md"
 MORE_TIME = "allow more with --seconds"
@@ -80,55 +79,33 @@ def probe(env: ProbedEnv, machine: Machine, seconds: float) -> Probed:
 
     Raises `UserFacingError` if no step was completed.
     """
-    give_up_at_s = time.monotonic() + seconds
-    first = _session(env, SessionSize(), OF_ALONE * seconds, give_up_at_s)
+    end_s = time.monotonic() + seconds
+    first = _session(env, SessionSize(), OF_ALONE * seconds, end_s)
     if not first.times or not len(first.times[0].steps):
         why = first.wrong or "the start of a copy, a reset or a step takes longer"
         raise RunError(f"plan: {env.name}: no step could be made within {seconds:g} s: {why}")
     sessions = [first]
     measured = _measured_alone(env, first)
-    worked = first
-    too_slow = ""
-
-    def left_s() -> float:
-        """The time that is left for sessions with several copies."""
-        return give_up_at_s - (1 - OF_SIDE_BY_SIDE) * seconds - time.monotonic()
-
-    if measured.alone.own_s < SHORT_S and first.is_whole:
-        each = min(most_each(measured, machine), first.needed.most_each(left_s()))
-        if each > 1:
-            several = _session(env, SessionSize(each=each), OF_ALONE * seconds, give_up_at_s)
-            sessions.append(several)
-            if several.is_whole:
-                worked = several
-                measured = msgspec.structs.replace(measured, side_by_side=(_costs(1, several.times),))
-    for workers in numbers_of_workers(measured, machine, worked.size.each):
-        size = SessionSize(workers, worked.size.each)
-        if not worked.needed.fits(size, machine.cores, left_s()):
-            too_slow = _not_tried(worked.size, measured)
-            break
-        session = _session(env, size, EACH_S, give_up_at_s)
+    each = 1
+    if first.is_whole and measured.alone.own_s < SHORT_S and (most := most_each(measured, machine)) > 1:
+        # Several workers need the other half of the time that is left.
+        several = _session(env, SessionSize(each=most), OF_ALONE * seconds, (time.monotonic() + end_s) / 2)
+        sessions.append(several)
+        if several.is_whole:
+            each = most
+            measured = msgspec.structs.replace(measured, side_by_side=(_costs(1, several.times),))
+    for workers in () if first.is_too_slow else numbers_of_workers(measured, machine, each):
+        session = _session(env, SessionSize(workers, each), EACH_S, end_s)
         sessions.append(session)
         if not session.is_whole:
             break
-        worked = session
         costs = _costs(workers, session.times)
         if costs.steps_per_s < WORTH_WHILE * measured.side_by_side[-1].steps_per_s:
             break
         measured = msgspec.structs.replace(measured, side_by_side=(*measured.side_by_side, costs))
-    if len(sessions) == 1 and not first.wrong and first.needed.seconds < give_up_at_s - time.monotonic():
-        # A second copy must show whether the environment is deterministic.
-        sessions.append(_session(env, SessionSize(), OF_ALONE * seconds, give_up_at_s))
-    findings = [each for each in (*(session.finding for session in sessions), too_slow) if each]
-    return Probed(_with_all(measured, sessions, findings), first.observation_space, first.action_space, first.seats)
-
-
-def _not_tried(worked: SessionSize, measured: Measurements) -> str:
-    """A line that says why no more workers were tried, if that limits the plan: a plan for steps that wait has no more."""
-    if measured.alone.computes:
-        return ""
-    tried = counted(worked.workers, "worker")
-    return f"more than {tried} were not tried, because their start, reset and first steps may take too long; {MORE_TIME}"
+    if first.is_whole and len(sessions) == 1:  # a second copy must show whether the environment is deterministic
+        sessions.append(_session(env, SessionSize(), OF_ALONE * seconds, end_s))
+    return Probed(_with_all(measured, sessions), first.observation_space, first.action_space, first.seats)
 
 
 # ------------------------------------------------------------------------------------------------------------ one session
@@ -142,12 +119,10 @@ class _SteppedCopies(NamedTuple):
     traces: list[list[int]]
     """for each copy and step, a checksum of the observation, reward and flags that it returned"""
     start_s: float
-    needed_s: float
-    """time until each copy had taken `LEAST_STEPS` steps"""
     wrong: str
     """what went wrong, as one line; empty if nothing did"""
-    too_slow: bool
-    """whether the time was up before all copies had answered"""
+    cut_off: bool
+    """whether the deadline has passed before all copies had answered"""
     masks: SeenMasks
     observation_space: gymnasium.Space[Any]
     action_space: gymnasium.Space[Any]
@@ -155,43 +130,43 @@ class _SteppedCopies(NamedTuple):
     time_limit: int | None
 
     @property
-    def needed(self) -> Needed:
-        """The session's size, and the time that it needed."""
-        return Needed(self.size, self.needed_s)
-
-    @property
     def is_whole(self) -> bool:
         """Whether all copies took steps, in time, and nothing went wrong."""
         stepped = sum(len(each.steps) > WARM_UP for each in self.times)
-        return stepped == len(self.traces) and not self.wrong and not self.too_slow
+        return stepped == self.size.copies and not self.wrong and not self.cut_off
+
+    @property
+    def is_too_slow(self) -> bool:
+        """Whether the deadline passed before all copies had taken a few steps and answered."""
+        return not self.is_whole and not self.wrong
 
     @property
     def finding(self) -> str:
         """What went wrong, and with how many copies, as one line; empty if nothing did."""
-        if not self.wrong and not self.too_slow:
+        if self.is_whole:
             return ""
         if self.size.copies == 1:
             calls = max(map(len, self.traces))
-            why = self.wrong or f"the time was up before the next one returned; unless it hangs, {MORE_TIME}"
+            why = self.wrong or f"the time was up before another one returned; unless it hangs, {MORE_TIME}"
             return f"one copy, after {calls} calls: {why}"
         copies = f"{self.size.copies} copies {'in one worker' if self.size.workers == 1 else 'side by side'}"
-        if self.too_slow:
-            return f"{copies} were not measured, because the time was up before all had answered; {MORE_TIME}"
-        return f"{copies}: {self.wrong}; {OF_ITS_OWN}"
+        if self.wrong:
+            return f"{copies}: {self.wrong}; {OF_ITS_OWN}"
+        return f"{copies} were not measured, because the time was up before all had taken a few steps; {MORE_TIME}"
 
 
 class _TimeIsUp(Exception):
-    """The probe's time is up, and copies have not answered."""
+    """A session's deadline has passed, and copies have not answered."""
 
 
-def _session(env: ProbedEnv, size: SessionSize, seconds: float, give_up_at_s: float) -> _SteppedCopies:
-    """Step copies for this many seconds.
+def _session(env: ProbedEnv, size: SessionSize, seconds: float, deadline_s: float) -> _SteppedCopies:
+    """Step copies for this many seconds, but not beyond the deadline. After the deadline, start no copies at all.
 
     Raises `UserFacingError` if there is only one copy and it can't be made.
     """
 
     def check_time() -> None:
-        if time.monotonic() > give_up_at_s + GRACE_S:
+        if time.monotonic() > deadline_s + GRACE_S:
             raise _TimeIsUp
 
     with TemporaryDirectory(prefix="millrace-plan-") as folder:
@@ -200,11 +175,13 @@ def _session(env: ProbedEnv, size: SessionSize, seconds: float, give_up_at_s: fl
         began_s = time.monotonic()
         traces: list[list[int]] = [[] for _ in range(size.copies)]
         wrong = ""
-        too_slow = False
+        cut_off = False
         known: tuple[Any, ...] = (None, None, (), None)
         masks = SeenMasks(False, "")
-        start_s = needed_s = 0.0
+        start_s = 0.0
         try:
+            if began_s > deadline_s:
+                raise _TimeIsUp
             settings = VectorEnvSettings(
                 env.in_wrapper(f"millrace.planning.stopwatch:stopwatch(folder={str(notes)!r})"),
                 size.copies,
@@ -221,32 +198,30 @@ def _session(env: ProbedEnv, size: SessionSize, seconds: float, give_up_at_s: fl
                 known = (envs.single_observation_space, envs.single_action_space, envs.seats, limit)
                 random_actions = RandomActions(*known[:2], max(1, len(envs.seats)))
                 try:
-                    needed_s = _step(envs, random_actions, traces, time.monotonic() + seconds, give_up_at_s) - began_s
+                    _step(envs, random_actions, traces, time.monotonic() + seconds, deadline_s)
                 finally:
                     masks = random_actions.masks
         except UsageError:
             raise
         except _TimeIsUp:
-            too_slow = True
+            cut_off = True
         except MillraceError as error:
             if size.copies == 1 and not any(notes.iterdir()):
                 raise
             wrong = one_line(first_line(error, type(error).__name__))
         times = [each for each in read_notes(notes) if len(each.resets)]
-        needed_s = needed_s or time.monotonic() - began_s
-        return _SteppedCopies(size, times, traces, start_s, needed_s, wrong, too_slow, masks, *known)
+        return _SteppedCopies(size, times, traces, start_s, wrong, cut_off, masks, *known)
 
 
 def _step(
-    envs: ZmqVectorEnv, random_actions: RandomActions, traces: list[list[int]], end_at_s: float, give_up_at_s: float
-) -> float:
-    """Step all copies until `end_at_s`; a copy's next step begins as soon as its previous one has ended.
+    envs: ZmqVectorEnv, random_actions: RandomActions, traces: list[list[int]], end_at_s: float, deadline_s: float
+) -> None:
+    """Step all copies until `end_at_s`, or until the deadline if they haven't taken `LEAST_STEPS` steps by `end_at_s`.
 
-    Returns the time at which each copy had taken `LEAST_STEPS` steps.
+    A copy's next step begins as soon as its previous one has ended.
     """
     agents = max(1, len(envs.seats))
     space = envs.single_action_space
-    stepped_at_s = 0.0
     envs.reset_async(seed=[SEED] * len(traces))
     while envs.outstanding:
         observation, reward, terminated, truncated, infos = envs.recv()
@@ -259,13 +234,10 @@ def _step(
             terminated = ~infos["acts"]
         actions = random_actions.choose([len(traces[copy]) for copy in ready], observation, infos, terminated, truncated)
         now_s = time.monotonic()
-        if not stepped_at_s and min(map(len, traces)) > LEAST_STEPS:
-            stepped_at_s = now_s
-        if now_s < give_up_at_s and (now_s < end_at_s or not stepped_at_s):
+        if now_s < deadline_s and (now_s < end_at_s or min(map(len, traces)) <= LEAST_STEPS):
             into: Any = create_empty_array(space, len(actions))
             batch = concatenate(space, actions, into)
             envs.send(batch, ready)
-    return stepped_at_s or time.monotonic()
 
 
 def _arrays(observation: Any) -> Iterator[Array]:
@@ -316,7 +288,7 @@ def _measured_alone(env: ProbedEnv, session: _SteppedCopies) -> Measurements:
     )
 
 
-def _with_all(measured: Measurements, sessions: Sequence[_SteppedCopies], findings: Sequence[str]) -> Measurements:
+def _with_all(measured: Measurements, sessions: Sequence[_SteppedCopies]) -> Measurements:
     """Add the measurements that need all sessions.
 
     The first reset of a copy may be slower than the later ones, so it isn't counted unless no copy was reset twice.
@@ -341,7 +313,7 @@ def _with_all(measured: Measurements, sessions: Sequence[_SteppedCopies], findin
         failed_in_one_worker=min((size.each for size in failed if size.workers == 1), default=0),
         episode_steps=steps / sum(map(len, later)) if later else sessions[0].time_limit,
         deterministic=_deterministic([trace for session in sessions for trace in session.traces]),
-        findings=tuple(findings),
+        findings=tuple(session.finding for session in sessions if not session.is_whole),
     )
 
 

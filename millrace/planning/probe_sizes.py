@@ -1,7 +1,6 @@
-"""How many workers and copies the sessions of a probe have, so that they fit into its time and its memory. Pure.
+"""How many workers and copies the sessions of a probe have. Pure.
 
-Rule: an estimate assumes the worst case: the copies of a worker start, reset and step one after another, and all of this
-computes, so that more workers than cores take turns.
+Rule: no session needs more copies than are allowed, or more than `OF_MEMORY` of the free memory.
 """
 
 from __future__ import annotations
@@ -17,7 +16,6 @@ MOST_AT_LEAST = 16  # number of workers to try even if `MOST_PER_CORE` allows fe
 COPIES_OF_SHORT = 8  # number of copies in a worker if steps are short
 GROWTH = 4  # each number of workers to try is this many times the one before
 OF_MEMORY = 0.7  # the probe uses at most this share of the free memory
-SPARE = 1.5  # a session begins only if there is this many times the time that it needs
 
 
 class SessionSize(NamedTuple):
@@ -30,22 +28,6 @@ class SessionSize(NamedTuple):
     def copies(self) -> int:
         """The number of copies of all workers together."""
         return self.workers * self.each
-
-
-class Needed(NamedTuple):
-    """The time that a session needed until each copy had taken a few steps."""
-
-    size: SessionSize
-    seconds: float
-
-    def most_each(self, left_s: float) -> int:
-        """The largest number of copies in each worker for which a session with as many workers fits into `left_s`."""
-        return int(left_s * self.size.each / (SPARE * max(self.seconds, 1e-9)))
-
-    def fits(self, size: SessionSize, cores: int, left_s: float) -> bool:
-        """Whether a session of this size fits into `left_s`."""
-        turns = max(1.0, size.workers / cores) / max(1.0, self.size.workers / cores)
-        return SPARE * self.seconds * turns * size.each / self.size.each <= left_s
 
 
 def most_each(measured: Measurements, machine: Machine) -> int:

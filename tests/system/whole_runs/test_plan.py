@@ -18,7 +18,7 @@ import pytest
 import millrace
 from millrace.cli.main import main
 from millrace.learner.config.command_line import read_config
-from millrace.planning.measurements import Machine
+from millrace.planning.measurements import Machine, Measurements
 from millrace.planning.probe import LEAST_STEPS, ProbedEnv, probe
 from millrace.planning.probe_sizes import COPIES_OF_SHORT
 from millrace.protocol.errors import RunError, UsageError
@@ -26,6 +26,7 @@ from millrace.protocol.errors import RunError, UsageError
 TOY = "tests.support.envs.toy"
 BRIEF_S = 6.0
 ENDS_WITHIN_S = 5.0  # after the time of a probe, its workers have this long to end
+NOT_MEASURED = "copies (in one worker|side by side) were not measured, because the time was up .*--seconds"
 LARGEST = float(np.finfo(np.float32).max)
 
 
@@ -45,6 +46,11 @@ class Forgets(gymnasium.Env[Any, Any]):
 
     def _shown(self) -> Any:
         return np.frombuffer(os.urandom(2), np.uint8).astype(np.float32)
+
+
+def failures(measured: Measurements) -> list[str]:
+    """The findings, without those of copies for which there was no time."""
+    return [line for line in measured.findings if not re.fullmatch(rf"\d+ {NOT_MEASURED}", line)]
 
 
 def planned(capsys: pytest.CaptureFixture[str], env: str, *flags: str) -> dict[str, Any]:
@@ -155,16 +161,17 @@ def test_a_plan_for_an_environment_of_which_a_second_copy_fails_has_one_copy(
 
 
 class Slow(gymnasium.Env[Any, Any]):
-    """Short steps. Making a copy, a reset, or making another copy in the same process takes this many seconds."""
+    """Making a copy, a reset, a step, or making another copy in the same process takes this many seconds more."""
 
     observation_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
     action_space = gymnasium.spaces.Discrete(2)
     made = 0
 
-    def __init__(self, start_s: float = 0.0, reset_s: float = 0.0, another_s: float = 0.0) -> None:
+    def __init__(self, start_s: float = 0.0, reset_s: float = 0.0, step_s: float = 0.0, another_s: float = 0.0) -> None:
         time.sleep(start_s + (another_s if Slow.made else 0.0))
         Slow.made += 1
         self._reset_s = reset_s
+        self._step_s = step_s
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
         super().reset(seed=seed)
@@ -172,24 +179,38 @@ class Slow(gymnasium.Env[Any, Any]):
         return np.zeros(1, np.float32), {}
 
     def step(self, action: Any) -> Any:
+        time.sleep(self._step_s)
         return np.zeros(1, np.float32), 0.0, False, False, {}
 
 
 @pytest.mark.parametrize("slow", ["start_s", "reset_s"])
-def test_slow_copies_are_tried_only_as_far_as_the_time_allows_and_limit_nothing(slow: str) -> None:
+def test_slow_copies_are_measured_only_as_far_as_the_time_allows_and_limit_nothing(slow: str) -> None:
     began_s = time.monotonic()
     measured = probe(ProbedEnv(Slow, {slow: 1.5}, ()), Machine(cores=2), seconds=2 * BRIEF_S).measured
     assert time.monotonic() - began_s < 2 * BRIEF_S + ENDS_WITHIN_S
-    assert (measured.copies_failed, measured.failed_in_one_worker, measured.findings) == (0, 0, ())
+    assert (measured.copies_failed, measured.failed_in_one_worker) == (0, 0)
+    assert failures(measured) == []
 
 
-def test_a_session_that_takes_longer_than_the_time_left_is_not_a_failure_and_ends_with_the_time() -> None:
+def test_copies_in_one_worker_that_take_too_long_are_not_a_failure_and_leave_time_for_several_workers() -> None:
     began_s = time.monotonic()
     measured = probe(ProbedEnv(Slow, {"another_s": 60.0}, ()), Machine(cores=2), seconds=2 * BRIEF_S).measured
     assert time.monotonic() - began_s < 2 * BRIEF_S + ENDS_WITHIN_S
-    assert (measured.copies_failed, measured.failed_in_one_worker) == (0, 0)
-    (line,) = measured.findings
-    assert re.fullmatch(r"[2-8] copies in one worker were not measured, because the time was up .*--seconds", line)
+    assert (measured.copies_worked, measured.copies_failed, measured.failed_in_one_worker) == (2, 0, 0)
+    assert failures(measured) == []
+    assert re.match("[2-8] copies in one worker were not measured", measured.findings[0])
+
+
+def test_more_workers_are_tried_as_long_as_there_is_time_even_if_they_start_slowly() -> None:
+    measured = probe(ProbedEnv(Slow, {"start_s": 1.0, "step_s": 0.01}, ()), Machine(cores=2), seconds=4 * BRIEF_S).measured
+    assert measured.copies_worked >= 8
+    assert failures(measured) == []
+
+
+def test_if_steps_take_so_long_that_only_one_copy_is_measured_a_line_says_so() -> None:
+    measured = probe(ProbedEnv(Slow, {"step_s": 1.0}, ()), Machine(cores=2), seconds=2 * BRIEF_S).measured
+    reported = [bool(re.fullmatch(rf"2 {NOT_MEASURED}", line)) for line in measured.findings]
+    assert reported == [True] * (2 - measured.copies_worked)
 
 
 class OneInEachProcess(gymnasium.Env[Any, Any]):
@@ -235,7 +256,7 @@ def test_random_actions_are_allowed_ones_in_whichever_form_masks_come(name: str)
     """The environments raise for any other action."""
     env = ProbedEnv(f"tests.support.users_code.mask_envs:{name}-v0", {}, ())
     measured = probe(env, Machine(cores=1), seconds=3).measured
-    assert measured.findings == ()
+    assert failures(measured) == []
     assert measured.alone.steps >= LEAST_STEPS
     assert measured.masks_in_info == ("InObservation" not in name)
 
@@ -304,4 +325,4 @@ def test_bounds_that_say_nothing_fit_a_plan(actions: str, algo: str) -> None:
     plan = millrace.plan(Boundless, env_kwargs={"actions": actions}, max_env_copies=2, seconds=BRIEF_S)
     assert plan.settings["algo"] == algo, "those for continuous actions need bounds"
     assert plan.steps_per_s > 0
-    assert not plan.measured.findings
+    assert failures(plan.measured) == []
