@@ -26,7 +26,7 @@ from millrace.launch.vector import call_timeouts_of, start_vector_env
 from millrace.learner.vector_env.env import ZmqVectorEnv
 from millrace.learner.vector_env.settings import VectorEnvSettings
 from millrace.planning.measurements import ActionKind, Machine, Measurements, StepCosts
-from millrace.planning.probe_sizes import SessionSize, most_each, numbers_of_workers
+from millrace.planning.probe_sizes import SessionSize, most_each, numbers_of_workers, two_fit
 from millrace.planning.random_actions import SEED, RandomActions, SeenMasks
 from millrace.planning.stopwatch import CopyTimes, read_notes
 from millrace.protocol.arrays import Array
@@ -103,8 +103,9 @@ def probe(env: ProbedEnv, machine: Machine, seconds: float) -> Probed:
         if costs.steps_per_s < WORTH_WHILE * measured.side_by_side[-1].steps_per_s:
             break
         measured = msgspec.structs.replace(measured, side_by_side=(*measured.side_by_side, costs))
-    if first.is_whole and len(sessions) == 1:  # a second copy must show whether the environment is deterministic
-        sessions.append(_session(env, SessionSize(), OF_ALONE * seconds, end_s))
+    if first.is_whole and not any(session.size.each > 1 or session.failed_with_two for session in sessions):
+        # An evaluation makes a second copy in a worker. It also shows whether the environment is deterministic.
+        sessions.append(_session(env, SessionSize(each=2 if two_fit(measured, machine) else 1), EACH_S, end_s))
     return Probed(_with_all(measured, sessions), first.observation_space, first.action_space, first.seats)
 
 
@@ -139,6 +140,11 @@ class _SteppedCopies(NamedTuple):
     def is_too_slow(self) -> bool:
         """Whether the deadline passed before all copies had taken a few steps and answered."""
         return not self.is_whole and not self.wrong
+
+    @property
+    def failed_with_two(self) -> bool:
+        """Whether two copies failed, in one worker or side by side."""
+        return bool(self.wrong) and self.size.copies == 2
 
     @property
     def finding(self) -> str:

@@ -41,6 +41,11 @@ def most_each(measured: Measurements, machine: Machine) -> int:
     return max(1, most)
 
 
+def two_fit(measured: Measurements, machine: Machine) -> bool:
+    """Whether two copies in one worker fit into the memory. Two are always allowed: one trains, the other evaluates."""
+    return machine.free_bytes is None or WORKER_BYTES + 2 * measured.copy_bytes <= OF_MEMORY * machine.free_bytes
+
+
 def numbers_of_workers(measured: Measurements, machine: Machine, each: int) -> Iterator[int]:
     """The numbers of workers to try, ascending. `each`: the number of copies of each worker."""
     alone = measured.alone

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from millrace.planning.measurements import Machine
-from millrace.planning.probe_sizes import COPIES_OF_SHORT, OF_MEMORY, most_each, numbers_of_workers
+from millrace.planning.probe_sizes import COPIES_OF_SHORT, OF_MEMORY, most_each, numbers_of_workers, two_fit
 from tests.millrace.planning.made_up import measured
 
 GB = 1 << 30
@@ -14,7 +14,7 @@ IDLE_WORKER = 50 << 20
 
 @pytest.mark.parametrize("cores", [1, 2, 8, 64])
 @pytest.mark.parametrize("free_gb", [1, 4, 16, 256])
-@pytest.mark.parametrize("worker_bytes", [60 << 20, 300 << 20, GB, 4 * GB])
+@pytest.mark.parametrize("worker_bytes", [60 << 20, 300 << 20, GB, 2 * GB, 4 * GB])
 @pytest.mark.parametrize(("wait_s", "cpu_s"), [(0.0, 1e-4), (9e-4, 1e-5)])
 def test_no_session_uses_more_than_its_share_of_the_free_memory(
     cores: int, free_gb: int, worker_bytes: int, wait_s: float, cpu_s: float
@@ -22,13 +22,16 @@ def test_no_session_uses_more_than_its_share_of_the_free_memory(
     machine = Machine(cores=cores, free_bytes=free_gb * GB)
     found = measured(wait_s=wait_s, cpu_s=cpu_s, worker_bytes=worker_bytes)
     each = most_each(found, machine)
-    for workers in [*numbers_of_workers(found, machine, each), *[1] * (each > 1)]:
-        assert workers * (IDLE_WORKER + each * (worker_bytes - IDLE_WORKER)) <= OF_MEMORY * free_gb * GB
+    sizes = [(workers, each) for workers in numbers_of_workers(found, machine, each)]
+    sizes += [(1, each)] * (each > 1) + [(1, 2)] * two_fit(found, machine)
+    for workers, copies in sizes:
+        assert workers * (IDLE_WORKER + copies * (worker_bytes - IDLE_WORKER)) <= OF_MEMORY * free_gb * GB
 
 
 def test_small_copies_are_stepped_several_in_a_worker_on_each_core() -> None:
     machine = Machine(cores=8, free_bytes=16 * GB)
     found = measured(cpu_s=1e-4, worker_bytes=60 << 20)
     assert most_each(found, machine) == COPIES_OF_SHORT
+    assert two_fit(found, machine)
     assert [*numbers_of_workers(found, machine, COPIES_OF_SHORT)] == [8]
     assert most_each(found, Machine(cores=8, most_copies=24)) == 3

@@ -124,6 +124,13 @@ def test_no_more_copies_are_tried_than_are_allowed_even_if_steps_are_short(most_
     assert measured.copies_worked <= most_copies
 
 
+def compute(seconds: float) -> None:
+    """Use a core for this long."""
+    end_s = time.process_time() + seconds
+    while time.process_time() < end_s:
+        pass
+
+
 class Licensed(gymnasium.Env[Any, Any]):
     """Computes for 3 ms in each step. Only one copy may exist on this machine."""
 
@@ -139,9 +146,7 @@ class Licensed(gymnasium.Env[Any, Any]):
         return np.zeros(1, np.float32), {}
 
     def step(self, action: Any) -> Any:
-        until_s = time.process_time() + 0.003
-        while time.process_time() < until_s:
-            pass
+        compute(0.003)
         return np.zeros(1, np.float32), 0.0, False, False, {}
 
     def close(self) -> None:
@@ -153,8 +158,10 @@ def test_a_plan_for_an_environment_of_which_a_second_copy_fails_has_one_copy(
 ) -> None:
     monkeypatch.setattr("millrace.planning.plan.usable_cores", lambda: 2)
     plan = millrace.plan(Licensed, env_kwargs={"licence": str(tmp_path / "licence")}, seconds=2 * BRIEF_S)
-    assert plan.measured.copies_worked == 1
-    assert any(line.startswith("2 copies side by side: ") for line in plan.advice)
+    assert (plan.measured.copies_worked, plan.measured.copies_failed, plan.measured.failed_in_one_worker) == (1, 2, 0)
+    (line,) = plan.measured.findings
+    assert line.startswith("2 copies side by side: ")
+    assert line in plan.advice
     assert (plan.settings["envs"], plan.settings["workers"], plan.settings["lanes"]) == (1, 1, 1)
     assert plan.settings["eval_copies"] == 1
     assert any(line.startswith("evaluations need a second copy, but 2 did not work side by side") for line in plan.advice)
@@ -209,32 +216,36 @@ def test_more_workers_are_tried_as_long_as_there_is_time_even_if_they_start_slow
 
 def test_if_steps_take_so_long_that_only_one_copy_is_measured_a_line_says_so() -> None:
     measured = probe(ProbedEnv(Slow, {"step_s": 1.0}, ()), Machine(cores=2), seconds=2 * BRIEF_S).measured
-    reported = [bool(re.fullmatch(rf"2 {NOT_MEASURED}", line)) for line in measured.findings]
-    assert reported == [True] * (2 - measured.copies_worked)
+    matches = [re.fullmatch(rf"2 {NOT_MEASURED}", line) for line in measured.findings]
+    reported = [match and match[1] for match in matches]
+    assert reported == ["side by side"] * (2 - measured.copies_worked) + ["in one worker"]
 
 
 class OneInEachProcess(gymnasium.Env[Any, Any]):
-    """Short steps. A process may make only one copy."""
+    """Computes for `step_s` in each step. A process may make only one copy."""
 
     observation_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
     action_space = gymnasium.spaces.Discrete(2)
     made = False
 
-    def __init__(self) -> None:
+    def __init__(self, step_s: float) -> None:
         if OneInEachProcess.made:
             raise RuntimeError("cannot create multiple simulators in a process")
         OneInEachProcess.made = True
+        self._step_s = step_s
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
         super().reset(seed=seed)
         return np.zeros(1, np.float32), {}
 
     def step(self, action: Any) -> Any:
+        compute(self._step_s)
         return np.zeros(1, np.float32), 0.0, False, False, {}
 
 
-def test_an_environment_that_allows_one_copy_in_each_process_is_found_out() -> None:
-    measured = probe(ProbedEnv(OneInEachProcess, {}, ()), Machine(cores=2), seconds=2 * BRIEF_S).measured
+@pytest.mark.parametrize("step_s", [0.0, 0.005])
+def test_an_environment_that_allows_one_copy_in_each_process_is_found_out(step_s: float) -> None:
+    measured = probe(ProbedEnv(OneInEachProcess, {"step_s": step_s}, ()), Machine(cores=2), seconds=2 * BRIEF_S).measured
     assert measured.copies_worked == 2
     assert 2 <= measured.failed_in_one_worker <= COPIES_OF_SHORT
     (line,) = measured.findings
