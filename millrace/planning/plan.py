@@ -188,6 +188,12 @@ def _advice(sizes: Sizes, situation: Situation, rate: float) -> list[str]:
     measured = situation.measured
     machine = situation.machine
     lines = list(measured.findings)
+    if sizes.envs > measured.copies_worked:
+        lines.append(
+            f"this command has {sizes.envs} env copies, but the plan measured at most "
+            f"{counted(measured.copies_worked, 'copy', 'copies')} at the same time: the speed of {sizes.envs} is computed, "
+            "and they may not work together"
+        )
     if measured.copies_failed and measured.copies_worked == 1:
         lines.append(
             f"evaluations need a second copy, but {measured.copies_failed} did not work side by side: the evaluation of "

@@ -44,7 +44,7 @@ EACH_S = 2.0  # how long each number of workers is measured
 GRACE_S = 1.0  # how long after its deadline a session waits for the last steps
 SHORT_S = 1e-3  # shorter steps are measured in workers with several copies, because a run steps them in this way
 OF_ITS_OWN = "if a copy needs a port, a folder or a licence of its own, see docs/how-to/simulators.md"
-MORE_TIME = "allow more with --seconds"
+MORE_TIME = "allow more time with --seconds"
 WORTH_WHILE = 1.1  # if more workers don't increase the env steps/s by this factor, even larger numbers aren't tried
 
 
@@ -75,7 +75,7 @@ class Probed(NamedTuple):
 
 
 def probe(env: ProbedEnv, machine: Machine, seconds: float) -> Probed:
-    """Step one copy, then several side by side, for about this many seconds in total.
+    """Step one copy, then several in one worker and side by side, for about this many seconds in total.
 
     Raises `UserFacingError` if no step was completed.
     """
@@ -158,7 +158,8 @@ class _SteppedCopies(NamedTuple):
         copies = f"{self.size.copies} copies {'in one worker' if self.size.workers == 1 else 'side by side'}"
         if self.wrong:
             return f"{copies}: {self.wrong}; {OF_ITS_OWN}"
-        return f"{copies} were not measured, because the time was up before all had taken a few steps; {MORE_TIME}"
+        why = "the time was up before all had taken a few steps"
+        return f"{copies} were not measured, because {why}; unless they hang, {MORE_TIME}"
 
 
 class _TimeIsUp(Exception):

@@ -26,7 +26,7 @@ from millrace.protocol.errors import RunError, UsageError
 TOY = "tests.support.envs.toy"
 BRIEF_S = 6.0
 ENDS_WITHIN_S = 5.0  # after the time of a probe, its workers have this long to end
-NOT_MEASURED = "copies (in one worker|side by side) were not measured, because the time was up .*--seconds"
+NOT_MEASURED = "copies (in one worker|side by side) were not measured, because .*; unless they hang, allow more time.*"
 LARGEST = float(np.finfo(np.float32).max)
 
 
@@ -132,14 +132,14 @@ def compute(seconds: float) -> None:
 
 
 class Licensed(gymnasium.Env[Any, Any]):
-    """Computes for 3 ms in each step. Only one copy may exist on this machine."""
+    """Computes for 3 ms in each step. Only one copy may exist on this machine: another one fails or, if `waits`, hangs."""
 
     observation_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
     action_space = gymnasium.spaces.Discrete(2)
 
-    def __init__(self, licence: str) -> None:
+    def __init__(self, licence: str, waits: bool = False) -> None:
         self._licence = os.open(licence, os.O_CREAT | os.O_RDWR)
-        fcntl.flock(self._licence, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(self._licence, fcntl.LOCK_EX if waits else fcntl.LOCK_EX | fcntl.LOCK_NB)
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
         super().reset(seed=seed)
@@ -165,6 +165,20 @@ def test_a_plan_for_an_environment_of_which_a_second_copy_fails_has_one_copy(
     assert (plan.settings["envs"], plan.settings["workers"], plan.settings["lanes"]) == (1, 1, 1)
     assert plan.settings["eval_copies"] == 1
     assert any(line.startswith("evaluations need a second copy, but 2 did not work side by side") for line in plan.advice)
+    assert not any("measured at most" in line for line in plan.advice)
+
+
+def test_a_plan_with_more_copies_than_were_measured_says_so_and_that_those_that_took_too_long_may_hang(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("millrace.planning.plan.usable_cores", lambda: 2)
+    env_kwargs: dict[str, Any] = {"licence": str(tmp_path / "licence"), "waits": True}
+    plan = millrace.plan(Licensed, env_kwargs=env_kwargs, seconds=2 * BRIEF_S)
+    assert (plan.measured.copies_worked, plan.measured.copies_failed) == (1, 0)
+    assert len(plan.measured.findings) == 2  # for two workers, and for two copies in one worker
+    assert failures(plan.measured) == []
+    has = f"this command has {plan.settings['envs']} env copies, but the plan measured at most 1 copy at the same time: "
+    assert any(line.startswith(has) for line in plan.advice)
 
 
 class Slow(gymnasium.Env[Any, Any]):
