@@ -17,7 +17,7 @@ from millrace.planning.in_words import counted, number_in_words, time_in_words
 from millrace.planning.measurements import WORKER_BYTES, Machine, Measurements
 
 AS_GOOD = 0.95
-SLOW_S = 0.005  # if a step takes longer, divided by the copies at once, an algorithm with a replay buffer ends sooner
+SLOW_S = 0.003  # if a step takes longer, divided by the copies at once, an algorithm with a replay buffer ends sooner
 SLOW_WITH_IMAGES_S = 0.05  # the limit if actions are continuous and observations are images
 MOST_ENVS = 64  # if a step computes rather than waits, more env copies gain little
 UNEVEN = 3.0  # steps are uneven if the 95th percentile of the step time is above this multiple of the median

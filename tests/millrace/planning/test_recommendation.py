@@ -178,15 +178,15 @@ def test_all_that_is_chosen_is_nearly_the_best_of_all_sizes() -> None:
 @pytest.mark.parametrize(
     ("each_ms", "action", "others", "algo"),
     [  # the table of docs/how-to/algorithms.md
-        (6, "box", {}, "xqc"),
+        (4, "box", {}, "xqc"),
         (60, "box", {"images": True}, "sac"),
         (40, "box", {"images": True}, "ppo"),
-        (6, "discrete", {}, "rainbow"),
-        (6, "discrete", {"images": True}, "rainbow"),
-        (6, "other", {}, "ppo"),
-        (6, "box", {"agents": 3}, "ppo"),
-        (4, "box", {}, "ppo"),
-        (4, "discrete", {}, "ppo"),
+        (4, "discrete", {}, "rainbow"),
+        (4, "discrete", {"images": True}, "rainbow"),
+        (4, "other", {}, "ppo"),
+        (4, "box", {"agents": 3}, "ppo"),
+        (2, "box", {}, "ppo"),
+        (2, "discrete", {}, "ppo"),
     ],
 )
 def test_the_algorithm_is_that_of_the_manual(each_ms: float, action: ActionKind, others: dict[str, Any], algo: str) -> None:
