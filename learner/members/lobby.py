@@ -95,6 +95,7 @@ class Lobby:
         stall_timeout_s = self._settings.stall_timeout_s
         members = coordinator.members
         began_s = self._clock()  # since then, there has always been a worker that could describe the environment
+        looked_s = counted_s = began_s  # `counted_s` moves on with the time without workers, so that it doesn't count
         wait = LongWait(began_s)
         wait_for_answer = LongWait(began_s)
         server.send(coordinator.ask(unknown))
@@ -104,11 +105,13 @@ class Lobby:
             self._check()
             now = self._clock()
             if not members:
+                counted_s += now - looked_s
                 began_s = now
                 wait_for_answer = LongWait(now)
+            looked_s = now
             # Time in the environment's code doesn't count, because those calls have their own timeouts, with better errors.
-            busy_s = max((member.in_env_code_s for member in members.values()), default=began_s)
-            if now - max(began_s, busy_s) > stall_timeout_s:
+            busy_s = max((member.in_env_code_s for member in members.values()), default=counted_s)
+            if now - max(counted_s, busy_s) > stall_timeout_s:
                 told = server.what_workers_do()
                 raise Stalled(f"no description of the environment within {stall_timeout_s:.0f} s; {told}")
             if wait.due(now):

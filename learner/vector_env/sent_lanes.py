@@ -178,12 +178,11 @@ class SentLanes:
         """Take whichever of these lanes are ready; they now count as having come back. Others are left for later."""
         taken = [lane for lane in sorted(lanes) if lane in self._results]
         rows = self._layout.rows_of(self._layout.copies_of(taken)) if self._losses else ()
-        for lane in taken:
+        losses = {row: self._losses.pop(row) for row in rows if row in self._losses}
+        results = {lane: self._results.pop(lane) for lane in taken}
+        for lane in taken:  # only now, because an interrupt may come before, and `give_up` forgets lanes that were sent
             del self.sent[lane]
-        return Ready(
-            {lane: self._results.pop(lane) for lane in taken},
-            {row: self._losses.pop(row) for row in rows if row in self._losses},
-        )
+        return Ready(results, losses)
 
     def _copies(self, lanes: Iterable[int]) -> list[int]:
         found: list[int] = []

@@ -112,8 +112,8 @@ class ResetAhead(gymnasium.Wrapper[Any, Any, Any, Any]):
         if self._prepared is None and not other.has_wrapper_attr(name):
             self._late[name] = deepcopy(value)
         else:
-            self._late.pop(name, None)  # an older value, if the reset after which it was to be set has failed
             _set(other, name, deepcopy(value))
+            self._late.pop(name, None)  # an older value, if the reset after which it was to be set has failed
         return playing.set_wrapper_attr(name, value)
 
     def instances(self) -> tuple[gymnasium.Env[Any, Any], gymnasium.Env[Any, Any]]:

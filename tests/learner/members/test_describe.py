@@ -524,6 +524,24 @@ def test_time_without_workers_is_neither_a_stall_nor_time_of_a_description(first
     assert lobby.described_in_s == pytest.approx(3.0, abs=0.2)
 
 
+def test_workers_that_join_and_die_one_after_the_other_stall_the_start() -> None:
+    """Each is silent for 5 s before it counts as lost. Its successor joins 15 s later."""
+    link = FakeLink()
+    lobby = Lobby(
+        cast(LearnerLink, link), FakeProcesses(expected=1), replace(SETTINGS, stall_timeout_s=18), lambda: link.now
+    )
+    began_s = link.now
+    turns = [joins(link, b"w%d" % n, began_s + 20.0 * n) for n in range(9)]
+
+    def join() -> None:
+        for turn in turns:
+            turn()
+
+    with pytest.raises(Stalled, match="no description of the environment within 18 s"):
+        lobby.describe(Unknown(ENV), join)
+    assert link.now - began_s == pytest.approx(63, abs=2), "the time of the fourth worker: three others took 15 s together"
+
+
 def test_more_workers_describe_only_once_those_that_joined_have_had_time_to() -> None:
     """The log mentions the wait earlier, because it counts the time without workers too."""
     link = FakeLink()

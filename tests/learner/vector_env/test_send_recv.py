@@ -19,7 +19,7 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 import millrace
-from millrace.learner.vector_env import calls, send_recv
+from millrace.learner.vector_env import calls, send_recv, sent_lanes
 from millrace.learner.vector_env import env as env_module
 from millrace.learner.vector_env.batch_layout import BatchLayout
 from millrace.learner.vector_env.env import ZmqVectorEnv
@@ -1026,7 +1026,7 @@ def interrupted(call: Callable[[], object], at: int) -> bool:
     return False
 
 
-FILES = {module.__file__ for module in (calls, env_module, send_recv)}
+FILES = {module.__file__ for module in (calls, env_module, send_recv, sent_lanes)}
 CALLS: dict[str, Callable[[ZmqVectorEnv], object]] = {
     "step": lambda env: env.step(zeros(range(4))),
     "step_async": lambda env: env.step_async(zeros(range(4))),
