@@ -6,20 +6,19 @@ UTF-8 cannot encode, integers with more decimal digits than Python converts, and
 (`_too_slow`) are not plain. A value that isn't plain raises `TypeError`; if the caller asks for it, the value is instead
 sent as its `repr` and arrives as a `ReprString`, which cannot be confused with a string. For such a caller, subclasses of
 dict, list and tuple are plain too: they arrive as dicts, lists and tuples. Other numbers, buffers, and objects with
-numpy's protocol, such as tensors, arrive as numpy scalars or arrays if numpy reads numbers from them; any other sequence
-arrives as a list.
+numpy's protocol, such as tensors, arrive as numpy scalars or arrays if numpy reads numbers from them. A deque arrives as
+a list. Other sequences don't, because some never end, or contain themselves, as a character of a `UserString` does.
 """
 
 from __future__ import annotations
 
 import math
 import sys
-from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections import Counter, deque
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from functools import partial
-from itertools import islice
 from typing import Any
 
 import msgpack
@@ -108,7 +107,7 @@ class _Packer:
             return value
         if kind is int and (digits := _digits(value)) is not None:
             return msgpack.ExtType(_Code.INT, digits)
-        if self._is_a(list, value):
+        if self._is_a(list, value) or (self.use_repr and isinstance(value, deque)):
             return self._items(value, where, depth)
         if self._is_a(tuple, value):
             return msgpack.ExtType(_Code.TUPLE, _pack(self._items(value, where, depth)))
@@ -124,7 +123,8 @@ class _Packer:
         if isinstance(value, np.generic) and value.dtype.kind in DTYPE_KINDS:
             return msgpack.ExtType(_Code.SCALAR, _pack([value.dtype.str, value.tobytes()]))
         if self.use_repr:
-            return self._other(value, where, depth)
+            numbers = _numbers(value)
+            return _repr(value) if numbers is None else self.convert(numbers, where, depth)
         got = {
             str: "text with a lone surrogate",
             int: "an integer with too many digits",
@@ -154,14 +154,6 @@ class _Packer:
                 return _repr(key)
             raise
 
-    def _other(self, value: Any, where: str, depth: int) -> Any:
-        """Convert a value that isn't plain: to numbers, to a list, or else to its `repr`."""
-        if (numbers := _numbers(value)) is not None:
-            return self.convert(numbers, where, depth)
-        if (listed := _listed(value)) is not None:
-            return self._items(listed, where, depth)
-        return _repr(value)
-
 
 def _too_slow(keys: Iterable[object], limit: KeyLimit) -> bool:
     """Whether a dict with these keys would take too long. If not, they count from now on.
@@ -169,33 +161,23 @@ def _too_slow(keys: Iterable[object], limit: KeyLimit) -> bool:
     If keys have the same hash, Python also compares them with each other, however long they are.
     """
     others = [key for key in keys if not isinstance(key, str)]
-    if len(others) > MOST_WITH_ONE_HASH and max(Counter(map(hash, others)).values()) > MOST_WITH_ONE_HASH:
+    if not limit.allows(len(others)):  # first, because a Counter is a dict too
         return True
-    return not limit.allows(len(others))
+    return len(others) > MOST_WITH_ONE_HASH and max(Counter(map(hash, others)).values()) > MOST_WITH_ONE_HASH
 
 
 def _numbers(value: Any) -> Any:
     """The scalar or array that numpy reads from a number of another type, from a buffer, or from an object with numpy's
     protocol.
 
-    None for anything else. numpy would also read sequences, but it copies each text at the length of the longest, and some
-    sequences never end.
+    None for anything else. numpy would also read sequences, but some never end, and it gives each text in a sequence the
+    length of the longest one.
     """
     try:
         if not isinstance(value, int | float) and not any(hasattr(value, name) for name in NUMPY_PROTOCOL):
             memoryview(value)  # raises TypeError if the value isn't a buffer
         array = np.asarray(value)
         return array[()] if array.dtype.kind in NUMBER_KINDS else None
-    except Exception:  # user-defined objects may raise anything
-        return None
-
-
-def _listed(value: Any) -> list[Any] | None:
-    """The items of a sequence of another type, as many as its length says. None for text, bytes and anything else."""
-    if not isinstance(value, Sequence) or isinstance(value, str | bytes):
-        return None
-    try:
-        return list(islice(value, len(value)))
     except Exception:  # user-defined objects may raise anything
         return None
 

@@ -6,7 +6,7 @@ import ctypes
 import itertools
 import tracemalloc
 from array import array as buffer
-from collections import OrderedDict, defaultdict, deque
+from collections import OrderedDict, UserString, defaultdict, deque
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from enum import IntEnum
@@ -21,6 +21,8 @@ from hypothesis.extra import numpy as hnp
 
 from millrace.protocol.bounds import MOST_OTHER_KEYS, MOST_WITH_ONE_HASH
 from millrace.protocol.errors import BadMessage
+from millrace.protocol.key_limit import KeyLimit
+from millrace.protocol.wire import plain_values
 from millrace.protocol.wire.plain_values import MAX_DEPTH, ReprString, pack, repr_paths, unpack
 from tests.support.numbers.bit_equality import bit_equal
 
@@ -253,7 +255,6 @@ class Tensor:
         ((ctypes.c_int8 * 2)(1, 0), np.array([1, 0], np.int8)),
         (Interface(), np.array([1, 0], np.int8)),
         (deque([1, Tensor(np.zeros(2))]), [1, np.zeros(2)]),
-        (range(2), [0, 1]),
         (deque(["a", deque([[1], [1, 2]])]), ["a", [[1], [1, 2]]]),
         (Pair(Level.LOW, Many([1, Tensor(np.zeros(2))])), (np.int64(3), [1, np.zeros(2)])),
     ],
@@ -268,7 +269,6 @@ class Tensor:
         "ctypes",
         "interface",
         "deque",
-        "range",
         "nested deque",
         "sequences",
     ],
@@ -295,10 +295,21 @@ def test_an_object_that_may_have_endless_items_is_not_read() -> None:
     assert not value.items
 
 
-def test_a_sequence_has_as_many_items_as_its_length_says() -> None:
-    value = EndlessSequence()
-    assert unpack(pack({"a": deque([value])}, use_repr=True)) == {"a": [[0, 1]]}
-    assert value.items == 2
+@pytest.mark.parametrize("value", [EndlessSequence(), UserString("abc"), range(10**12)], ids=["ring", "text", "range"])
+def test_a_sequence_that_may_never_end_is_shown_and_not_read(value: Any) -> None:
+    assert unpack(pack({"a": deque([value])}, use_repr=True)) == {"a": [repr(value)]}
+    assert not getattr(value, "items", 0)
+
+
+def test_keys_that_may_collide_are_counted_before_they_are_hashed() -> None:
+    """A dict in which their hashes are counted would take as long as theirs."""
+
+    class Hashed(int):
+        def __hash__(self) -> int:
+            raise AssertionError("it was hashed")
+
+    limit = KeyLimit()
+    assert plain_values._too_slow([Hashed(n) for n in range(MOST_OTHER_KEYS + 1)], limit)
 
 
 def test_a_long_text_in_a_sequence_takes_no_memory_for_the_other_texts() -> None:

@@ -230,8 +230,7 @@ def test_more_workers_are_tried_as_long_as_there_is_time_even_if_they_start_slow
 
 def test_if_steps_take_so_long_that_only_one_copy_is_measured_a_line_says_so() -> None:
     measured = probe(ProbedEnv(Slow, {"step_s": 1.0}, ()), Machine(cores=2), seconds=2 * BRIEF_S).measured
-    matches = [re.fullmatch(rf"2 {NOT_MEASURED}", line) for line in measured.findings]
-    reported = [match and match[1] for match in matches]
+    reported = [match[1] for line in measured.findings if (match := re.fullmatch(rf"2 {NOT_MEASURED}", line))]
     assert reported == ["side by side"] * (2 - measured.copies_worked) + ["in one worker"]
 
 
