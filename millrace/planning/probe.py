@@ -316,7 +316,7 @@ def _with_all(measured: Measurements, sessions: Sequence[_SteppedCopies]) -> Mea
         reset_cpu_s=float((resets[:, 2] + share * resets[:, 1]).mean()),
         resets=len(resets),
         copies_worked=worked,
-        copies_failed=min((size.copies for size in failed if size.copies > worked), default=0),
+        copies_failed=min((size.copies for size in failed if size.workers > 1 and size.copies > worked), default=0),
         failed_in_one_worker=min((size.each for size in failed if size.workers == 1), default=0),
         episode_steps=steps / sum(map(len, later)) if later else sessions[0].time_limit,
         deterministic=_deterministic([trace for session in sessions for trace in session.traces]),

@@ -256,10 +256,11 @@ class OneInEachProcess(gymnasium.Env[Any, Any]):
         return np.zeros(1, np.float32), 0.0, False, False, {}
 
 
-@pytest.mark.parametrize("step_s", [0.0, 0.005])
-def test_an_environment_that_allows_one_copy_in_each_process_is_found_out(step_s: float) -> None:
-    measured = probe(ProbedEnv(OneInEachProcess, {"step_s": step_s}, ()), Machine(cores=2), seconds=2 * BRIEF_S).measured
-    assert measured.copies_worked == 2
+@pytest.mark.parametrize(("step_s", "cores"), [(0.0, 2), (0.005, 2), (0.005, 1)])
+def test_an_environment_that_allows_one_copy_in_each_process_is_found_out(step_s: float, cores: int) -> None:
+    machine = Machine(cores=cores)
+    measured = probe(ProbedEnv(OneInEachProcess, {"step_s": step_s}, ()), machine, seconds=2 * BRIEF_S).measured
+    assert (measured.copies_worked, measured.copies_failed) == (cores, 0)
     assert 2 <= measured.failed_in_one_worker <= COPIES_OF_SHORT
     (line,) = measured.findings
     assert line.startswith(f"{measured.failed_in_one_worker} copies in one worker: ")
