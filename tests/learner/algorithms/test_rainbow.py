@@ -254,7 +254,7 @@ def chain(batches: int) -> Batch:
     )
 
 
-@pytest.mark.parametrize("dueling", [True, False])
+@pytest.mark.parametrize("dueling", [True, pytest.param(False, marks=pytest.mark.rest)])
 def test_it_learns_the_mean_and_the_spread_of_the_returns_of_a_chain(dueling: bool) -> None:
     """From state 0, the returns of action 0 are -500, 1000, 500 and 2000, as in state 1 action 0 is the better one.
 
