@@ -20,7 +20,7 @@ from millrace.learner.between_updates.run_parts import RunParts
 from millrace.learner.run_folder import checkpoint
 from millrace.learner.run_folder.env_attributes import EnvAttributes
 from millrace.learner.run_folder.image_sample import image_samples
-from millrace.learner.run_folder.last_line import resume_command
+from millrace.learner.run_folder.last_line import complete, resume_command
 from millrace.learner.run_folder.metrics_log import MetricsLog
 from millrace.learner.run_folder.progress import Progress, Row, steps_per_second
 from millrace.learner.run_folder.results import Summary
@@ -158,7 +158,7 @@ class RunFiles:
             return ""
         folder = self._folder.shown
         if self._complete:
-            return f"the run is complete: {folder}"
+            return complete(folder)
         if self._saved_env_steps is None:
             return f"no checkpoint could be written to {shlex.quote(str(folder))}"
         newest = f"{self._saved_env_steps:,} env steps are saved"

@@ -24,6 +24,11 @@ def resume_command(run: Path, *, elsewhere: bool) -> str:
     return f"{typed_name()} {'learner' if elsewhere else 'train'} --resume {shlex.quote(str(run))}"
 
 
+def complete(folder: Path) -> str:
+    """The note of an error that ends the program after training."""
+    return f"the run is complete: {folder}"
+
+
 def last_line(program: str, error: BaseException, hints: Sequence[str] = (), *, elsewhere: bool = False) -> str:
     """The line for a terminal that says why `program` ended. `hints` follow the notes of the error.
 
@@ -36,7 +41,7 @@ def last_line(program: str, error: BaseException, hints: Sequence[str] = (), *, 
             if (run := getattr(error, "run", None)) is not None:  # an `Interrupted`, whose class isn't imported here
                 if getattr(error, "complete", False):
                     why += " after training"
-                    more = [f"the run is complete: {run}"]
+                    more = [complete(run)]
                 else:
                     more = [f"continue with: {resume_command(run, elsewhere=elsewhere)}"]
         case UserFacingError():
