@@ -75,7 +75,7 @@ def plan(
     such as `EnvironmentFailed`, if the environment completed no step.
 
     >>> import millrace
-    >>> plan = millrace.plan("Pendulum-v1", seconds=6)
+    >>> plan = millrace.plan("Pendulum-v1", seconds=5)
     >>> plan.command.split()[:3], plan.steps_per_s > 0
     (['millrace', 'train', 'Pendulum-v1'], True)
     """

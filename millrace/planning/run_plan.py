@@ -49,7 +49,7 @@ class RunPlan(msgspec.Struct, frozen=True, kw_only=True):
     """Recommended settings for an environment, and the speed to expect. `print` shows it as `millrace plan` does.
 
     >>> import millrace
-    >>> plan = millrace.plan("Pendulum-v1", seconds=6)
+    >>> plan = millrace.plan("Pendulum-v1", seconds=5)
     >>> isinstance(plan, millrace.RunPlan), sorted(plan.settings)
     (True, ['algo', 'envs', 'lanes', 'max_lag', 'workers'])
     """

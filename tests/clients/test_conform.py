@@ -33,8 +33,6 @@ SHORT = {
         "keeps the row format where episodes end",
         "sends a lost rollout again, the same",
         "closes a lane that is released while a ticket waits",
-        "forgets the session before",
-        "drains while it collects",
     ),
 }
 

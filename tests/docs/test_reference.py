@@ -64,7 +64,7 @@ def logged(which: str) -> tuple[set[str], set[str]]:
         "lanes": 1,
         "rollout_steps": 8,
         "eval_episodes": 1,
-        "eval_every": 16,
+        "eval_every": 100,
         "workers": 1,
     }
     chosen: dict[str, Any] = {
