@@ -138,7 +138,6 @@ def read_line(path: Path, now: float) -> RunLine:
 
 def headline(line: RunLine) -> str:
     """A sentence that says how far the run has got, how it ended, or that it died, and how to continue it."""
-    resume = f"continue it with: {one_line(resume_command(line.path, elsewhere=False))}"
     match line.state:
         case "training" if line.begins:
             return f"Training: {line.done}."
@@ -150,11 +149,15 @@ def headline(line: RunLine) -> str:
         case "dead":
             sign = last_sign(line.progress)
             known = f"no process trains it, and it has no results{f'; {sign}' if sign else ''}"
-            return f"Dead: {known}. It was killed, or its machine went down; {resume}"
+            return f"Dead: {known}. It was killed, or its machine went down; {_how_to_continue(line.path)}"
         case _:
             assert line.summary is not None
             said = ending(one_line(line.summary.stop_reason), cut_short=line.summary.cut_short)
-            return f"{said}; {resume}" if line.summary.cut_short else f"{said}."
+            return f"{said}; {_how_to_continue(line.path)}" if line.summary.cut_short else f"{said}."
+
+
+def _how_to_continue(run: Path) -> str:
+    return f"continue it with: {one_line(resume_command(run))}"
 
 
 def in_sentences(line: RunLine) -> str:

@@ -72,8 +72,6 @@ class RunSetup:
     resumed: bool
     interrupts: Interrupts
     """Must be entered, so that signals are recorded."""
-    elsewhere: bool = False
-    """Whether the workers are started elsewhere, not by this program."""
     learners: Learners | None = None
     """The learner processes of a run with shards, which share the updates."""
 

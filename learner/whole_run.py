@@ -41,7 +41,7 @@ def train_to_the_end(run: OpenRun, workers: int) -> None:
         _tell_of_error(lambda: run.audience.leave(reason))
         raise
     except BaseException as error:
-        if line := run.files.saved(elsewhere=setup.elsewhere):
+        if line := run.files.saved():
             error.add_note(line)
         reason = "interrupted" if isinstance(error, KeyboardInterrupt) else _why(error)
         hub.drain(reason, timeout_s=setup.interrupts.at_most(GOODBYE_IF_CUT_SHORT_S))

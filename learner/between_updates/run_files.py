@@ -148,11 +148,11 @@ class RunFiles:
             line += f"; {lost:,} later update{'s were' if lost > 1 else ' was'} not saved, and must be made again"
         return line
 
-    def saved(self, *, elsewhere: bool) -> str:
+    def saved(self) -> str:
         """One line that says how much is saved, and how to resume the run unless it is complete; empty if nothing has been
         learned yet.
 
-        For `elsewhere`, see `resume_command`. A run whose environment was passed as a function can continue only in Python.
+        A run whose environment was passed as a function can continue only in Python.
         """
         if not self._state.version:
             return ""
@@ -167,7 +167,7 @@ class RunFiles:
         env = self._spec.env
         if env.factory is not None and not found_by_others(env.id):
             return f"{newest}; continue in Python with: millrace.train(ENV, resume={str(folder)!r})"
-        return f"{newest}; continue with: {resume_command(folder, elsewhere=elsewhere)}"
+        return f"{newest}; continue with: {resume_command(folder)}"
 
     def close(self) -> None:
         """Close the metrics file. Call this even if the run was cut short."""

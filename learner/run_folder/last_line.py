@@ -1,4 +1,4 @@
-"""The last line that a training program prints: why it ended, and how to continue the run. Pure.
+"""The last line that a training program prints: why it ended, and how to continue the run.
 
 Rule: it is one line. The error's notes (`BaseException.__notes__`) follow its message.
 """
@@ -9,18 +9,23 @@ import shlex
 import sysconfig
 import traceback
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from millrace.flags.program_name import typed_name
+from millrace.learner.run_folder.run_format import check_format
 from millrace.protocol.bounds import MAX_TEXT, one_line
-from millrace.protocol.errors import UserFacingError, first_line
+from millrace.protocol.errors import UsageError, UserFacingError, first_line
 
 OURS = "millrace."  # prefix of the names of millrace's modules
 OF_LEARNER = "millrace.learner."
 
 
-def resume_command(run: Path, *, elsewhere: bool) -> str:
-    """The shell command that continues a run. `elsewhere` says that its workers aren't started by the learner."""
+def resume_command(run: Path) -> str:
+    """The shell command that continues a run. It starts workers, unless run.json says that they were started elsewhere."""
+    elsewhere = False
+    with suppress(UsageError):
+        elsewhere = check_format(run).workers_elsewhere
     return f"{typed_name()} {'learner' if elsewhere else 'train'} --resume {shlex.quote(str(run))}"
 
 
@@ -29,11 +34,8 @@ def complete(folder: Path) -> str:
     return f"the run is complete: {folder}"
 
 
-def last_line(program: str, error: BaseException, hints: Sequence[str] = (), *, elsewhere: bool = False) -> str:
-    """The line for a terminal that says why `program` ended. `hints` follow the notes of the error.
-
-    For `elsewhere`, see `resume_command`.
-    """
+def last_line(program: str, error: BaseException, hints: Sequence[str] = ()) -> str:
+    """The line for a terminal that says why `program` ended. `hints` follow the notes of the error."""
     more = [note for note in getattr(error, "__notes__", ()) if isinstance(note, str)]
     match error:
         case KeyboardInterrupt():
@@ -43,7 +45,7 @@ def last_line(program: str, error: BaseException, hints: Sequence[str] = (), *, 
                     why += " after training"
                     more = [complete(run)]
                 else:
-                    more = [f"continue with: {resume_command(run, elsewhere=elsewhere)}"]
+                    more = [f"continue with: {resume_command(run)}"]
         case UserFacingError():
             why = str(error)
         case _:

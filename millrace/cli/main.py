@@ -69,12 +69,12 @@ def _exit_code(argv: list[str]) -> int:
         sys.stdout.flush()
         return exit_code
     except UserFacingError as error:
-        _print_error(last_line("millrace", error, elsewhere=_elsewhere(argv)))
+        _print_error(last_line("millrace", error))
         if error.detail:
             _print_error(indented(error.detail))
         return _failed(argv, error.exit_code)
     except KeyboardInterrupt as interrupt:
-        _print_error(last_line("millrace", interrupt, elsewhere=_elsewhere(argv)))
+        _print_error(last_line("millrace", interrupt))
         return _failed(argv, 130)
     except BrokenPipeError:  # whatever reads the output, such as `head`, has ended, so print no message
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -134,14 +134,9 @@ def _print_error(line: str) -> None:
     print(escaped(line), file=sys.stderr)  # escaped, because it may quote a worker
 
 
-def _elsewhere(argv: list[str]) -> bool:
-    """Whether this command line starts a learner without local workers. Its run must be resumed by the same command."""
-    return argv[:1] == ["learner"]
-
-
 def _internal_error(argv: list[str], error: Exception) -> int:
     hints = [] if "--debug" in argv else ["--debug shows the traceback"]
-    _print_error(last_line("millrace", error, hints, elsewhere=_elsewhere(argv)))
+    _print_error(last_line("millrace", error, hints))
     return _failed(argv, 1)
 
 

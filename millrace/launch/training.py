@@ -121,7 +121,7 @@ def _train(
                 raise stopped(None if resume is None else resume.run)
 
         with interrupts, one_thread(), _learners(config, place, poll) as learners:
-            setup = RunSetup(config, known, folder, resume is not None, interrupts, elsewhere, learners)
+            setup = RunSetup(config, known, folder, resume is not None, interrupts, learners)
             run = open_run(setup, lobby, watch, observer)
             pool.report(run.parts.hub.status)
             setup.announce(pool.bound)

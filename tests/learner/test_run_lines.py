@@ -9,7 +9,7 @@ from msgspec.structs import replace
 
 from millrace.learner.run_folder.lease import Listens, decoded
 from millrace.learner.run_folder.progress_file import PROGRESS_FILE
-from millrace.learner.run_folder.run_format import CONFIG_FILE
+from millrace.learner.run_folder.run_format import CONFIG_FILE, write_format
 from millrace.learner.run_folder.run_lock import LOCK_FILE, PACE, RunLock
 from millrace.learner.run_lines import find_runs, headline, in_sentences, read_line
 from millrace.protocol.errors import UsageError
@@ -32,6 +32,15 @@ def test_a_run_that_failed_says_why_and_how_to_continue(tmp_path: Path) -> None:
     line = read_line(a_run(tmp_path, failure="no worker came"), time.time())
     assert (line.state, line.done) == ("interrupted", "no worker came"), "no percentage"
     assert headline(line).startswith("Interrupted: no worker came; continue it with: millrace train --resume ")
+
+
+def test_a_run_whose_workers_were_started_elsewhere_is_continued_by_a_learner_alone(tmp_path: Path) -> None:
+    for run in (a_run(tmp_path, failure="no worker came"), a_run(tmp_path, finished=False)):
+        write_format(run, workers_elsewhere=True)
+        said = headline(read_line(run, time.time()))
+        assert said.endswith(f"; continue it with: millrace learner --resume {run}"), (
+            "`train` would start workers of its own"
+        )
 
 
 def test_a_run_without_a_process_and_without_results_is_dead(tmp_path: Path) -> None:

@@ -29,6 +29,7 @@ from millrace.learner.run_folder.metrics_log import MetricsLog
 from millrace.learner.run_folder.progress import Progress
 from millrace.learner.run_folder.results import Best, Evaluation, Summary
 from millrace.learner.run_folder.run_folder import Interrupted, RunFolder
+from millrace.learner.run_folder.run_format import write_format
 from millrace.play_flags import EvaluateFlags, PlayFlags, RecordFlags
 from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.envs.spaces import action_spec, observation_leaves
@@ -403,14 +404,16 @@ def test_an_error_in_millrace_hides_its_traceback_until_asked(capsys: Captured, 
         assert lines[:2] == ["millrace: internal error: ZeroDivisionError: division", "Traceback (most recent call last):"]
 
 
-def test_an_interrupted_run_says_how_to_go_on(capsys: Captured, monkeypatch: pytest.MonkeyPatch) -> None:
-    failing(monkeypatch, Interrupted(Path("runs/mine")))
+def test_an_interrupted_run_says_how_to_go_on(tmp_path: Path, capsys: Captured, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("mine").mkdir()
+    failing(monkeypatch, Interrupted(Path("mine")))
+    write_format(Path("mine"))
     line = refusal(capsys, "train", "CartPole-v1", exit_code=130)
-    assert line == "interrupted; continue with: millrace train --resume runs/mine"
+    assert line == "interrupted; continue with: millrace train --resume mine"
+    write_format(Path("mine"), workers_elsewhere=True)
     line = refusal(capsys, "learner", "CartPole-v1", exit_code=130)
-    assert line == "interrupted; continue with: millrace learner --resume runs/mine", (
-        "`train` would start workers of its own"
-    )
+    assert line == "interrupted; continue with: millrace learner --resume mine", "`train` would start workers of its own"
     failing(monkeypatch, KeyboardInterrupt())
     assert refusal(capsys, "train", "CartPole-v1", exit_code=130) == "interrupted"
 

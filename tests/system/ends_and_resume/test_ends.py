@@ -25,6 +25,7 @@ from millrace.learner.run_folder import atomic_write, checkpoint
 from millrace.learner.run_folder.last_line import resume_command
 from millrace.learner.run_folder.metrics_log import METRICS_FILE, read_rows
 from millrace.learner.run_folder.progress import Progress
+from millrace.learner.run_folder.run_format import write_format
 from millrace.protocol.errors import RunError, UsageError
 from tests.support.envs.toy import Identity
 from tests.system.stage.run_folders import folder_of, policy_of, saved, summary
@@ -57,7 +58,7 @@ def raises_at(update: int, error: BaseException) -> Watch:
 
 def how_to_go_on(folder: Path) -> list[str]:
     env_steps = checkpoint.newest(folder)[0].env_steps
-    return [f"{env_steps:,} env steps are saved; continue with: {resume_command(folder, elsewhere=False)}"]
+    return [f"{env_steps:,} env steps are saved; continue with: {resume_command(folder)}"]
 
 
 def parameters(folder: Path) -> torch.Tensor:
@@ -90,9 +91,17 @@ def test_a_run_whose_environment_only_the_script_has_goes_on_in_python(tmp_path:
     assert caught.value.__notes__[-1].endswith(f"; continue in Python with: millrace.train(ENV, resume={folder!r})")
 
 
-def test_the_command_that_goes_on_is_of_the_same_kind_and_may_be_pasted_into_a_shell() -> None:
-    assert resume_command(Path("runs/my run"), elsewhere=False) == "millrace train --resume 'runs/my run'"
-    assert resume_command(Path("runs/mine"), elsewhere=True) == "millrace learner --resume runs/mine"
+def test_the_command_that_goes_on_is_of_the_same_kind_and_may_be_pasted_into_a_shell(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    here, elsewhere = Path("my run"), Path("mine")
+    for run in (here, elsewhere):
+        run.mkdir()
+        write_format(run, workers_elsewhere=run == elsewhere)
+    assert resume_command(here) == "millrace train --resume 'my run'"
+    assert resume_command(elsewhere) == "millrace learner --resume mine"
+    assert resume_command(Path("gone")) == "millrace train --resume gone"
 
 
 def test_a_watch_that_raises_in_an_evaluation(tmp_path: Path) -> None:
