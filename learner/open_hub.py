@@ -13,7 +13,6 @@ from millrace.learner.members.lobby import Lobby, LobbySettings
 from millrace.learner.rollouts.hub import Hub, HubObserver, HubSettings
 from millrace.learner.rollouts.lag_rule import Rounds
 from millrace.learner.rollouts.lane_history import LaneHistories
-from millrace.learner.rollouts.ledger import Ledger
 from millrace.learner.rollouts.opponent_pool import OpponentPool
 from millrace.learner.rollouts.past_rollouts import PastRollouts
 from millrace.learner.rollouts.rollout_dealer import RolloutDealer
@@ -39,7 +38,7 @@ def open_hub(
     raises ends the wait. `observer` is called each time the hub has listened. In a resumed run, `past` comes from the
     checkpoint. In a run with teams, `opponents` is the pool of opponents.
     """
-    past = past or PastRollouts(Ledger(), ())
+    past = past or PastRollouts()
     rounds = Rounds(config.max_lag, past.rounds.next, past.rounds.versions)
     histories = LaneHistories(run.copies, config.most_repeated_steps(), past.lanes)
     rollouts = RolloutDealer(run.lanes, rounds, past.ledger, past.incarnations, opponents, histories)

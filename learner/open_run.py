@@ -39,7 +39,7 @@ from millrace.learner.run_folder.env_attributes import EnvAttributes
 from millrace.learner.run_folder.progress_file import ProgressFile
 from millrace.learner.run_setup import RunSetup
 from millrace.learner.run_spec import run_spec
-from millrace.learner.run_state import RunState, restore, start_from
+from millrace.learner.run_state import SavedRun, restore, start_from
 from millrace.learner.shards.roles import lead
 from millrace.learner.shards.sharded import new_sharded
 from millrace.learner.torch_setup import threads, torch_device, updates_use_all_cores
@@ -76,10 +76,10 @@ def open_run(setup: RunSetup, lobby: Lobby, watch: Watch, observer: HubObserver)
     config = setup.config
     folder = setup.folder
     algorithm, prior = _new_algorithm(setup, spec)
-    state = restore(folder, algorithm) if setup.resumed else RunState()
+    saved = restore(folder, algorithm) if setup.resumed else SavedRun()
     # The last save gets half of the remaining grace time, because the workers need time to leave.
     folder.writes.at_most = lambda seconds: setup.interrupts.at_most(2 * seconds) / 2
-    pool = _opponent_pool(config, spec, state.opponents)
+    pool = _opponent_pool(config, spec, saved.state.opponents)
     progress_file = ProgressFile(folder.path)
 
     def watch_hub(listened: Hub) -> None:
@@ -89,22 +89,20 @@ def open_run(setup: RunSetup, lobby: Lobby, watch: Watch, observer: HubObserver)
         if folder.lock is None or not folder.lock.taken_over:
             progress_file.write(listened.progress, time.time())
 
-    hub = open_hub(config, spec, lobby, setup.check_running, watch_hub, state.past_rollouts(), pool)
-    state.lanes = state.acting = ()
-    if state.opponent_policies is not None and pool is not None:
-        hub.keep_opponents(*state.opponent_policies)
-    state.opponent_policies = None
+    hub = open_hub(config, spec, lobby, setup.check_running, watch_hub, saved.rollouts, pool)
+    if saved.opponent_policies is not None and pool is not None:
+        hub.keep_opponents(*saved.opponent_policies)
     if config.record:
-        resumed_at = state.env_steps if setup.resumed else None
+        resumed_at = saved.state.env_steps if setup.resumed else None
         name = folder.path.resolve().name
         callbacks.add(started_by("record")(config.record, setup.known.described, spec, name, resumed_at))
     setup.check_interrupt()
     folder.remove_temporary()
     folder.write_config(config, workers_elsewhere=not lobby.processes.expected)
     folder.remove_summary()
-    tally = Tally(config, spec, state, lambda: callbacks.stop_reason, pool)
+    tally = Tally(config, spec, saved, lambda: callbacks.stop_reason, pool)
     parts = RunParts(config, spec, folder, algorithm, hub, tally)
-    requests = Requests(EnvAttributes(state.env_attributes, _why_no_attributes(spec.vector)))
+    requests = Requests(EnvAttributes(saved.env_attributes, _why_no_attributes(spec.vector)))
     evaluations = Evaluations(parts, setup.known.evaluation_limit)
     files = RunFiles(parts, evaluations, requests.attributes)
     run = OpenRun(setup, parts, files, Audience(parts, callbacks, files, requests), evaluations, prior)

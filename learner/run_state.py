@@ -1,7 +1,8 @@
-"""The state of a run: the content of a checkpoint apart from the algorithm's own state, and how it is restored.
+"""The state of a run: what changes while it trains (`RunState`), what a checkpoint has (`SavedRun`), how it is restored.
 
-A resumed run restores all of it (`restore`). A new run may load a part of another run's state (`start_from`), but only
-numbers, for a policy that the new run's own settings describe. Modules that the other run folder names are not imported.
+A checkpoint also has the algorithm's own state. A resumed run restores all of it (`restore`). A new run may load a part of
+another run's state (`start_from`), but only numbers, for a policy that the new run's own settings describe. Modules that the
+other run folder names are not imported.
 """
 
 from __future__ import annotations
@@ -11,14 +12,15 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+from msgspec import UNSET
 
 from millrace.learner.algorithms import Algorithm
 from millrace.learner.algorithms.algorithm import Start
 from millrace.learner.config.config import Config
 from millrace.learner.resume_checks import first_difference, policy_to_start_from
-from millrace.learner.rollouts.ledger import Ledger, Past
+from millrace.learner.rollouts.ledger import Past
 from millrace.learner.rollouts.opponent_pool import PoolState
-from millrace.learner.rollouts.past_rollouts import PastRollouts, RoundsState, packed, unpacked
+from millrace.learner.rollouts.past_rollouts import PastRollouts, packed, unpacked
 from millrace.learner.run_folder import checkpoint
 from millrace.learner.run_folder.env_attributes import AttributesState, EnvAttributes
 from millrace.learner.run_folder.episode_window import EpisodeWindow
@@ -27,7 +29,6 @@ from millrace.learner.run_folder.run_folder import RunFolder
 from millrace.protocol.arrays import Floats
 from millrace.protocol.bounds import Natural, Real, Seconds, one_line
 from millrace.protocol.errors import BadMessage, CheckpointError, UsageError
-from millrace.protocol.messages import LanePast, Weights
 from millrace.protocol.policy.layout import buffer_layout, named_views
 from millrace.protocol.rollout import Episode
 from millrace.protocol.specs import PolicySpec
@@ -36,34 +37,14 @@ log = logging.getLogger("millrace.learner")
 
 MISFITS = (LookupError, ValueError, TypeError, AttributeError, ArithmeticError, RuntimeError, MemoryError, BadMessage)
 """The exceptions that loading a state with an unexpected form may raise."""
-POLICIES = ("best_policy", "pending_policy", "opponent_policies")  # fields of `RunState` that checkpoints store as tensors
-RECORDS: dict[str, type[msgspec.Struct]] = {"lanes": LanePast, "acting": Weights}
-"""The fields of `RunState` that checkpoints store as bytes, and the type of each field's records."""
 BESIDES = {"policy": "", "critic": ", critic", "all": ", critic, optimizers"}
 
 
 class RunState(msgspec.Struct, kw_only=True):
-    """All counters of a run. The defaults are a new run's values."""
+    """The counts and evaluations of a run, which are current while it trains. The defaults are a new run's values."""
 
     version: Past = 0
     env_steps: Past = 0
-    wall_s: Seconds = 0.0
-    stages: dict[str, Real] = {}
-    """The seconds in each stage, as in `Summary.stages`."""
-    ledger: Ledger = msgspec.field(default_factory=Ledger)
-    incarnations: list[Past] = []
-    """The next incarnation of each lane."""
-    rounds: RoundsState = RoundsState()
-    lanes: Any = ()
-    """The history of each lane, as a sequence of `LanePast`."""
-    acting: Any = ()
-    """The weights that act in open rounds, except the newest, as a sequence of `Weights`."""
-    episodes: list[Episode] = []
-    """The episodes of the `EpisodeWindow`."""
-    facts: list[str] = []
-    """The names of the facts of these episodes."""
-    env_attributes: AttributesState = msgspec.field(default_factory=AttributesState)
-    """The attributes that callbacks have set on env copies."""
     best: tuple[Real, Natural] | None = None
     """The mean return of the best evaluation, and the env steps of its policy."""
     best_policy: Any = None
@@ -79,61 +60,88 @@ class RunState(msgspec.Struct, kw_only=True):
     """Parameters [P] and buffers of that policy, both float32."""
     opponents: PoolState = msgspec.field(default_factory=PoolState)
     """The opponents in self-play, and their ratings."""
-    opponent_policies: Any = None
-    """Parameters [n, P] and buffers [n, B] of the n snapshots among the opponents, both float32."""
     next_evaluation: Natural = 0
     """The env steps at which the next evaluation is due; 0 if this is not known."""
+
+
+class SavedRun(msgspec.Struct, kw_only=True):
+    """A run between two updates, from which a resumed run continues. The defaults are a new run's values.
+
+    The run's objects keep their own state while it trains, and a `SavedRun` is made from them for each checkpoint.
+    """
+
+    state: RunState = msgspec.field(default_factory=RunState)
+    rollouts: PastRollouts = msgspec.field(default_factory=PastRollouts)
+    wall_s: Seconds = 0.0
+    stages: dict[str, Real] = {}
+    """The seconds in each stage, as in `Summary.stages`."""
+    episodes: list[Episode] = []
+    """The episodes of the `EpisodeWindow`."""
+    facts: list[str] = []
+    """The names of the facts of these episodes."""
+    env_attributes: AttributesState = msgspec.field(default_factory=AttributesState)
+    """The attributes that callbacks have set on env copies."""
+    opponent_policies: Any = None
+    """Parameters [n, P] and buffers [n, B] of the n snapshots among the opponents, both float32."""
 
     def checkpoint_content(self, algorithm: Algorithm) -> dict[str, Any]:
         """The content of a checkpoint with this state and the algorithm's state, as plain data and tensors."""
         import torch
 
-        policies = {name: getattr(self, name) for name in POLICIES}
+        state = self.state
+        policies = {
+            "best_policy": state.best_policy,
+            "pending_policy": state.pending_policy,
+            "opponent_policies": self.opponent_policies,
+        }
         tensors = {name: each and [torch.from_numpy(array) for array in each] for name, each in policies.items()}
-        records = {name: torch.from_numpy(packed(getattr(self, name)).copy()) for name in RECORDS}
-        past = msgspec.to_builtins(msgspec.structs.replace(self, **dict.fromkeys((*POLICIES, *RECORDS))))
-        return {"past": past, **tensors, **records, "algorithm": algorithm.state_dict()}
-
-    def past_rollouts(self) -> PastRollouts:
-        """The state from which the hub continues."""
-        return PastRollouts(self.ledger, self.incarnations, self.rounds, self.lanes, self.acting)
+        rollouts = torch.from_numpy(packed(self.rollouts).copy())
+        without_policies = msgspec.structs.replace(state, best_policy=UNSET, pending_policy=UNSET)
+        past = msgspec.structs.replace(self, state=without_policies, rollouts=UNSET, opponent_policies=UNSET)
+        return {"past": msgspec.to_builtins(past), "rollouts": rollouts, **tensors, "algorithm": algorithm.state_dict()}
 
 
-def restore(folder: RunFolder, algorithm: Algorithm) -> RunState:
-    """Load the newest undamaged checkpoint into the algorithm. Returns the run's state.
+def restore(folder: RunFolder, algorithm: Algorithm) -> SavedRun:
+    """Load the newest undamaged checkpoint into the algorithm. Returns the saved run.
 
     Raises `CheckpointError` if there is no undamaged checkpoint, or if the newest one does not fit this run.
     """
     newest = _newest(folder.path)
+    found = newest.state
     try:
-        state = msgspec.convert(newest.state["past"], RunState)
-        EnvAttributes(state.env_attributes), EpisodeWindow(state.episodes, state.facts)  # both raise for an invalid state
-        for name in POLICIES:
-            if (policy := newest.state.get(name)) is not None:
-                setattr(state, name, tuple(array.numpy() for array in policy))
-        for name, kind in RECORDS.items():
-            setattr(state, name, unpacked(kind, newest.state[name].numpy()))
-        algorithm.load_state_dict(newest.state["algorithm"])
-        _check_policies(state, algorithm.weights())
-        state.ledger.end_outstanding()
+        saved = msgspec.convert(found["past"], SavedRun)
+        EnvAttributes(saved.env_attributes), EpisodeWindow(saved.episodes, saved.facts)  # both raise for an invalid state
+        saved.state.best_policy = _arrays(found["best_policy"])
+        saved.state.pending_policy = _arrays(found["pending_policy"])
+        saved.opponent_policies = _arrays(found["opponent_policies"])
+        saved.rollouts = unpacked(PastRollouts, found["rollouts"].numpy())
+        algorithm.load_state_dict(found["algorithm"])
+        _check_policies(saved, algorithm.weights())
+        saved.rollouts.ledger.end_outstanding()
     except MISFITS as error:
         raise CheckpointError(
             f"checkpoint {newest.path}: expected the state of this configuration, got another ({one_line(str(error))}); "
             "resume it with the settings it was made with"
         ) from error
-    return state
+    return saved
 
 
-def _check_policies(state: RunState, own: tuple[Floats, Floats]) -> None:
+def _arrays(tensors: Any) -> Any:
+    """The arrays of a policy in a checkpoint; None if the checkpoint has no such policy."""
+    return None if tensors is None else tuple(tensor.numpy() for tensor in tensors)
+
+
+def _check_policies(saved: SavedRun, own: tuple[Floats, Floats]) -> None:
     """Raise `ValueError` unless each policy that the state mentions exists and is as large as the run's `own` weights."""
+    state = saved.state
     snapshots = len(state.opponents.snapshots)
-    for name, is_there, rows in (
-        ("best_policy", state.best is not None, ()),
-        ("pending_policy", state.pending is not None, ()),
-        ("opponent_policies", snapshots > 0, (snapshots,)),
+    for name, policy, is_there, rows in (
+        ("best_policy", state.best_policy, state.best is not None, ()),
+        ("pending_policy", state.pending_policy, state.pending is not None, ()),
+        ("opponent_policies", saved.opponent_policies, snapshots > 0, (snapshots,)),
     ):
         expected = [f"float32{[*rows, *each.shape]}" for each in own] if is_there else []
-        got = [f"{each.dtype}{list(each.shape)}" for each in getattr(state, name) or ()]
+        got = [f"{each.dtype}{list(each.shape)}" for each in policy or ()]
         if expected != got:
             raise ValueError(f"{name}: expected {' and '.join(expected) or 'none'}, got {' and '.join(got) or 'none'}")
 

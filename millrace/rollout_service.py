@@ -33,7 +33,7 @@ from millrace.learner.config.rollout_config import RolloutConfig
 from millrace.learner.config.validation import convert_rollout_settings
 from millrace.learner.interrupts import Interrupts
 from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan, evaluation_of
-from millrace.learner.rollouts.past_rollouts import PastRollouts, packed
+from millrace.learner.rollouts.past_rollouts import PastRollouts
 from millrace.learner.rollouts.rollout_dealer import AcceptedRollout
 from millrace.learner.run_folder.episode_window import EpisodeWindow
 from millrace.learner.run_folder.progress import Progress, steps_per_second
@@ -172,7 +172,7 @@ class RolloutService:
         state: ServiceState | None = None
         if restore is not None:
             state, self.restored = read(Path(restore))
-            past = state.past
+            past = state.rollouts
             self._version = max(state.version - 1, -1)
             self.env_steps = state.env_steps
         self.config: RolloutConfig = config
@@ -355,17 +355,13 @@ class RolloutService:
         """
         self._check_open()
         with self._lock:
-            past = self._hub.past()
+            rollouts = self._hub.past()
         state = ServiceState(
             env=self.run.env.id,
             policy=digest(self.run.policy),
             version=self._version,
             env_steps=self.env_steps,
-            ledger=past.ledger,
-            incarnations=list(past.incarnations),
-            rounds=past.rounds,
-            lanes=packed(past.lanes).tobytes(),
-            acting=packed(past.acting).tobytes(),
+            rollouts=rollouts,
             normalizer=None if self._normalizer is None else self._normalizer.state(),
         )
         write(Path(path), state, arrays)

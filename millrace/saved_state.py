@@ -13,17 +13,16 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from millrace.learner.rollouts.ledger import Ledger, Past
-from millrace.learner.rollouts.past_rollouts import PastRollouts, RoundsState, unpacked
+from millrace.learner.rollouts.ledger import Past
+from millrace.learner.rollouts.past_rollouts import PastRollouts, packed, unpacked
 from millrace.learner.run_folder.atomic_write import write_file
 from millrace.learner.run_folder.regular_files import open_regular, reason
 from millrace.protocol.arrays import Array
 from millrace.protocol.bounds import LARGEST, one_line
 from millrace.protocol.errors import CheckpointError, UsageError
-from millrace.protocol.messages import LanePast, Weights
 from millrace.protocol.specs import PolicySpec
 
-OURS = "millrace"  # name of the entry with the state, as JSON bytes; the user's arrays must have other names
+OURS = "millrace"  # name of the entry with the state, packed as bytes; the user's arrays must have other names
 OF_NUMPY = ("file", "allow_pickle")  # parameters of numpy.savez, so the user's arrays can't have these names
 FORMAT = 1
 
@@ -38,24 +37,10 @@ class ServiceState(msgspec.Struct, frozen=True, kw_only=True):
     version: Annotated[int, Meta(ge=-1, le=LARGEST >> 2)]
     """version of the newest published weights"""
     env_steps: Past
-    ledger: Ledger
-    incarnations: list[Past]
-    """number of the next incarnation of each lane"""
-    rounds: RoundsState
-    lanes: bytes
-    """the history of each lane (`LanePast`), packed"""
-    acting: bytes
-    """the weights with which open rounds are collected, except the newest weights, packed"""
+    rollouts: PastRollouts
     normalizer: dict[str, Any] | None = None
     """the state of the normalizer, as plain data; None if it was not used"""
     format: int = FORMAT
-
-    @property
-    def past(self) -> PastRollouts:
-        """The state from which the hub continues. Raises what `unpacked` raises."""
-        lanes = unpacked(LanePast, np.frombuffer(self.lanes, np.uint8))
-        acting = unpacked(Weights, np.frombuffer(self.acting, np.uint8))
-        return PastRollouts(self.ledger, self.incarnations, self.rounds, lanes, acting)
 
 
 def digest(policy: PolicySpec) -> str:
@@ -80,7 +65,7 @@ def write(path: Path, state: ServiceState, arrays: Mapping[str, Any]) -> None:
             taken = ", ".join((OURS, *OF_NUMPY))
             raise UsageError(f"save: {name}: expected an array of numbers, not called {taken}; got {array.dtype}")
         kept[name] = array
-    ours = np.frombuffer(msgspec.json.encode(state), np.uint8)
+    ours = packed(state)
     write_file(path, lambda file: np.savez(file, **{OURS: ours}, **kept))  # type: ignore[arg-type]
 
 
@@ -96,9 +81,8 @@ def read(path: Path) -> tuple[ServiceState, dict[str, Array]]:
             if any(entry.compress_type != zipfile.ZIP_STORED for entry in file.zip.infolist()):
                 raise ValueError("it is compressed, which millrace never does")  # a few of its bytes could fill the memory
             arrays = {name: file[name] for name in file.files}
-        state = msgspec.json.decode(arrays.pop(OURS).tobytes(), type=ServiceState)
-        state.ledger.end_outstanding()
-        _ = state.past  # raises an error for an invalid state
+        state = unpacked(ServiceState, arrays.pop(OURS))
+        state.rollouts.ledger.end_outstanding()
     except Exception as error:  # zipfile, numpy and msgspec raise a dozen exception types for damaged files
         raise unreadable(path, error) from error
     if state.format != FORMAT:

@@ -12,8 +12,6 @@ import shlex
 import time
 from collections.abc import Callable
 
-import msgspec
-
 from millrace.learner.algorithms.algorithm import acting_weights
 from millrace.learner.between_updates.evaluations import Evaluations
 from millrace.learner.between_updates.run_parts import RunParts
@@ -25,6 +23,7 @@ from millrace.learner.run_folder.metrics_log import MetricsLog
 from millrace.learner.run_folder.progress import Progress, Row, steps_per_second
 from millrace.learner.run_folder.results import Summary
 from millrace.learner.run_folder.run_format import versions
+from millrace.learner.run_state import SavedRun
 from millrace.protocol.bounds import one_line
 from millrace.protocol.envs.found_names import found_by_others
 from millrace.protocol.errors import RunError, first_line
@@ -189,27 +188,22 @@ class RunFiles:
         self._folder.writes.write("metrics", self._metrics.sync)  # a resumed run doesn't write these rows again
         spec = self._spec
         env_steps = self._state.env_steps
-        past = self._hub.past()
         snapshot = self._hub.snapshot()
-        state = msgspec.structs.replace(
-            self._state,
+        content = SavedRun(
+            state=self._state,
+            rollouts=self._hub.past(),
             wall_s=self._tally.wall_s(snapshot),
             stages=self._tally.stages(snapshot),
-            ledger=past.ledger,
-            incarnations=list(past.incarnations),
-            rounds=past.rounds,
-            lanes=past.lanes,
-            acting=past.acting,
-            opponent_policies=self._hub.opponent_policies(),
             episodes=self._tally.window.state(),
             facts=list(spec.facts),
             env_attributes=self._attributes.state(self._state.version),
+            opponent_policies=self._hub.opponent_policies(),
         ).checkpoint_content(self._algorithm)
         try:
             self._folder.write_policy(spec, *acting_weights(self._algorithm, spec.policy))
             self._policy_env_steps = env_steps
         finally:
-            path = checkpoint.save(self._folder.path, state, env_steps, self._config.keep_checkpoints)
+            path = checkpoint.save(self._folder.path, content, env_steps, self._config.keep_checkpoints)
             self.checkpoint = one_line(str(path))
             self._saved = self._position()
             self._saved_env_steps = env_steps

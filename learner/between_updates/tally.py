@@ -16,7 +16,7 @@ from millrace.learner.rollouts.hub import HubSnapshot
 from millrace.learner.rollouts.opponent_pool import OpponentPool
 from millrace.learner.run_folder.episode_window import EpisodeWindow
 from millrace.learner.run_folder.results import DecidingReturns
-from millrace.learner.run_state import RunState
+from millrace.learner.run_state import SavedRun
 from millrace.protocol.rollout import Batch, Episode
 from millrace.protocol.specs import RunSpec
 
@@ -28,18 +28,18 @@ class Tally:
         self,
         config: Config,
         spec: RunSpec,
-        state: RunState,
+        saved: SavedRun,
         ended_by: Callable[[], str | None] = lambda: None,
         pool: OpponentPool | None = None,
     ) -> None:
-        """`state` is the run's state. `ended_by` returns why a callback has ended the run, or None if none has.
+        """`saved` is what the run continues from. `ended_by` returns why a callback has ended the run, or None if none has.
 
         `pool` holds the opponents in self-play, if there are any.
         """
         self.pool = pool
-        self.state = state
-        """The run's state. Evaluations change it too, and a checkpoint adds the state of other objects."""
-        self.window = EpisodeWindow.from_state(state.episodes, state.facts, spec.facts)
+        self.state = state = saved.state
+        """The run's state. Evaluations change it too."""
+        self.window = EpisodeWindow.from_state(saved.episodes, saved.facts, spec.facts)
         self.new_episodes: tuple[Episode, ...] = ()
         """The episodes that ended in the rollouts of the last update."""
         due_at = state.env_steps + config.eval_every
@@ -52,8 +52,8 @@ class Tally:
         self._config = config
         self._steps_per_update = spec.rollout_steps * config.envs
         self._update_s = 0.0
-        self.wall_before_s = state.wall_s
-        self._stages_before = dict(state.stages)
+        self.wall_before_s = saved.wall_s
+        self._stages_before = dict(saved.stages)
         self.steps_before = state.env_steps
         self._started_s = time.monotonic()
 

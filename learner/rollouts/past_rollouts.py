@@ -7,7 +7,7 @@ the same versions, on lanes that continue where their last rollout ended.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import msgspec
 import numpy as np
@@ -29,11 +29,11 @@ class RoundsState(msgspec.Struct, frozen=True):
     """the version that acts in each open round"""
 
 
-class PastRollouts(NamedTuple):
-    """The state after the rollouts so far."""
+class PastRollouts(msgspec.Struct, frozen=True):
+    """The state after the rollouts so far. The defaults are a new run's values."""
 
-    ledger: Ledger
-    incarnations: Sequence[int]
+    ledger: Ledger = msgspec.field(default_factory=Ledger)
+    incarnations: list[Past] = []
     """the next incarnation of each lane"""
     rounds: RoundsState = RoundsState()
     lanes: Sequence[LanePast] = ()
@@ -42,14 +42,14 @@ class PastRollouts(NamedTuple):
     """the weights that act in open rounds, except the newest"""
 
 
-def packed(records: Sequence[msgspec.Struct]) -> Bytes:
-    """Encode records as bytes, for a file. Their arrays are copied."""
-    return np.frombuffer(msgspec.msgpack.encode(records, enc_hook=_described), np.uint8)
+def packed(record: msgspec.Struct) -> Bytes:
+    """Encode a record as bytes, for a file. Its arrays are copied."""
+    return np.frombuffer(msgspec.msgpack.encode(record, enc_hook=_described), np.uint8)
 
 
-def unpacked(kind: type[T], data: Bytes) -> list[T]:
-    """Decode records of one type. Raises `ValueError` or `msgspec.ValidationError` for anything else."""
-    return msgspec.msgpack.decode(data.tobytes(), type=list[kind], dec_hook=_array)  # type: ignore[valid-type]
+def unpacked(kind: type[T], data: Bytes) -> T:
+    """Decode a record of this type. Raises `ValueError` or `msgspec.ValidationError` for anything else."""
+    return msgspec.msgpack.decode(data.tobytes(), type=kind, dec_hook=_array)
 
 
 def _described(value: object) -> object:

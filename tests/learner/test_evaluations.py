@@ -20,7 +20,7 @@ from millrace.learner.run_folder.atomic_write import Writes
 from millrace.learner.run_folder.progress import Row
 from millrace.learner.run_folder.results import EvaluatedPolicy
 from millrace.learner.run_folder.run_folder import RunFolder
-from millrace.learner.run_state import RunState
+from millrace.learner.run_state import RunState, SavedRun
 from millrace.play_flags import EvaluateFlags
 from millrace.protocol.bounds import LARGEST
 from millrace.protocol.rollout import Episode, stack_rollouts
@@ -66,9 +66,11 @@ class Fakes:
     def evaluations(
         self, every: int, state: RunState, seed: int = 1, ended_by: Any = lambda: None, **settings: Any
     ) -> tuple[Tally, Evaluations]:
+        """`episodes` among the settings are the newest episodes of the run that is resumed."""
+        saved = SavedRun(state=state, episodes=settings.pop("episodes", []))
         config = Config(eval_every=every, eval_episodes=10, seed=seed, **settings)
         folder, algorithm, hub = cast(RunFolder, self), cast(Algorithm, self), cast(Hub, self)
-        tally = Tally(config, run_spec(), state, ended_by)
+        tally = Tally(config, run_spec(), saved, ended_by)
         return tally, Evaluations(RunParts(config, run_spec(), folder, algorithm, hub, tally), None)
 
 
@@ -263,8 +265,8 @@ def test_evaluations_after_training_do_not_change_why_a_run_ended(
 ) -> None:
     """Nor does a resume: whether the run was interrupted before its second evaluations, or has finished."""
     mean_reached = "target_mean_return" in settings
-    state = RunState(version=1, env_steps=100, next_evaluation=100, episodes=WINDOW if mean_reached else [])
-    settings = {"steps": 1_000_000, **settings}
+    state = RunState(version=1, env_steps=100, next_evaluation=100)
+    settings = {"steps": 1_000_000, "episodes": WINDOW if mean_reached else [], **settings}
     fakes = Fakes(*returns)
     tally, evaluations = ended(fakes, state, **settings)
     assert (tally.stop_reason(), evaluations.ended_by) == (reason, ended_by)

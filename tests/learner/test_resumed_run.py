@@ -21,11 +21,12 @@ from millrace.learner.resume_checks import unless_finished
 from millrace.learner.rollouts.hub import HubSnapshot
 from millrace.learner.rollouts.ledger import Ledger
 from millrace.learner.rollouts.opponent_pool import PoolState, Snapshot
+from millrace.learner.rollouts.past_rollouts import PastRollouts
 from millrace.learner.rollouts.rollout_dealer import AcceptedRollout
 from millrace.learner.run_folder import checkpoint
 from millrace.learner.run_folder.results import EvaluatedPolicy, Evaluation, Summary
 from millrace.learner.run_folder.run_folder import RunFolder
-from millrace.learner.run_state import RunState, restore
+from millrace.learner.run_state import RunState, SavedRun, restore
 from millrace.learner.train import train
 from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.errors import CheckpointError
@@ -42,8 +43,8 @@ def ppo(config: Config) -> PPOConfig:
 
 
 def test_the_seconds_of_stages_go_on_after_a_resume() -> None:
-    state = RunState(stages={"learner_wait": 10.0, "learner_evaluate": 4.0, "worker_step": 7.0})
-    tally = Tally(resolve("CartPole-v1"), fake_run_spec(), state)
+    saved = SavedRun(stages={"learner_wait": 10.0, "learner_evaluate": 4.0, "worker_step": 7.0})
+    tally = Tally(resolve("CartPole-v1"), fake_run_spec(), saved)
     tally.updated(1.5)
     snapshot = HubSnapshot(
         Ledger(), incarnations=[], lags=[], wait_s=2.0, learn_s=3.5, worker_stages={"step": 1.0, "act": 0.5}
@@ -135,9 +136,9 @@ def test_tickets_of_the_learner_that_died_are_lost_and_the_ledger_balances(tmp_p
     run = run_spec(config, EnvSpec("CartPole-v1"))
     algorithm = PPO(ppo(config), run.policy, total_steps=1, seed=1)
     folder = RunFolder.create(config)
-    state = RunState(ledger=Ledger(issued=10, used=6, transitions_received=80, transitions_used=60))
-    checkpoint.save(folder.path, state.checkpoint_content(algorithm), env_steps=60, keep=1)
-    ledger = restore(folder, algorithm).ledger
+    saved = SavedRun(rollouts=PastRollouts(Ledger(issued=10, used=6, transitions_received=80, transitions_used=60)))
+    checkpoint.save(folder.path, saved.checkpoint_content(algorithm), env_steps=60, keep=1)
+    ledger = restore(folder, algorithm).rollouts.ledger
     assert (ledger.lost, ledger.outstanding, ledger.transitions_late, ledger.transitions_waiting) == (4, 0, 20, 0)
 
 
@@ -146,7 +147,7 @@ def test_a_checkpoint_of_another_network_is_refused_in_one_line(tmp_path: Path) 
     run = run_spec(config, EnvSpec("CartPole-v1"))
     folder = RunFolder.create(config)
     narrower = PPO(ppo(config), run.policy, total_steps=1, seed=1)
-    checkpoint.save(folder.path, RunState().checkpoint_content(narrower), env_steps=0, keep=1)
+    checkpoint.save(folder.path, SavedRun().checkpoint_content(narrower), env_steps=0, keep=1)
     wider = resolve("CartPole-v1", net=(32, 32), run_dir=str(tmp_path))
     other = PPO(ppo(wider), run_spec(wider, EnvSpec("CartPole-v1")).policy, total_steps=1, seed=1)
     with pytest.raises(CheckpointError, match="expected the state of this configuration") as failure:
@@ -201,9 +202,10 @@ def test_a_run_is_finished_while_its_reason_to_stop_holds(tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     ("part", "wrong"),
     [
-        ("past", {"version": -1}), ("past", {"env_steps": 2**64}), ("past", {"wall_s": float("inf")}),
+        ("past", {"state": {"version": -1}}), ("past", {"state": {"env_steps": 2**64}}), ("past", {"wall_s": float("inf")}),
         ("past", {"episodes": [[]]}), ("past", {"facts": ["a"], "episodes": [[1.0, 2, 3.0, [4.0]], [1.0, 2, 3.0, []]]}),
         ("past", {"env_attributes": {"sent": b"\xc1"}}), ("past", {"env_attributes": {"waiting": b"\x01"}}),
+        ("rollouts", torch.zeros(2, dtype=torch.uint8)), ("rollouts", None),
         ("best_policy", ["x"]), ("best_policy", 1), ("algorithm", []), ("algorithm", {"observations": []}),
         ("algorithm", {"rewards": {"moments": "x"}}),
     ],
@@ -211,7 +213,7 @@ def test_a_run_is_finished_while_its_reason_to_stop_holds(tmp_path: Path) -> Non
 def test_a_checkpoint_of_another_structure_is_one_line(tmp_path: Path, part: str, wrong: Any) -> None:
     config = resolve("CartPole-v1", run_dir=str(tmp_path), normalize_observations=True)
     algorithm = PPO(ppo(config), run_spec(config, EnvSpec("CartPole-v1")).policy, total_steps=100, seed=1)
-    content = RunState().checkpoint_content(algorithm)
+    content = SavedRun().checkpoint_content(algorithm)
     content[part] = content[part] | wrong if isinstance(wrong, dict) else wrong
     folder = RunFolder.create(config)
     checkpoint.save(folder.path, content, env_steps=0, keep=3)
@@ -242,7 +244,9 @@ def test_a_policy_that_a_checkpoint_speaks_of_is_in_it(tmp_path: Path, says: dic
         "a number fewer": [own[0][1:], own[1]],
         "float64": [each.double() for each in own],
     }
-    content = RunState(**says).checkpoint_content(algorithm) | {name: made[kind] for name, kind in policy.items()}
+    content = SavedRun(state=RunState(**says)).checkpoint_content(algorithm) | {
+        name: made[kind] for name, kind in policy.items()
+    }
     folder = RunFolder.create(config)
     checkpoint.save(folder.path, content, env_steps=0, keep=3)
     with pytest.raises(CheckpointError, match=f"got another \\({next(iter(policy))}: expected ") as refused:

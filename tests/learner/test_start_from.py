@@ -20,7 +20,7 @@ from millrace.learner.config.layers import resolve
 from millrace.learner.resume_checks import unless_finished
 from millrace.learner.run_folder import checkpoint
 from millrace.learner.run_folder.run_folder import RunFolder, Which
-from millrace.learner.run_state import RunState, start_from
+from millrace.learner.run_state import RunState, SavedRun, start_from
 from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.errors import UserFacingError
 from millrace.protocol.policy.layout import buffer_layout, named_views
@@ -75,7 +75,7 @@ def earlier_run(algo: str, folder: Path, **settings: Any) -> tuple[Path, Any]:
     for seed in (1, 2):
         algorithm.update(rows(algorithm, seed), no_pulse)
     save(run, algorithm)
-    content = RunState(version=2).checkpoint_content(algorithm)
+    content = SavedRun(state=RunState(version=2)).checkpoint_content(algorithm)
     checkpoint.save(run.path, content, env_steps=algorithm.env_steps, keep=3)
     return run.path, algorithm
 

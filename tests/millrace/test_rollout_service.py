@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import itertools
-import json
 import os
 import re
 import threading
@@ -14,6 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -240,7 +240,7 @@ def test_a_damaged_file_is_named(tmp_path: Path) -> None:
                 made.save(file, **{name: np.ones(3)})
     whole = file.read_bytes()
     nested = io.BytesIO()
-    np.savez(nested, millrace=np.frombuffer(b'{"normalizer":' + b'{"a":' * 100_000, np.uint8))
+    np.savez(nested, millrace=np.frombuffer(b"\x81\xaanormalizer" + b"\x81\xa1a" * 100_000, np.uint8))
     compressed = io.BytesIO()
     with np.load(file) as saved:
         np.savez_compressed(compressed, **saved)
@@ -255,10 +255,10 @@ def test_a_damaged_file_is_named(tmp_path: Path) -> None:
     [
         ({"version": 2**53}, "Expected `int` <= "),
         ({"env_steps": -1}, "Expected `int` >= 0"),
-        ({"incarnations": [2**53] * 4}, "Expected `int` <= "),
-        ({"ledger": {"issued": 2**53}}, "Expected `int` <= "),
+        ({"rollouts": {"incarnations": [2**53] * 4}}, "Expected `int` <= "),
+        ({"rollouts": {"ledger": {"issued": 2**53}}}, "Expected `int` <= "),
         (
-            {"ledger": {"used": 5}},
+            {"rollouts": {"ledger": {"used": 5}}},
             "ledger: expected at least as many tickets and transitions as were used or lost, got fewer",
         ),
         ({"normalizer": {}}, "'observations'"),
@@ -273,8 +273,8 @@ def test_a_state_that_no_service_can_have_is_one_line(tmp_path: Path, change: di
     with service() as made:
         made.save(file)
     with np.load(file) as saved:
-        state = json.loads(saved["millrace"].tobytes()) | change
-    np.savez(file, millrace=np.frombuffer(json.dumps(state).encode(), np.uint8))
+        state = msgspec.msgpack.decode(saved["millrace"].tobytes()) | change
+    np.savez(file, millrace=np.frombuffer(msgspec.msgpack.encode(state), np.uint8))
     with pytest.raises(CheckpointError) as caught, service(restore=file):
         pass
     assert str(caught.value).startswith(f"{file}: expected a file that RolloutService.save wrote, cannot read it: ")

@@ -35,11 +35,11 @@ import millrace
 from millrace.extras.monitoring.report.page import page
 from millrace.extras.monitoring.report.picture import draw
 from millrace.launch.training import train
-from millrace.learner.algorithm_check.same_bits import first_difference
 from millrace.learner.algorithms import algorithm_class
 from millrace.learner.config.layers import resolve
 from millrace.learner.env_spaces import EnvSpaces
 from millrace.learner.resume_checks import naming_run, unless_finished
+from millrace.learner.rollouts.past_rollouts import packed
 from millrace.learner.run_folder.json_log import kept_log
 from millrace.learner.run_folder.lease import Owner
 from millrace.learner.run_folder.living_owner import learner_of_run
@@ -52,7 +52,7 @@ from millrace.learner.run_folder.run_lock import LOCK_FILE, Pace, RunLock
 from millrace.learner.run_folder.sentences import bottleneck, lag_in_words, went_wrong
 from millrace.learner.run_lines import RunLine, headline, in_sentences
 from millrace.learner.run_spec import run_spec
-from millrace.learner.run_state import RunState, restore
+from millrace.learner.run_state import SavedRun, restore
 from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.errors import UsageError, UserFacingError
 from tests.support.in_process.described import described
@@ -83,7 +83,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def resume(run: Path) -> tuple[RunState, tuple[bytes, ...]]:
+def resume(run: Path) -> tuple[SavedRun, bytes]:
     """All that `--resume` reads before it trains."""
     config = resolve(resume=run)
     unless_finished(config, run, lambda checked: run)
@@ -94,16 +94,14 @@ def resume(run: Path) -> tuple[RunState, tuple[bytes, ...]]:
     with naming_run(run):
         policy = run_spec(config, env, spaces).policy
     algorithm = algorithm_class(config.algo)(config.algorithm, policy, total_steps=config.steps, seed=1)
-    state = restore(folder, algorithm)
-    MetricsLog(run, state.env_steps).close()
-    arrays = (algorithm.weights()[0], *(state.best_policy or ()))
-    return msgspec.structs.replace(state, best_policy=None), tuple(array.tobytes() for array in arrays)
+    found = restore(folder, algorithm)
+    MetricsLog(run, found.state.env_steps).close()
+    return found, algorithm.weights()[0].tobytes()
 
 
-def same(one: tuple[RunState, Any], other: tuple[RunState, Any]) -> bool:
+def same(one: tuple[SavedRun, bytes], other: tuple[SavedRun, bytes]) -> bool:
     """Whether two runs go on alike."""
-    states = [msgspec.structs.asdict(state) for state, _ in (one, other)]
-    return one[1] == other[1] and first_difference(states[0], states[1]) is None
+    return one[1] == other[1] and packed(one[0]).tobytes() == packed(other[0]).tobytes()
 
 
 def look(run: Path) -> list[Any]:
@@ -348,7 +346,7 @@ def check(
                 if name == "newest checkpoint" and reader == "resume" and not how.startswith("structure"):
                     older = any(str(newest) in line for line in said)
                     assert older or same(found, undamaged), "a damaged checkpoint was taken without a word"
-                    assert not older or found[0].version < undamaged[0].version
+                    assert not older or found[0].state.version < undamaged[0].state.version
     assert outside.read_bytes() == PRECIOUS
     assert not outside.with_name("nothing").exists()
     for target, content in zip(targets, contents, strict=True):

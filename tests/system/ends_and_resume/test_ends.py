@@ -113,7 +113,7 @@ def test_a_watch_that_raises_in_an_evaluation(tmp_path: Path) -> None:
         run(tmp_path, watch, eval_every=100, eval_episodes=200)
     found = checkpoint.newest(folder_of(tmp_path / "runs"))[0]
     assert saved(folder_of(tmp_path / "runs")) == 4
-    assert found.state["past"]["next_evaluation"] == 100 <= found.env_steps, "it must be made again"
+    assert found.state["past"]["state"]["next_evaluation"] == 100 <= found.env_steps, "it must be made again"
 
 
 def test_a_watch_that_raises_at_the_very_end(tmp_path: Path) -> None:

@@ -12,12 +12,11 @@ import pytest
 
 from millrace.launch.training import train
 from millrace.learner.config.layers import resolve
-from millrace.learner.run_folder import checkpoint
 from millrace.learner.run_folder.metrics_log import read_rows
 from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.errors import UsageError
 from tests.learner.config.test_resume_rules import content
-from tests.system.stage.run_folders import summary
+from tests.system.stage.run_folders import saved_rollouts, summary
 from tests.system.stage.runs import balanced
 
 GRADIENT_STEPS = 5
@@ -46,11 +45,6 @@ def silent(progress: object) -> None:
     """Show nothing."""
 
 
-def past(run: Path) -> dict[str, Any]:
-    found: dict[str, Any] = checkpoint.newest(run)[0].state["past"]
-    return found
-
-
 def goes_on_with(tmp_path: Path, algorithm: str, shapes: list[tuple[int, int]]) -> None:
     """Train for five updates with 4 lanes and 8 envs, then for five more with each of these shapes."""
     settings = ALGORITHMS[algorithm]
@@ -60,19 +54,19 @@ def goes_on_with(tmp_path: Path, algorithm: str, shapes: list[tuple[int, int]]) 
     max_lag = settings.get("max_lag", 0)
     used = 4 * summary(run)["updates"]
     for lanes, envs in shapes:
-        before, old = summary(run), past(run)
+        before, old = summary(run), saved_rollouts(run).incarnations
         steps = before["env_steps"] + 5 * T * envs
         assert train(resolve(resume=run, steps=steps, lanes=lanes, envs=envs), run, silent) == run
-        now, new = summary(run), past(run)
+        now, new = summary(run), saved_rollouts(run).incarnations
         updates = now["updates"] - before["updates"]
         assert updates >= 5, "it does not go on"
         ledger, used = balanced(now), used + lanes * updates
         assert ledger["used"] == used, "an update was not made of one rollout of each lane"
         assert ledger["transitions_used"] == now["env_steps"]
         assert ledger["outstanding"] <= lanes * (1 + max_lag), "more tickets than lanes and max_lag allow"
-        for lane in range(max(len(old["incarnations"]), lanes)):
-            had = old["incarnations"][lane] if lane < len(old["incarnations"]) else 0
-            has = new["incarnations"][lane]
+        for lane in range(max(len(old), lanes)):
+            had = old[lane] if lane < len(old) else 0
+            has = new[lane]
             assert has > had if lane < lanes else has == had, f"lane {lane}: incarnation {had}, then {has}"
         rows = [row for row in read_rows(run / "metrics.jsonl") if row["time/iterations"] > before["updates"]]
         assert [row["time/iterations"] for row in rows] == list(range(before["updates"] + 1, now["updates"] + 1))

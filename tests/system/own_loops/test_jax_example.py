@@ -44,4 +44,4 @@ def test_it_solves_cartpole_with_workers_on_another_host_of_which_one_is_killed(
     assert found, learner.said()
     assert float(found[1]) >= 475
     state, _ = read(file)
-    assert max(state.incarnations) == 2, state.incarnations  # lanes of the killed worker went to the other one
+    assert max(state.rollouts.incarnations) == 2, state.rollouts  # lanes of the killed worker went to the other one

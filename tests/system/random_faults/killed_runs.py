@@ -306,7 +306,7 @@ class OneRun:
             return
         found, warnings = checkpoint.newest(run)
         assert not warnings, warnings
-        saved = int(found.state["past"]["version"])
+        saved = int(found.state["past"]["state"]["version"])
         every = -(-EVERY // ROWS) if self.flags["checkpoint-every-s"] else 1  # a checkpoint comes before each evaluation
         assert saved >= marks.saved, f"an older checkpoint than the one that was written: {saved}, {marks}"
         table = run / "metrics.jsonl"

@@ -122,7 +122,7 @@ class Marker:
 
         def marked_save(folder: Path, state: dict[str, Any], *args: Any) -> Path:
             found = self.during(Phase.CHECKPOINTING, save)(folder, state, *args)
-            self.mark(saved=state["past"]["version"])
+            self.mark(saved=state["past"]["state"]["version"])
             return found
 
         Hub.gather = marked_gather  # type: ignore[assignment,method-assign]

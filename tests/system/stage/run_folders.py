@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+from millrace.learner.rollouts.past_rollouts import PastRollouts, unpacked
 from millrace.learner.run_folder import checkpoint
 
 
@@ -26,7 +27,12 @@ def policy_of(folder: Path) -> bytes:
     return (folder / "policy.safetensors").read_bytes()
 
 
+def saved_rollouts(folder: Path) -> PastRollouts:
+    """The rollouts so far, as its newest checkpoint has them."""
+    return unpacked(PastRollouts, checkpoint.newest(folder)[0].state["rollouts"].numpy())
+
+
 def saved(folder: Path) -> int:
     """The number of updates in its newest checkpoint."""
-    found: int = checkpoint.newest(folder)[0].state["past"]["version"]
+    found: int = checkpoint.newest(folder)[0].state["past"]["state"]["version"]
     return found

@@ -196,8 +196,8 @@ def test_a_signal_while_the_learner_waits_for_it_ends_the_run_in_time(
     said = started.said()
     assert re.search("interrupted; continue with: .*millrace train --resume", said)
     assert "Traceback" not in said
-    past = checkpoint.newest(folder_of(stage.runs))[0].state["past"]
-    assert 0 < past["pending"]["version"] < past["version"]
+    saved = checkpoint.newest(folder_of(stage.runs))[0].state["past"]["state"]
+    assert 0 < saved["pending"]["version"] < saved["version"]
 
 
 @pytest.mark.parametrize("dies", [False, True])

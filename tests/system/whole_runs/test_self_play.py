@@ -45,7 +45,7 @@ def broken() -> Any:
 def pool_of(run: Path) -> Any:
     state = checkpoint.newest(run)[0].state
     arrays = state["opponent_policies"]
-    return state["past"]["opponents"], arrays and [array.numpy().tobytes() for array in arrays]
+    return state["past"]["state"]["opponents"], arrays and [array.numpy().tobytes() for array in arrays]
 
 
 @pytest.mark.parametrize(

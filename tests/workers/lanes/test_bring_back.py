@@ -194,8 +194,7 @@ def past_of(
 
 def saved(past: LanePast) -> LanePast:
     """As a checkpoint keeps it."""
-    (read,) = unpacked(LanePast, packed([past]))
-    return read
+    return unpacked(LanePast, packed(past))
 
 
 def all_bits(rollout: Rollout) -> dict[str, object]:
