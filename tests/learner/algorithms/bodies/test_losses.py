@@ -10,10 +10,12 @@ import torch
 from msgspec.structs import replace
 from torch import Tensor
 
-from millrace.learner.algorithms.bodies.stacked_mlps import StackedMLPs
+from millrace.learner.algorithms.bodies.stacked_mlps import StackedMLPs, initial
 from millrace.learner.algorithms.bounded_returns import BoundedReturns
 from millrace.learner.algorithms.replay.transitions import Transitions
 from millrace.protocol.arrays import Doubles
+from millrace.protocol.errors import UsageError
+from millrace.protocol.random_streams import Purpose, torch_seed
 from tests.learner.algorithms.bodies import plain_formula as plain
 from tests.learner.algorithms.test_continuous import batch, made, sample_of
 
@@ -133,18 +135,28 @@ def test_the_critic_loss_of_tqc_and_its_gradient_are_those_of_the_formula() -> N
     torch.testing.assert_close(gradient(found, given.algorithm.net.critics), by_critics, **ROUNDING)
 
 
+def test_targets_of_tqc_keep_at_least_one_quantile() -> None:
+    with pytest.raises(UsageError, match="dropped_quantiles: expected fewer than quantiles, 4, got 4"):
+        made("tqc", quantiles=4, dropped_quantiles=4)
+
+
 # -------------------------------------------------------------------- CrossQ
 
 
-def crossq_loss(given: Case, critics: Tensor, normalize: Any = plain.of_minibatch) -> Tensor:
-    """½ Σ E[w (Q(s, a) − y)²]: one pass of [s; s′], whose second half gives the constant y."""
+def values_and_targets_of_crossq(given: Case, critics: Tensor, normalize: Any = plain.of_minibatch) -> tuple[Tensor, Tensor]:
+    """Q(s, a) [2, B] and y [B]: one pass of [s; s′], whose second half gives the constant y."""
     rows = given.rows
     action, log_prob = given.action(rows.next_x, given.noise[0])
     x, actions = torch.cat((rows.x, rows.next_x)), torch.cat((rows.action, action))
     q = given.critics(x, actions, normalize, critics)[..., 0]
     value = np.minimum(*array(q[:, B:])) - given.alpha * array(log_prob)
-    y = torch.from_numpy(array(rows.reward) + array(rows.discount) * value)
-    return 0.5 * (rows.weight * (q[0, :B] - y) ** 2).mean() + 0.5 * (rows.weight * (q[1, :B] - y) ** 2).mean()
+    return q[:, :B], torch.from_numpy(array(rows.reward) + array(rows.discount) * value)
+
+
+def crossq_loss(given: Case, critics: Tensor, normalize: Any = plain.of_minibatch) -> Tensor:
+    """½ Σ E[w (Q(s, a) − y)²] over both critics."""
+    weight, (q, y) = given.rows.weight, values_and_targets_of_crossq(given, critics, normalize)
+    return 0.5 * (weight * (q[0] - y) ** 2).mean() + 0.5 * (weight * (q[1] - y) ** 2).mean()
 
 
 @pytest.mark.parametrize("renormalizes", [False, True])
@@ -246,7 +258,7 @@ def test_the_critic_loss_of_xqc_and_its_gradient_are_those_of_the_formula() -> N
 
 def test_xqc_learns_from_rewards_whose_values_are_within_the_bound_of_the_categories() -> None:
     algorithm, plainly, expected = (
-        made("xqc", return_bound=0.5),
+        made("xqc", return_bound=0.5, n_step=3),  # the scale is that of returns of single steps, whose discount is 0.99
         made("xqc", normalize_rewards=False),
         BoundedReturns(0.99, 0.5),
     )
@@ -293,7 +305,51 @@ def test_weights_of_units_of_xqc_have_norm_1_after_each_step() -> None:
         algorithm.step(algorithm.transitions(sample_of(numbers, B)))
 
 
+# -------------------------------------------------------------------- errors, which become priorities
+
+
+def values_and_targets(given: Case) -> tuple[Doubles, Doubles]:
+    """The expected values of all critics, [K, B], and those of their targets, [B]."""
+    critics, rows = given.algorithm.net.critics, given.rows
+    match type(given.algorithm).__name__:
+        case "TQC":
+            quantiles = given.critics(rows.x, rows.action, plain.of_minibatch, critics)
+            return array(quantiles.mean(-1)), targets_of_tqc(given).mean(-1)
+        case "CrossQ":
+            values, y = values_and_targets_of_crossq(given, critics)
+            return array(values), array(y)
+        case _:
+            x, actions, _, _ = next_of_xqc(given)
+            logits = given.critics(x, actions, plain.of_minibatch, critics)[:, :B]
+            return softmax(array(logits)) @ atoms_of(given), target_of_xqc(given) @ atoms_of(given)
+
+
+@ALL
+def test_errors_of_critics_that_are_wrong_in_opposite_directions_do_not_cancel(algo: str) -> None:
+    given = case(algo)
+    values, targets = values_and_targets(given)
+    errors = values - targets
+    assert ((errors < 0).any(0) & (errors > 0).any(0)).any()
+    found = given.algorithm.critic_loss(given.rows).error
+    np.testing.assert_allclose(array(found), abs(errors).mean(0), **ROUNDING)
+
+
 # -------------------------------------------------------------------- the actor
+
+
+@pytest.mark.parametrize("algo", ["tqc", "crossq"])
+def test_means_and_deviations_of_actions_begin_almost_alike_for_all_observations(algo: str) -> None:
+    """The weights of each output of the actor have norm 0.01."""
+    algorithm = made(algo, **SETTINGS[algo])
+    (layers,) = plain.layers(algorithm.net.actor_body.shape, algorithm.net.actor)
+    torch.testing.assert_close(layers[-1].weight.square().sum(1).sqrt(), torch.full((4,), 0.01), **ROUNDING)
+
+
+def test_initial_weights_come_from_the_random_stream_of_weights() -> None:
+    """The actor's are the first."""
+    algorithm = made("tqc", seed=3, **SETTINGS["tqc"])
+    generator = torch.Generator().manual_seed(torch_seed(3, Purpose.WEIGHTS))
+    assert torch.equal(algorithm.net.actor, initial(algorithm.net.actor_body.shape, generator))
 
 
 def actor_loss(given: Case, actor: Tensor) -> Tensor:
