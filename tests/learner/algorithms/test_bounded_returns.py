@@ -103,6 +103,13 @@ def test_an_episode_with_a_short_time_limit_would_have_gone_on() -> None:
     assert scaler.scaled(np.full(1, -1, np.float32))[0] / (1 - GAMMA) == pytest.approx(-BOUND)
 
 
+def test_a_penalty_sets_the_scale_as_a_reward_of_its_size_does() -> None:
+    """The returns are -4, -7.6 and -10.84, whose deviation is less than 4."""
+    scaler = BoundedReturns(GAMMA, 1.0)
+    life([-4.0] * 3, "terminated").count_into(scaler)
+    assert divisor(scaler) == pytest.approx(10.84, rel=1e-6)
+
+
 def test_an_episode_that_terminates_would_not() -> None:
     scaler = BoundedReturns(GAMMA, BOUND)
     life([-4.0] * 3, "terminated").count_into(scaler)
