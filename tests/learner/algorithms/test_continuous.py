@@ -32,6 +32,7 @@ from millrace.protocol.policy.layout import LOG_STD_BOUNDS, named_views
 from millrace.protocol.policy.numpy_policy import NumpyPolicy
 from millrace.protocol.policy.torch_distributions import squashed_sample
 from millrace.protocol.policy.torch_policy import TorchPolicy
+from millrace.protocol.random_streams import Purpose, torch_seed
 from millrace.protocol.rollout import Batch
 from millrace.protocol.specs import ActionSpec, Leaf
 
@@ -171,6 +172,14 @@ def test_workers_act_as_the_network_does(algo: str) -> None:
 
 
 @BOTH
+@pytest.mark.parametrize(("env_steps", "uniform"), [(23, 1), (24, 0)])
+def test_actions_are_uniform_in_as_many_env_steps_as_learning_waits_for(algo: str, env_steps: int, uniform: int) -> None:
+    algorithm = made(algo, learning_starts=24)
+    algorithm.env_steps = env_steps
+    assert algorithm.weights()[1][-1] == uniform
+
+
+@BOTH
 @pytest.mark.parametrize(
     ("observation", "action", "settings", "expected"),
     [
@@ -198,6 +207,31 @@ def test_other_spaces_are_refused_in_one_line(
     kind: Any = algorithm_class(algo)
     with pytest.raises(UsageError, match=f"^{algo}: .*{expected}.*--algo ppo[^\n]*$"):
         kind.policy_spec(msgspec.convert(settings, HYPERPARAMETERS[algo]), observation, action)
+
+
+# -------------------------------------------------------------------- what a run begins with
+
+
+def test_noise_comes_from_its_own_random_stream() -> None:
+    """If it were the stream of weights, noise would depend on them."""
+    expected = torch.randn(5, 2, generator=torch.Generator().manual_seed(torch_seed(3, Purpose.NOISE)))
+    assert torch.equal(made("sac", seed=3).noise(5), expected)
+
+
+@pytest.mark.parametrize("algo", ["sac", "td3", "tqc", "xqc"])
+def test_target_networks_begin_as_copies(algo: str) -> None:
+    algorithm = made(algo, seed=3)
+    assert algorithm.target is not algorithm.net
+    assert torch.equal(algorithm.target.flat, algorithm.net.flat)
+
+
+def test_the_learning_rates_of_critics_actor_and_temperature_all_follow_the_schedule() -> None:
+    """After a quarter of the run."""
+    algorithm = made("sac", learning_rate=1e-3, learning_rate_schedule="linear")
+    algorithm.env_steps = 2_500
+    algorithm.set_schedules()
+    rates = {name: each.param_groups[0]["lr"] for name, each in algorithm.optimizers.items()}
+    assert rates == dict.fromkeys(("actor_optimizer", "critic_optimizer", "ent_coef_optimizer"), 0.75e-3)
 
 
 # -------------------------------------------------------------------- targets by hand
