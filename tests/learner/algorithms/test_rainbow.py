@@ -10,6 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from millrace.learner.algorithms.bodies.stacked_mlps import initial
 from millrace.learner.algorithms.rainbow import Rainbow
 from millrace.learner.algorithms.replay.transitions import Transitions
 from millrace.learner.config.hyperparameters import RainbowConfig
@@ -18,6 +19,7 @@ from millrace.protocol.policy.layout import named_views, parameter_layout, total
 from millrace.protocol.policy.networks import QNetwork
 from millrace.protocol.policy.numpy_policy import NumpyPolicy
 from millrace.protocol.policy.torch_policy import TorchPolicy
+from millrace.protocol.random_streams import Purpose, torch_seed
 from millrace.protocol.rollout import Batch
 from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
 from tests.learner.algorithms.bodies import plain_formula as plain
@@ -59,6 +61,13 @@ def by_action(policy: PolicySpec, out: Tensor, sign: int = -1) -> Tensor:
         advantage = own[:, -actions:]
         found.append(own[:, :-actions] + advantage + sign * advantage.mean(1, keepdim=True) if policy.dueling else own)
     return torch.stack(found, 1)
+
+
+def test_initial_weights_come_from_the_random_stream_of_weights() -> None:
+    config = RainbowConfig(net=(9, 8), quantiles=N)
+    policy = Rainbow.policy_spec(config, DISCRETE.observation, DISCRETE.action)
+    net = Rainbow(config, policy, total_steps=10_000, seed=3).net
+    assert torch.equal(net.flat, initial(net.body.shape, torch.Generator().manual_seed(torch_seed(3, Purpose.WEIGHTS))))
 
 
 # -------------------------------------------------------------------- the loss
