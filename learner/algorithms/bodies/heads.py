@@ -26,7 +26,7 @@ def quantile_huber(quantiles: Tensor, targets: Tensor) -> Tensor:
     count = quantiles.shape[-1]
     fractions = (torch.arange(count, dtype=quantiles.dtype, device=quantiles.device) + 0.5) / count
     error = targets.unsqueeze(-2) - quantiles.unsqueeze(-1)  # [K, B, O, J]
-    slope = torch.where(error.detach() < 0, 1 - fractions[:, None], fractions[:, None])
+    slope = torch.where(error < 0, 1 - fractions[:, None], fractions[:, None])
     return (slope * F.huber_loss(error, torch.zeros_like(error), reduction="none")).mean((-2, -1))
 
 
@@ -50,7 +50,7 @@ class Categories:
         """
         returns = reward[:, None] + discount[:, None] * self.atoms.to(reward.dtype)
         position = (returns.clamp(-self.bound, self.bound) + self.bound) / self.step
-        lower = position.floor().clamp(0, len(self.atoms) - 2)
+        lower = position.floor().clamp(max=len(self.atoms) - 2)
         upper_share = position - lower
         projected = torch.zeros_like(probabilities)
         projected.scatter_add_(-1, lower.long(), probabilities * (1 - upper_share))
