@@ -41,13 +41,13 @@ from millrace.extras.envs.vectorized import make_native
 from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.envs.spaces import action_spec, observation_leaves
 from millrace.protocol.errors import UsageError
+from millrace.protocol.messages import Permit
 from millrace.protocol.policy.distributions import distribution
 from millrace.protocol.policy.layout import acting_size, buffer_size
 from millrace.protocol.policy.policy import Policy, make_policy
 from millrace.protocol.specs import PolicySpec, RunSpec
 from millrace.protocol.wire.weight_dtypes import ActingDtype
 from millrace.workers.collect.collector import Collector
-from millrace.workers.conversation.held import Assignment
 
 PROCESSES = 2
 STEPS = 128  # T, the number of steps in a rollout
@@ -189,7 +189,7 @@ def ours(kind: str, lanes: int, images: ActingDtype, spec: EnvSpec, copies: int,
     def turn() -> int:
         nonlocal sequence
         before = collector.steps
-        collector.collect([Assignment(0, lane, 0, sequence, sequence) for lane in mine], 0, 0, _no_pulse)
+        collector.collect([Permit(0, lane, 0, sequence, sequence) for lane in mine], 0, 0, _no_pulse)
         sequence += 1
         return collector.steps - before
 

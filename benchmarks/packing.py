@@ -23,6 +23,7 @@ from benchmarks.simulated import canned, run_spec
 from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.keys.key_folder import Keyring
 from millrace.protocol.keys.keys import ClientList, Key, Token
+from millrace.protocol.messages import Permit
 from millrace.protocol.policy.layout import acting_size
 from millrace.protocol.policy.policy import make_policy
 from millrace.protocol.rollout import Rollout, rollout_bytes
@@ -34,7 +35,6 @@ from millrace.protocol.wire.message_sizes import MAX_FRAME_BYTES
 from millrace.protocol.wire.weight_dtypes import ActingDtype, to_float32, to_wire_dtype
 from millrace.protocol.wire.worker_link import WorkerLink
 from millrace.workers.collect.collector import Collector
-from millrace.workers.conversation.held import Assignment
 
 ATARI = RunSpec(
     EnvSpec("ALE/Pong-v5"),
@@ -96,7 +96,7 @@ def cartpole(copies: int, steps: int) -> Rollout:
     run = msgspec.structs.replace(run_spec(1), env=EnvSpec("CartPole-v1"), copies=copies, rollout_steps=steps)
     policy = make_policy(run.policy)
     policy.load(np.zeros(acting_size(run.policy), np.float32), np.zeros(0, np.float32))
-    return Collector(run, policy).collect([Assignment(0, 0, 0, 0, 0)], 0, 0, lambda: None)[0]
+    return Collector(run, policy).collect([Permit(0, 0, 0, 0, 0)], 0, 0, lambda: None)[0]
 
 
 def packing(rounds: int) -> list[dict[str, object]]:

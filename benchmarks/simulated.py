@@ -125,7 +125,7 @@ class Simulated:
                 valid=one.valid,
                 state=one.state,
             )
-            for each in task.assignments
+            for each in task.permits
         ]
 
     def _do(self, effects: Sequence[WorkerEffect]) -> None:

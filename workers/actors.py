@@ -38,8 +38,8 @@ class Actors:
         """
         self._load(task.weights)
         match task:
-            case RolloutTask(session, weights, assignments, held):
-                return self._collector.collect(assignments, weights.version, session, pulse, held)
+            case RolloutTask(session, weights, permits, held):
+                return self._collector.collect(permits, weights.version, session, pulse, held)
             case EvaluationTask(_, order, held):
                 return [self._evaluator.play(order, send, pulse, held)]
 

@@ -16,7 +16,7 @@ import numpy as np
 from millrace.learner.members.lane_placement import PlacedLane
 from millrace.learner.rollouts.lane_history import LaneHistories, LaneHistory
 from millrace.protocol.arrays import Bools
-from millrace.protocol.messages import Hello, LanePast, Permit
+from millrace.protocol.messages import LanePast, Permit
 from millrace.protocol.rollout import Rollout
 
 MOST_ATTEMPTS = 3  # copies start afresh once this many attempts to continue their lane have each lost a worker
@@ -95,10 +95,10 @@ class TicketedLane(PlacedLane):
     ) -> Ticket:
         """Make a ticket for the next rollout, for the lane's owner. `past` goes with the first ticket of an incarnation."""
         assert self.owner is not None
-        ticket = Ticket(number, self.number, self.incarnation, self.dealt, round_number, version, self.owner, opponent, past)
+        permit = Permit(number, self.number, self.incarnation, self.dealt, round_number, opponent, past)
         self.outstanding.add(number)
         self.dealt += 1
-        return ticket
+        return Ticket(permit, version, self.owner)
 
     def past(self, histories: LaneHistories, waiting: Iterable[tuple[int, Rollout, bytes]]) -> LanePast | None:
         """The past that a new owner continues; None if the lane has not begun.
@@ -161,20 +161,8 @@ class TicketedLane(PlacedLane):
 class Ticket:
     """A ticket that a worker holds."""
 
-    number: int
-    lane: int
-    incarnation: int
-    sequence: int
-    """Sequence number of its rollout in this incarnation."""
-    round: int
+    permit: Permit
+    """The ticket in the form that is sent."""
     version: int
     """Version of the weights that act."""
     peer: bytes
-    opponent: int | None = None
-    past: LanePast | None = None
-    """`opponent` and `past` mean the same as in a `Permit`."""
-
-    def permit(self, worker: Hello) -> Permit:
-        """The ticket in the form that is sent to this worker."""
-        past = self.past if worker.continues else None
-        return Permit(self.number, self.lane, self.incarnation, self.sequence, self.round, self.opponent, past)

@@ -21,7 +21,7 @@ from millrace.learner.rollouts.ledger import Ledger
 from millrace.learner.rollouts.opponent_pool import OpponentPool
 from millrace.protocol.arrays import Bools
 from millrace.protocol.errors import BadRollout
-from millrace.protocol.messages import Collect, LanePast, Received, Rollout
+from millrace.protocol.messages import Collect, LanePast, Permit, Received, Rollout
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,7 +117,7 @@ class RolloutDealer:
 
     def awaited(self) -> list[Ticket]:
         """The tickets for the next update that workers hold."""
-        return [ticket for ticket in self.held.values() if ticket.round == self.rounds.next]
+        return [ticket for ticket in self.held.values() if ticket.permit.round == self.rounds.next]
 
     def collected(self) -> int:
         """The env steps of the next update's rollouts that have arrived."""
@@ -149,10 +149,11 @@ class RolloutDealer:
             for round_number in lane.due:
                 version = self.rounds.version(round_number)
                 opponent = None if self.opponents is None else self.opponents.of(lane.number, round_number, version)
-                past = None if lane.dealt else self._past(lane, round_number)
-                ticket = lane.deal(self.ledger.issued, round_number, version, opponent, past)
-                self.held[ticket.number] = ticket
-                dealt.setdefault(lane.owner, []).append(ticket.number)
+                continues = not lane.dealt and members[lane.owner].hello.continues
+                past = self._past(lane, round_number) if continues else None
+                number = self.ledger.issued
+                self.held[number] = lane.deal(number, round_number, version, opponent, past)
+                dealt.setdefault(lane.owner, []).append(number)
                 self.ledger.issued += 1
             lane.due.clear()
             self._to_deal.remove(lane.number)
@@ -163,11 +164,11 @@ class RolloutDealer:
 
         A ticket that includes a lane's past gets its own order, because a past is long.
         """
-        chosen = [self.held[number] for number in tickets if number in self.held]
-        member.tickets |= {ticket.number: member.replies for ticket in chosen}
+        chosen = {number: self.held[number] for number in tickets if number in self.held}
+        member.tickets |= dict.fromkeys(chosen, member.replies)
         out: list[Outgoing] = []
-        for version in sorted({ticket.version for ticket in chosen}):
-            of_version = [each.permit(member.hello) for each in chosen if each.version == version]
+        for version in sorted({ticket.version for ticket in chosen.values()}):
+            of_version = [ticket.permit for ticket in chosen.values() if ticket.version == version]
             together = tuple(each for each in of_version if each.past is None)
             alone = [(each,) for each in of_version if each.past is not None]
             orders = [*alone, together] if together else alone
@@ -192,18 +193,18 @@ class RolloutDealer:
             self.ledger.transitions_received += rollout.env_steps
             self.ledger.transitions_duplicate += rollout.env_steps
             return False
-        expected = ticket.peer, ticket.lane, ticket.version, ticket.sequence
+        permit = ticket.permit
+        expected = ticket.peer, permit.lane, ticket.version, permit.sequence
         if (member.peer, rollout.lane, rollout.version, rollout.sequence) != expected:  # rule WRONG_ROLLOUT
-            expects = f"lane {ticket.lane}, version {ticket.version}, sequence {ticket.sequence}"
+            expects = f"lane {permit.lane}, version {ticket.version}, sequence {permit.sequence}"
             got = f"lane {rollout.lane}, version {rollout.version}, sequence {rollout.sequence}"
             raise BadRollout(f"numbers: expected {expects}, got {got}")
         self.ledger.transitions_received += rollout.env_steps
-        self._end(member, ticket).arrived(rollout.sequence)
+        self._end(member, permit).arrived(rollout.sequence)
         member.has_stepped()
-        self.lanes[ticket.lane].went_on()
-        from_past = ticket.past is not None and member.hello.continues
-        accepted = AcceptedRollout(rollout, ticket.incarnation, from_past=from_past)
-        self.ready.setdefault(ticket.round, {})[ticket.lane] = accepted
+        self.lanes[permit.lane].went_on()
+        accepted = AcceptedRollout(rollout, permit.incarnation, from_past=permit.past is not None)
+        self.ready.setdefault(permit.round, {})[permit.lane] = accepted
         return True
 
     def longest_episode(self, number: int, rollout_steps: int) -> int:
@@ -212,7 +213,7 @@ class RolloutDealer:
         Rollouts before a resume may have been longer, and only their total number of env steps is known.
         """
         ticket = self.held.get(number)
-        last = self.rounds.next + self.rounds.max_lag if ticket is None else ticket.round
+        last = self.rounds.next + self.rounds.max_lag if ticket is None else ticket.permit.round
         before = max(self._steps_before, self._first_round * rollout_steps)
         return before + (last + 1 - self._first_round) * rollout_steps
 
@@ -236,24 +237,24 @@ class RolloutDealer:
         self.ledger.transitions_received += steps
         self.ledger.transitions_invalid += steps
         if number in self.held and number in member.tickets:
-            ticket = self.held[number]
-            self.lanes[ticket.lane].arrived(ticket.sequence)  # so that the worker stops sending it
+            permit = self.held[number].permit
+            self.lanes[permit.lane].arrived(permit.sequence)  # so that the worker stops sending it
             self.lose(member, number)
 
     def lose(self, member: Member, number: int) -> None:
         """Record that this member's ticket is lost, so that a new ticket is dealt for its round."""
-        ticket = self.held[number]
-        insort(self._end(member, ticket).due, ticket.round)
-        self._to_deal.add(ticket.lane)
+        permit = self.held[number].permit
+        insort(self._end(member, permit).due, permit.round)
+        self._to_deal.add(permit.lane)
         self.ledger.lost += 1
 
     # ---------------------------------------------------------------- inside
 
-    def _end(self, member: Member, ticket: Ticket) -> TicketedLane:
+    def _end(self, member: Member, permit: Permit) -> TicketedLane:
         """Remove a ticket from the outstanding tickets. Returns its lane."""
-        del self.held[ticket.number], member.tickets[ticket.number]
-        lane = self.lanes[ticket.lane]
-        lane.outstanding.remove(ticket.number)
+        del self.held[permit.ticket], member.tickets[permit.ticket]
+        lane = self.lanes[permit.lane]
+        lane.outstanding.remove(permit.ticket)
         return lane
 
     def _past(self, lane: TicketedLane, first: int) -> LanePast | None:

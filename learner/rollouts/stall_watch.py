@@ -120,7 +120,7 @@ class StallWatch:
     def _rollout_s(self, number: int) -> float:
         """How long the rollout of this ticket may take, including the steps that are replayed before it."""
         run = self._coordinator.run
-        past = self._coordinator.rollouts.held[number].past
+        past = self._coordinator.rollouts.held[number].permit.past
         rollout_s = self._longest_s(run.copies, run.rollout_steps)
         if past is not None:
             rollout_s += run.copies * self._timeouts.limit_s("resetting")  # one more reset of each copy

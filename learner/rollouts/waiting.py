@@ -100,7 +100,7 @@ class LearnerTime:
         lanes = dict[bytes, set[int]]()
         members = self._coordinator.members
         for ticket in self._coordinator.rollouts.awaited():
-            lanes.setdefault(ticket.peer, set()).add(ticket.lane)
+            lanes.setdefault(ticket.peer, set()).add(ticket.permit.lane)
         peer = max(lanes, key=lambda peer: held_up(members[peer], now))
         mine = sorted(lanes.pop(peer))
         more = sum(map(len, lanes.values()))

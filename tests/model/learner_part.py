@@ -18,14 +18,16 @@ from millrace.learner.rollouts.ledger import Ledger
 from millrace.learner.rollouts.rollout_dealer import AcceptedRollout, RolloutDealer
 from millrace.learner.rollouts.sent_weights import Confirmed, SentAfter, SentWeights, Standing, WeightsHeld
 from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
-from millrace.protocol.messages import ToLearner, WorkerExit, versions_of
+from millrace.protocol.messages import Permit, ToLearner, WorkerExit, versions_of
 from millrace.protocol.rules import Rule
 from tests.model import membership_part
 from tests.model.conversation import Content
 from tests.model.message_content import (
+    fields_of,
     hello,
     incarnation,
     peer_of,
+    record_of,
     rollout_content,
     rollout_of,
     session,
@@ -50,7 +52,7 @@ SAVED: dict[type, set[str]] = {
     TicketedLane: {"number", "incarnation", "owner", "moving", "due", "dealt", "outstanding", "next_sequence"}
     | {"out_of_order", "taken"},
     TakenRollouts: {"history"},
-    Ticket: {"number", "lane", "incarnation", "sequence", "round", "version", "peer", "opponent", "past"},
+    Ticket: {"permit", "version", "peer"},
     LanePlacement: {"_lanes", "_unplaced", "_settled", "_waiting_for"},
     Rounds: {"next", "_versions", "_saved"},
 }
@@ -157,7 +159,7 @@ class Learner:
     def named(self) -> list[tuple[CollectingMember, int]]:
         """Which versions the orders of which workers name."""
         members, evaluation = self.coordinator.members.values(), self.coordinator.evaluation
-        versions = {number: {each.version, each.opponent} for number, each in self.coordinator.rollouts.held.items()}
+        versions = {number: {each.version, each.permit.opponent} for number, each in self.coordinator.rollouts.held.items()}
         versions |= {number: {evaluation.version} for number in evaluation.playing}
         every = ((member, version) for member in members for number in member.tickets for version in versions[number])
         return [(member, version) for member, version in every if version is not None]
@@ -259,14 +261,15 @@ class Learner:
             f"{Rule.ROUND_VERSION}: other weights act in a round than those that were the newest"
         )
         self._check_opponents()
-        found = [(each.lane, each.round, each.version) for each in coordinator.rollouts.held.values()]
+        found = [(each.permit.lane, each.permit.round, each.version) for each in coordinator.rollouts.held.values()]
         for number, of_round in coordinator.rollouts.ready.items():
             found += [(lane, number, arrived.rollout.version) for lane, arrived in of_round.items()]
         found += [(lane.number, number, versions[number]) for lane in coordinator.rollouts.lanes for number in lane.due]
         every = [(lane.number, *of_round) for lane in coordinator.rollouts.lanes for of_round in versions.items()]
         assert sorted(found) == every, f"{Rule.OPEN_ROUNDS}: a lane does not have every open round once, under its version"
         for lane in coordinator.rollouts.lanes:
-            mine = [(t.round, t.sequence) for t in coordinator.rollouts.held.values() if t.lane == lane.number]
+            permits = [ticket.permit for ticket in coordinator.rollouts.held.values()]
+            mine = [(permit.round, permit.sequence) for permit in permits if permit.lane == lane.number]
             mine += [
                 (number, of_round[lane.number].rollout.sequence)
                 for number, of_round in coordinator.rollouts.ready.items()
@@ -287,7 +290,7 @@ class Learner:
         play = self.settings.opponents
         for each in self.coordinator.rollouts.held.values():
             met = range(max(0, each.version - play + 1), each.version + 1) if play else [None]
-            assert each.opponent in met, "a ticket names an opponent that does not play"
+            assert each.permit.opponent in met, f"{Rule.OPPONENT}: a ticket names an opponent that does not play"
 
 
 # -------------------------------------------------------------------- to tuples and back
@@ -297,7 +300,7 @@ def saved(learner: Learner, now: float) -> Content:
     coordinator = learner.coordinator
     learner.check()
     lanes, rounds = coordinator.rollouts.lanes, coordinator.rollouts.rounds
-    tickets = sorted(coordinator.rollouts.held.values(), key=lambda each: each.number)
+    tickets = [each for _, each in sorted(coordinator.rollouts.held.items())]
     waiting_for = coordinator._placement._waiting_for
     return (
         ticket(coordinator.rollouts.ledger.issued),
@@ -382,18 +385,7 @@ def _lane(lane: TicketedLane) -> Content:
 
 
 def _ticket(each: Ticket) -> Content:
-    number, worker = incarnation(each.lane, each.incarnation), _worker(worker_of(each.peer))
-    return (
-        ticket(each.number),
-        each.lane,
-        number,
-        each.sequence,
-        each.round,
-        each.version,
-        each.opponent,
-        worker,
-        None if each.past is None else place_of(each.past.memory),
-    )
+    return fields_of(each.permit), each.version, _worker(worker_of(each.peer))
 
 
 def without_checkpoints(content: Content) -> Content:
@@ -431,12 +423,11 @@ def loaded(content: Content, settings: Settings) -> Learner:
         lane.incarnation, lane.owner = number.value, None if owner is None else peer_of(owner.value)
         lane.moving, lane.due, lane.dealt = moving, list(due), dealt
         lane.next_sequence, lane.out_of_order = following, set(out_of_order)
-    for number, of_lane, inc, sequence, of_round, under, opponent, worker, place in tickets:
-        past = None if place is None else fake_past(of_lane, place)
-        each = Ticket(number.value, of_lane, inc.value, sequence, of_round, under, peer_of(worker.value), opponent, past)
-        coordinator.rollouts.held[number.value] = each
-        coordinator.rollouts.lanes[of_lane].outstanding.add(number.value)
-        coordinator.weights.held.named.setdefault(each.peer, {})[number.value] = versions_of(under, [opponent])
+    for fields, under, worker in tickets:
+        permit, peer = record_of(Permit, fields), peer_of(worker.value)
+        coordinator.rollouts.held[permit.ticket] = Ticket(permit, under, peer)
+        coordinator.rollouts.lanes[permit.lane].outstanding.add(permit.ticket)
+        coordinator.weights.held.named.setdefault(peer, {})[permit.ticket] = versions_of(under, [permit.opponent])
     membership_part.load(coordinator.membership, members, CollectingMember)
     for peer, by_version in zip(coordinator.members, held, strict=True):  # in the order in which they joined
         standings = {version: _standing(sent_at) for version, sent_at in by_version}

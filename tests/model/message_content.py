@@ -8,7 +8,6 @@ All that a worker remembers of its env copies is how many rollouts they have mad
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Mapping
 from functools import cache
 from typing import Any, TypeVar, get_args
@@ -145,8 +144,6 @@ def _is_kept(kind: mi.Type) -> bool:
 @cache
 def _kept(kind: Any) -> dict[str, Read]:
     """The fields of a record that are kept, in their order."""
-    if dataclasses.is_dataclass(kind):
-        return {field.name: NAMED.get(field.name, _plain) for field in dataclasses.fields(kind)}
     record = mi.type_info(kind)
     assert isinstance(record, mi.StructType)
     found: dict[str, Read] = {}

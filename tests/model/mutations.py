@@ -89,16 +89,16 @@ MUTATIONS = {
         Rule.ROUND, ROLLOUTS, "self.ready.pop(self.rounds.next).items()", "self.ready[self.rounds.next].items()"
     ),
     "a rollout waits for the wrong round": Mutation(
-        Rule.ROUND, ROLLOUTS, "self.ready.setdefault(ticket.round, {})", "self.ready.setdefault(self.rounds.next, {})"
+        Rule.ROUND, ROLLOUTS, "self.ready.setdefault(permit.round, {})", "self.ready.setdefault(self.rounds.next, {})"
     ),
     "a round is dealt again and again": Mutation(
         Rule.OPEN_ROUNDS, ROLLOUTS, "            lane.due.clear()\n", "            pass\n"
     ),
     "the round of a lost ticket is not dealt again": Mutation(
-        Rule.LOST_TICKETS, ROLLOUTS, "insort(self._end(member, ticket).due, ticket.round)", "self._end(member, ticket)"
+        Rule.LOST_TICKETS, ROLLOUTS, "insort(self._end(member, permit).due, permit.round)", "self._end(member, permit)"
     ),
     "a lane whose ticket was lost is overlooked": Mutation(
-        Rule.LOST_TICKETS, ROLLOUTS, "self._to_deal.add(ticket.lane)", "pass"
+        Rule.LOST_TICKETS, ROLLOUTS, "self._to_deal.add(permit.lane)", "pass"
     ),
     "a late rollout is not counted": Mutation(
         None, ROLLOUTS, "self.ledger.transitions_late += rollout.env_steps", "self.ledger.transitions_late += 0"
@@ -107,7 +107,7 @@ MUTATIONS = {
         None, ROLLOUTS, "self.ledger.transitions_duplicate += rollout.env_steps", "self.ledger.transitions_duplicate += 0"
     ),
     "the arrival of a rollout is not recorded": Mutation(
-        Rule.ARRIVED, ROLLOUTS, "self._end(member, ticket).arrived(rollout.sequence)", "self._end(member, ticket)"
+        Rule.ARRIVED, ROLLOUTS, "self._end(member, permit).arrived(rollout.sequence)", "self._end(member, permit)"
     ),
     "a lost Collect is not sent again": Mutation(
         Rule.ORDER_AGAIN, COORDINATOR, "self.rollouts.send(member, lost) + self.evaluation", "self.evaluation"
@@ -175,8 +175,8 @@ MUTATIONS = {
     "a worker acts under the newest weights": Mutation(
         Rule.VERSION,
         SESSION,
-        "RolloutTask(session, self.weights[version], assignments, ",
-        "RolloutTask(session, self.weights[max(self.weights)], assignments, ",
+        "RolloutTask(session, self.weights[version], permits, ",
+        "RolloutTask(session, self.weights[max(self.weights)], permits, ",
     ),
     "a worker drops weights that a ticket names": Mutation(
         Rule.HOLDS_WEIGHTS, SESSION, "kept = self.asked_versions().union(listed)", "kept = listed"
@@ -227,7 +227,7 @@ MUTATIONS = {
         "rollout.sequence <= of_lane.next_sequence or",
     ),
     "a rollout is collected before an earlier one has come": Mutation(
-        Rule.IN_ORDER, HELD, "if asked.sequence == lane.sequence and ", "if "
+        Rule.IN_ORDER, HELD, "if asked.permit.sequence == lane.sequence and ", "if "
     ),
     "a rollout starts without its weights": Mutation(Rule.VERSION, HELD, " and asked.versions.issubset(versions):", ":"),
     "a rollout starts without the weights of its opponent": Mutation(
@@ -257,10 +257,10 @@ MUTATIONS = {
     ),
     "an opponent is drawn from versions that came later": Mutation(None, POOL, " if each <= version]", "]"),
     "an order does not name its opponent": Mutation(
-        Rule.OPPONENT, LANES, "self.round, self.opponent, past)", "self.round, None, past)"
+        Rule.OPPONENT, LANES, "round_number, opponent, past)\n", "round_number, None, past)\n"
     ),
     "an order does not bring the past of its lane": Mutation(
-        Rule.PAST, LANES, "past = self.past if worker.continues else None", "past = None"
+        Rule.PAST, LANES, "round_number, opponent, past)\n", "round_number, opponent)\n"
     ),
     "a lane continues without the rollouts that wait": Mutation(
         Rule.PAST, ROLLOUTS, "for number in range(self.rounds.next, first)]", "for number in range(0)]"
@@ -272,7 +272,10 @@ MUTATIONS = {
         Rule.PAST, COORDINATOR, "RoundsState(rounds.next, ", "RoundsState(0, "
     ),
     "a worker forgets what a lane continues": Mutation(
-        Rule.PAST, HELD, "self.round, self.opponent, self.past)", "self.round, self.opponent)"
+        Rule.PAST,
+        HELD,
+        "Permitted(permit, version)",
+        "Permitted(Permit(*(getattr(permit, name) for name in permit.__struct_fields__[:-1])), version)",
     ),
     "later rollouts are collected first": Mutation(
         Rule.LOWEST_VERSION_FIRST, HELD, "version = min(startable, default=-1)", "version = max(startable, default=-1)"

@@ -22,6 +22,7 @@ from millrace.learner.rollouts.rollout_dealer import RolloutDealer
 from millrace.learner.rollouts.sent_weights import SentWeights, WeightsHeld
 from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
 from millrace.learner.vector_env.order_coordinator import OrderCoordinator, OrderedLane
+from millrace.protocol.messages import Permit
 from millrace.workers.conversation.held import (
     HeldDescriptions,
     HeldEvaluations,
@@ -47,6 +48,7 @@ from tests.model.vector_env import worker_half as stepping_worker
 from tests.model.vector_env.stepping import Stepping
 from tests.model.worker_part import Worker
 from tests.model.world import GONE, World
+from tests.support.conversation.example_messages import example
 
 SMALL = Training(workers=2, lanes=1, updates=2, faults=1, max_lag=1)
 
@@ -116,7 +118,7 @@ def test_every_field_of_the_program_is_in_the_state_or_left_out_on_purpose() -> 
         coordinator.weights.held,
         coordinator.rollouts.lanes[0],
         coordinator.rollouts.lanes[0].taken,
-        Ticket(0, 0, 0, 0, 0, 0, b"w0"),
+        Ticket(example(Permit), 0, b"w0"),
         coordinator._placement,
         coordinator.rollouts.rounds,
         session,

@@ -96,7 +96,7 @@ class WeightsRule:
                 )
                 versions = {message.version}
                 for each in message.permits if isinstance(message, Collect) else ():
-                    opponent = after.coordinator.rollouts.held[each.ticket].opponent
+                    opponent = after.coordinator.rollouts.held[each.ticket].permit.opponent
                     assert each.opponent == opponent, f"{Rule.OPPONENT}: an order names another opponent than its ticket"
                     versions |= set() if opponent is None else {opponent}
                 named |= {(message.session, version) for version in versions}

@@ -10,9 +10,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TypeVar
 
-from millrace.protocol.messages import Collect, Describe, Evaluate, HeartbeatReply, Rollout, ToLearner, ToWorker
+from millrace.protocol.messages import Collect, Describe, Evaluate, HeartbeatReply, Permit, Rollout, ToLearner, ToWorker
 from millrace.protocol.rules import Rule
-from millrace.workers.conversation.held import Assignment, HeldRollouts, Permitted, RolloutLane
+from millrace.workers.conversation.held import HeldRollouts, Permitted, RolloutLane
 from millrace.workers.conversation.session import (
     CloseLanes,
     EvaluationTask,
@@ -35,12 +35,11 @@ from tests.model.message_content import (
     rollout_content,
     rollout_of,
     session,
-    ticket,
     weights,
 )
 from tests.model.process_part import Process
 from tests.model.settings import Settings
-from tests.support.conversation.fake_ends import fake_evaluated, fake_past, fake_rollout, held_count, place_of
+from tests.support.conversation.fake_ends import fake_evaluated, fake_rollout, held_count, place_of
 
 SAVED: dict[type, set[str]] = {
     Session: {"identity", "state", "run", "session", "_attempt", "_unanswered_s", "due_s", "_current"},
@@ -107,13 +106,13 @@ class Worker(Process):
             assert self.session is not None
             held, version = self.session._current, work.weights.version
             lanes = held.rollouts._lanes
-            for each in work.assignments:
+            for each in work.permits:
                 lane = lanes[each.lane]
                 assert each.sequence == lane.sequence, (
                     f"{Rule.IN_ORDER}: rollouts of a lane are not collected in their order"
                 )
                 asked = lane.asked[each.ticket]
-                assert (asked.version, asked.opponent) == (version, each.opponent), (
+                assert (asked.version, asked.permit.opponent) == (version, each.opponent), (
                     f"{Rule.VERSION}: other weights act than the order names"
                 )
                 assert held.weights.keys() >= _versions(asked), f"{Rule.OPPONENTS}: a rollout starts without its weights"
@@ -122,15 +121,15 @@ class Worker(Process):
                 asked.version
                 for lane in lanes.values()
                 for asked in lane.asked.values()
-                if asked.sequence == lane.sequence and _versions(asked) <= held.weights.keys()
+                if asked.permit.sequence == lane.sequence and _versions(asked) <= held.weights.keys()
             ]
             lowest = [each for each in startable if each == min(startable)]
-            assert [version] * len(work.assignments) == lowest, (
+            assert [version] * len(work.permits) == lowest, (
                 f"{Rule.LOWEST_VERSION_FIRST}: others are collected than all of the lowest version"
             )
         return []
 
-    def _open(self, each: Assignment) -> None:
+    def _open(self, each: Permit) -> None:
         """The env copies of a lane are here in this incarnation, or they are made, and continue its past."""
         if self.places.get(each.lane, (-1, 0))[0] != each.incarnation:
             assert each.sequence == 0, f"{Rule.PAST}: a lane goes on with env copies that are not here"
@@ -140,12 +139,12 @@ class Worker(Process):
         """What this work leads to."""
         match task:
             case RolloutTask():
-                return [self._rollout(task, each) for each in task.assignments]
+                return [self._rollout(task, each) for each in task.permits]
             case EvaluationTask():
                 return [fake_evaluated(task)]
         return [described(task.session, task.ticket)]
 
-    def _rollout(self, task: RolloutTask, each: Assignment) -> Rollout:
+    def _rollout(self, task: RolloutTask, each: Permit) -> Rollout:
         """What a collector would have made. Its env copies have made one rollout more."""
         incarnation, place = self.places[each.lane]
         self.places[each.lane] = incarnation, place + 1
@@ -156,7 +155,7 @@ class Worker(Process):
         assert current is not None
         self._close(effects)
         if self.task is not None and current.is_unwanted(self.task):
-            for each in self.task.assignments if isinstance(self.task, RolloutTask) else ():
+            for each in self.task.permits if isinstance(self.task, RolloutTask) else ():
                 self.places.pop(each.lane, None)
             self.task = None
             effects = effects + current.work_ended([])
@@ -210,7 +209,7 @@ def saved(worker: Worker, now: float) -> Content:
         more = lanes, tuple(sorted(held.weights)), places
     work = None
     if isinstance(task, RolloutTask):
-        work = session(task.session), task.weights.version, tuple(map(fields_of, task.assignments))
+        work = session(task.session), task.weights.version, tuple(map(fields_of, task.permits))
     return process_part.saved(worker, now, more, work)
 
 
@@ -229,24 +228,14 @@ def _asked(held: _SessionState) -> set[int]:
 
 def _versions(asked: Permitted) -> set[int]:
     """The versions that a rollout needs."""
-    return {asked.version} if asked.opponent is None else {asked.version, asked.opponent}
+    opponent = asked.permit.opponent
+    return {asked.version} if opponent is None else {asked.version, opponent}
 
 
 def _lane(number: int, lane: RolloutLane) -> Content:
-    tickets = tuple((ticket(each), *_plain(lane.asked[each])) for each in sorted(lane.asked))
+    tickets = tuple((fields_of(asked.permit), asked.version) for _, asked in sorted(lane.asked.items()))
     kept = tuple(rollout_content(rollout) for rollout in lane.answered.values())
     return number, incarnation(number, lane.incarnation), lane.sequence, tickets, kept
-
-
-def _plain(permitted: Permitted) -> Content:
-    """What is permitted, with the place of a lane instead of its past."""
-    place = None if permitted.past is None else place_of(permitted.past.memory)
-    return (*permitted._replace(past=None), place)
-
-
-def _permitted(lane: int, content: Content) -> Permitted:
-    sequence, version, of_round, opponent, _, place = content
-    return Permitted(sequence, version, of_round, opponent, None if place is None else fake_past(lane, place))
 
 
 W = TypeVar("W", bound=Worker)
@@ -262,10 +251,11 @@ def loaded(content: Content, number: int, settings: Settings, kind: type[W]) -> 
     held.weights = {version: weights(version) for version in versions}
     for lane, of_incarnation, sequence, tickets, kept in lanes:
         here = held.rollouts._lanes[lane] = RolloutLane(of_incarnation.value, sequence)
-        here.asked = {each.value: _permitted(lane, permitted) for each, *permitted in tickets}
+        asked = [Permitted(record_of(Permit, permit), version) for permit, version in tickets]
+        here.asked = {each.permit.ticket: each for each in asked}
         here.answered = {fields[2].value: rollout_of(fields) for fields in kept}
     worker.places = {number: (each.value, place) for number, each, place in places}
     if work is not None:
-        assignments = tuple(record_of(Assignment, each) for each in work[2])
-        worker.task = RolloutTask(work[0].value, weights(work[1]), assignments, {})
+        permits = tuple(record_of(Permit, each) for each in work[2])
+        worker.task = RolloutTask(work[0].value, weights(work[1]), permits, {})
     return worker

@@ -21,14 +21,13 @@ from millrace.learner.algorithms.sac import SAC
 from millrace.learner.config.hyperparameters import PPOConfig, SACConfig
 from millrace.learner.rollouts.evaluation_dealer import episode_seeds
 from millrace.learner.vector_env.lost_lanes import replacement_seeds
-from millrace.protocol.messages import Evaluate
+from millrace.protocol.messages import Evaluate, Permit
 from millrace.protocol.policy.called_policy import Acted, CalledPolicy
 from millrace.protocol.policy.own_encoder import describe_encoder
 from millrace.protocol.policy.policy import make_policy
 from millrace.protocol.random_streams import Purpose, RoundStreams, env_seed, generator, torch_seed
 from millrace.protocol.specs import PolicySpec
 from millrace.workers.collect.collector import Collector
-from millrace.workers.conversation.held import Assignment
 from millrace.workers.evaluate.evaluator import Evaluator
 from tests.support.conversation.example_messages import example
 from tests.support.in_process.collectors import no_pulse, run_around, with_env
@@ -131,7 +130,7 @@ def test_no_two_generators_of_a_run_coincide(monkeypatch: pytest.MonkeyPatch) ->
     guess = RandomGuess()
     collector = Collector(msgspec.structs.replace(COIN, seed=seed, copies=2), guess)
     for number in (0, 1):
-        collector.collect([Assignment(n, n, 0, number, number) for n in (0, 1)], 0, 3, no_pulse)
+        collector.collect([Permit(n, n, 0, number, number) for n in (0, 1)], 0, 3, no_pulse)
     streams |= {f"actions of lane {n}": guess.streams[at] for n, at in enumerate((0, 1, 8, 9))}
     (recorded, *_) = seeds = list(islice(recording_seeds(seed), 2))
     of_episodes = [episode_seeds(seed, 2, p) for p in (Purpose.EPISODES, Purpose.EVALUATION, Purpose.CONFIRMATION)]

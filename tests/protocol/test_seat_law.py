@@ -19,11 +19,10 @@ from millrace.protocol.arrays import Array
 from millrace.protocol.bounds import MAX_NAME
 from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.errors import BadRollout
-from millrace.protocol.messages import Weights
+from millrace.protocol.messages import Permit, Weights
 from millrace.protocol.rollout import Episode, Rollout
 from millrace.protocol.rows.rollout_checks import LARGEST_REWARD, validate, wrong_facts
 from millrace.protocol.specs import ActionSpec, ExtraArray, Leaf, PolicySpec, RunSpec, seat_returns
-from millrace.workers.conversation.held import Assignment
 from tests.support.conversation.example_messages import example
 from tests.support.in_process.collectors import SESSION, VERSION, no_pulse, random_collector, random_weights
 from tests.workers.collect.test_seat_rows import FORMS, collected, seated_run
@@ -84,7 +83,7 @@ def refusal(rollout: Rollout, run: RunSpec) -> str:
 def against_opponents(run: RunSpec, number: int) -> list[Rollout]:
     """Rollouts of a lane whose copies the policy shares with opponents."""
     collector, held = random_collector(run), {VERSION: Weights(VERSION, *random_weights(run.policy))}
-    asked = ([Assignment(100, 0, 0, k, k, opponent=VERSION)] for k in range(number))
+    asked = ([Permit(100, 0, 0, k, k, opponent=VERSION)] for k in range(number))
     return [collector.collect(each, VERSION, SESSION, no_pulse, held)[0] for each in asked]
 
 

@@ -19,7 +19,7 @@ from millrace.protocol.arrays import Floats
 from millrace.protocol.bounds import Stages
 from millrace.protocol.envs.kinds_of_copies import copies_kind
 from millrace.protocol.envs.which_copy import EnvCopy
-from millrace.protocol.messages import Weights
+from millrace.protocol.messages import Permit, Weights
 from millrace.protocol.policy.called_policy import CalledPolicy
 from millrace.protocol.policy.masks import stored_leaves
 from millrace.protocol.policy.policy import Policy
@@ -27,7 +27,6 @@ from millrace.protocol.random_streams import Purpose, RoundStreams, generator
 from millrace.protocol.rollout import Rollout
 from millrace.protocol.specs import RunSpec
 from millrace.workers.acting import ActedRows, RolloutActions
-from millrace.workers.conversation.held import Assignment
 from millrace.workers.copies.env_copies import EnvCopies, check_spaces
 from millrace.workers.copies.env_errors import environment_failures
 from millrace.workers.copies.env_loop import Pulse
@@ -91,36 +90,36 @@ class Collector:
 
     def collect(
         self,
-        assignments: Sequence[Assignment],
+        permits: Sequence[Permit],
         version: int,
         session: int,
         pulse: Pulse,
         held: Mapping[int, Weights] = MappingProxyType({}),
     ) -> list[Rollout]:
-        """Collect one rollout for each assignment. Returns them in the order of the assignments.
+        """Collect one rollout for each permit. Returns them in the order of the permits.
 
-        Each assignment must name a different lane. `held` has the available weights, by version, including those of new
+        Each permit must name a different lane. `held` has the available weights, by version, including those of new
         opponents. `pulse` is called at every step and may raise. If `pulse` raises, or an environment does
         (`EnvironmentFailed`), these lanes are closed and the unfinished rollouts are dropped.
         """
-        if len({assignment.lane for assignment in assignments}) < len(assignments):
-            raise ValueError(f"collect: expected one assignment for each lane, got {assignments}")
+        if len({permit.lane for permit in permits}) < len(permits):
+            raise ValueError(f"collect: expected one permit for each lane, got {permits}")
         with self.lanes.in_use():
             try:
-                return self._collect(assignments, version, session, pulse, self._opponents.among(held))
+                return self._collect(permits, version, session, pulse, self._opponents.among(held))
             except BaseException:
-                self.lanes.close(assignment.lane for assignment in assignments)
+                self.lanes.close(permit.lane for permit in permits)
                 raise
 
     def _collect(
-        self, assignments: Sequence[Assignment], version: int, session: int, pulse: Pulse, opponents: Opponents
+        self, permits: Sequence[Permit], version: int, session: int, pulse: Pulse, opponents: Opponents
     ) -> list[Rollout]:
-        lanes = [self._lane_for(assignment, pulse) for assignment in assignments]
-        for lane, assignment in zip(lanes, assignments, strict=True):  # rule ATTRIBUTES
+        lanes = [self._lane_for(permit, pulse) for permit in permits]
+        for lane, permit in zip(lanes, permits, strict=True):  # rule ATTRIBUTES
             lane.set_attributes(self.env_attributes, pulse)
-            self._meet(lane, assignment, opponents)
+            self._meet(lane, permit, opponents)
         states = [lane.state if lane.seats is None else lane.seats.state_before(lane.state) for lane in lanes]
-        drawn = [self._action_streams(each.lane).of(each.round) for each in assignments]
+        drawn = [self._action_streams(each.lane).of(each.round) for each in permits]
         parts = [self._part(lanes[among], drawn[among]) for among in self._runner.together.parts(len(lanes))]
         self._under_way = [part.rows for part in parts]
         try:
@@ -130,18 +129,18 @@ class Collector:
             self._under_way = []
         filled = [(rows, part.actions.columns(i)) for part in parts for i, rows in enumerate(part.rows.of_lanes)]
         return [
-            self._rollout(rows, state, acted, assignment, version, session)
-            for (rows, acted), state, assignment in zip(filled, states, assignments, strict=True)
+            self._rollout(rows, state, acted, permit, version, session)
+            for (rows, acted), state, permit in zip(filled, states, permits, strict=True)
         ]
 
     def _part(self, lanes: Sequence[Lane], drawn: Sequence[np.random.Generator]) -> Part[RolloutActions]:
         """These lanes as a part that is ready for its first step; `drawn` has a random generator for each lane."""
         return Part(Rows(self._run, lanes, self._run.rollout_steps), self._runner.acting.begin(drawn))
 
-    def _lane_for(self, assignment: Assignment, pulse: Pulse) -> Lane:
+    def _lane_for(self, permit: Permit, pulse: Pulse) -> Lane:
         """The lane in this incarnation; opened here if it isn't open yet."""
-        number = assignment.lane
-        incarnation = assignment.incarnation
+        number = permit.lane
+        incarnation = permit.incarnation
         if (lane := self.lanes.here(number, incarnation)) is not None:
             return lane
         run = self._run
@@ -154,29 +153,29 @@ class Collector:
         began = perf_counter()
         lane = self.lanes.open(number, made)
         check_spaces(run, lane.copies)
-        if assignment.past is None:
+        if permit.past is None:
             lane.set_attributes(self.env_attributes, pulse)
             lane.start([0] * run.copies, pulse)
         else:  # rule PAST
             written = self._runner.acting.begin([self._action_streams(number).of(0)]).written(0)
-            self.note = bring_back(run, lane, assignment.past, self.env_attributes, pulse, written) or self.note
+            self.note = bring_back(run, lane, permit.past, self.env_attributes, pulse, written) or self.note
         self.note = self.note or lane.copies.note
         self.stages["open"] += perf_counter() - began
         return lane
 
-    def _meet(self, lane: Lane, assignment: Assignment, opponents: Opponents) -> None:
-        """Set the opponent of the episodes that begin in the next rollout, if the assignment names one."""
-        if assignment.opponent is None:
+    def _meet(self, lane: Lane, permit: Permit, opponents: Opponents) -> None:
+        """Set the opponent of the episodes that begin in the next rollout, if the permit names one."""
+        if permit.opponent is None:
             return
         run = self._run
-        number = assignment.lane
-        lane.opponent = opponents(assignment.opponent)
+        number = permit.lane
+        lane.opponent = opponents(permit.opponent)
         if lane.others is None:
             lane.others = OtherTeams(run, [Match(run.team_of(number, n), lane.opponent) for n in range(run.copies)])
-        lane.others.generator = generator(run.seed, Purpose.OPPONENTS, number, assignment.round)
+        lane.others.generator = generator(run.seed, Purpose.OPPONENTS, number, permit.round)
 
     def _rollout(
-        self, rows: RowsOfLane, state: Floats, acted: ActedRows, assignment: Assignment, version: int, session: int
+        self, rows: RowsOfLane, state: Floats, acted: ActedRows, permit: Permit, version: int, session: int
     ) -> Rollout:
         """The rollout of a lane, made of views of its rows. `state` is the policy's state before the first row."""
         lane = rows.lane
@@ -193,10 +192,10 @@ class Collector:
         sent = lane.sent
         return Rollout(  # rules TICKETS, LANES, SEQUENCE
             session=session,
-            lane=assignment.lane,
-            ticket=assignment.ticket,
+            lane=permit.lane,
+            ticket=permit.ticket,
             version=version,
-            sequence=assignment.sequence,
+            sequence=permit.sequence,
             obs=tuple(array[:, sent] for array in (rows.obs[:-1] if masked else rows.obs)),
             action=acted.action[:, sent],
             log_prob=acted.log_prob[:, sent],

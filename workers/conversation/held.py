@@ -24,7 +24,6 @@ from millrace.protocol.messages import (
     Evaluate,
     Evaluated,
     LaneIncarnation,
-    LanePast,
     Order,
     Permit,
     Received,
@@ -159,42 +158,17 @@ class _HeldLanes(Generic[LaneT]):
         return released
 
 
-@dataclass(frozen=True)
-class Assignment:
-    """One rollout to collect."""
-
-    ticket: int
-    lane: int
-    incarnation: int
-    """If the worker has another incarnation of the lane, the lane starts on new env copies."""
-    sequence: int
-    round: int
-    """Determines the random numbers of the actions."""
-    opponent: int | None = None
-    """The opponent that plays the other teams in the episodes that begin in this rollout."""
-    past: LanePast | None = None
-    """The history from which the lane continues if it isn't open in this incarnation. If None, first episodes begin."""
-
-
 class Permitted(NamedTuple):
     """A rollout that may be collected."""
 
-    sequence: int
+    permit: Permit
     version: int
     """version of the weights with which to act"""
-    round: int
-    opponent: int | None
-    past: LanePast | None
-    """`round`, `opponent` and `past` mean the same as in a `Permit`"""
-
-    def assignment(self, ticket: int, lane: int, incarnation: int) -> Assignment:
-        """The `Assignment` of this rollout to a lane."""
-        return Assignment(ticket, lane, incarnation, self.sequence, self.round, self.opponent, self.past)
 
     @property
     def versions(self) -> set[int]:
         """The versions of the weights that this rollout needs."""
-        return versions_of(self.version, [self.opponent])
+        return versions_of(self.version, [self.permit.opponent])
 
 
 @dataclass
@@ -223,21 +197,20 @@ class HeldRollouts(_HeldLanes[RolloutLane]):
         lane = self._opened(permit.lane, permit.incarnation)
         if lane is None or (permit.sequence < lane.sequence and permit.ticket not in lane.answered):
             return None  # a late copy of the ticket: the learner has this rollout
-        permitted = Permitted(permit.sequence, version, permit.round, permit.opponent, permit.past)
-        return lane.take(permit.ticket, permitted)
+        return lane.take(permit.ticket, Permitted(permit, version))
 
     # rules IN_ORDER, VERSION, LOWEST_VERSION_FIRST
-    def startable(self, versions: Collection[int]) -> tuple[int, tuple[Assignment, ...]]:
+    def startable(self, versions: Collection[int]) -> tuple[int, tuple[Permit, ...]]:
         """The next rollouts to collect, among those whose weights are available.
 
-        Returns the lowest of their versions, and the rollouts with this version, in lane order. If nothing can be collected,
-        returns -1 and no rollouts.
+        Returns the lowest of their versions, and the permits of the rollouts with this version, in lane order. If nothing
+        can be collected, returns -1 and no permits.
         """
-        startable: dict[int, list[Assignment]] = {}
-        for number, lane in sorted(self._lanes.items()):
-            for ticket, asked in lane.asked.items():
-                if asked.sequence == lane.sequence and asked.versions.issubset(versions):
-                    startable.setdefault(asked.version, []).append(asked.assignment(ticket, number, lane.incarnation))
+        startable: dict[int, list[Permit]] = {}
+        for _, lane in sorted(self._lanes.items()):
+            for asked in lane.asked.values():
+                if asked.permit.sequence == lane.sequence and asked.versions.issubset(versions):
+                    startable.setdefault(asked.version, []).append(asked.permit)
         version = min(startable, default=-1)
         return version, tuple(startable.get(version, ()))
 

@@ -32,6 +32,7 @@ from millrace.protocol.messages import (
     Hello,
     LaneIncarnation,
     Order,
+    Permit,
     Received,
     Refuse,
     Rejoin,
@@ -46,7 +47,7 @@ from millrace.protocol.messages import (
 )
 from millrace.protocol.specs import RunSpec, StepSpec, WaitSpec
 from millrace.workers.conversation.connection_rules import REJOIN_TIMEOUT_S
-from millrace.workers.conversation.held import Assignment, HeldDescriptions, HeldEvaluations, HeldOrders, HeldRollouts
+from millrace.workers.conversation.held import HeldDescriptions, HeldEvaluations, HeldOrders, HeldRollouts
 from millrace.workers.conversation.worker_states import (
     TABLE,
     LearnerSilent,
@@ -107,7 +108,7 @@ class RolloutTask:
 
     session: int
     weights: Weights
-    assignments: tuple[Assignment, ...]
+    permits: tuple[Permit, ...]
     held: Mapping[int, Weights]
     """All available weights, by version, including those of opponents."""
 
@@ -211,10 +212,10 @@ class _SessionState:
             return description
         if (evaluation := self.evaluations.next(self.weights)) is not None:
             return EvaluationTask(self.weights[evaluation.version], evaluation, self.weights)
-        version, assignments = self.rollouts.startable(self.weights)
-        if not assignments:
+        version, permits = self.rollouts.startable(self.weights)
+        if not permits:
             return self.orders.next()
-        return RolloutTask(session, self.weights[version], assignments, self.weights)
+        return RolloutTask(session, self.weights[version], permits, self.weights)
 
     def asked_versions(self) -> set[int]:
         """Versions of the weights that unfinished tickets name."""

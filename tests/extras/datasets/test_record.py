@@ -34,6 +34,7 @@ from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.envs.env_actions import action_leaves_of, make_action_converter
 from millrace.protocol.envs.spaces import action_spec, make_flatten, observation_leaves
 from millrace.protocol.errors import EnvironmentFailed, RunError, UsageError, UserFacingError
+from millrace.protocol.messages import Permit
 from millrace.protocol.policy.distributions import distribution
 from millrace.protocol.policy.layout import acting_size, buffer_size
 from millrace.protocol.policy.recurrent import zero_state
@@ -41,7 +42,6 @@ from millrace.protocol.random_streams import Purpose, generator
 from millrace.protocol.rollout import Rollout
 from millrace.protocol.specs import PolicySpec
 from millrace.workers.collect.collector import Collector
-from millrace.workers.conversation.held import Assignment
 from tests.support.conversation.example_messages import example
 from tests.support.examples import examples
 from tests.support.in_process.collectors import TOY, no_pulse, random_policy, run_of
@@ -541,7 +541,7 @@ def test_nothing_is_left_of_a_training_dataset_that_cannot_be_written(
     first, second = (
         Progress(
             updates=n,
-            rollouts=(collector.collect([Assignment(n, 0, 0, n, n)], 0, 1, no_pulse)[0],),
+            rollouts=(collector.collect([Permit(n, 0, 0, n, n)], 0, 1, no_pulse)[0],),
             incarnations=(0,),
             fresh=(n == 0,),
         )
@@ -577,7 +577,7 @@ def test_rollouts_are_recorded_once_an_update_has_used_them(root: Path, caplog: 
         collector = Collector(run, random_policy(run.policy))
         recorder = TrainingRecorder("ns/countdown-v0", described(run.env), run, "a test")
         for updates in range(2):
-            rollouts = collector.collect([Assignment(updates, 0, 0, updates, updates)], 0, 1, no_pulse)
+            rollouts = collector.collect([Permit(updates, 0, 0, updates, updates)], 0, 1, no_pulse)
             recorder.on_rollouts(
                 Progress(updates=updates, rollouts=tuple(rollouts), incarnations=(0,), fresh=(updates == 0,))
             )
@@ -594,12 +594,12 @@ def test_an_episode_that_another_worker_goes_on_with_is_recorded_whole() -> None
     stayed, went = (Collector(run, random_policy(run.policy)) for _ in range(2))
     found: dict[str, list[RecordedEpisode]] = {"moved": [], "whole": []}
     for n in range(12):
-        (rollout,) = stayed.collect([Assignment(n, 0, 0, n, n)], 0, 1, no_pulse)
+        (rollout,) = stayed.collect([Permit(n, 0, 0, n, n)], 0, 1, no_pulse)
         found["whole"] += whole.add(rollout, 0, fresh=n == 0)
         incarnation, sequence = (0, n) if n < 5 else (1, n - 5)
         if incarnation:
             past = history.past(0) if not sequence else None
-            (rollout,) = went.collect([Assignment(n, 0, 1, sequence, n, past=past)], 0, 1, no_pulse)
+            (rollout,) = went.collect([Permit(n, 0, 1, sequence, n, past=past)], 0, 1, no_pulse)
         fresh = history.add(rollout, b"")
         found["moved"] += moved.add(rollout, incarnation, fresh | (n == 0))
     assert moved.left_out == 0
@@ -620,13 +620,13 @@ def test_after_a_resume_episodes_are_recorded_whose_reset_came_after_it(T: int, 
     """Episodes of 5 steps, each followed by a row of its reset. The run is resumed after the first rollout."""
     run = run_of(f"{TOY}Countdown-v0", T=T, N=2)
     history = LaneHistory.of_nothing(2, most_steps=500)
-    (rollout,) = Collector(run, random_policy(run.policy)).collect([Assignment(0, 0, 0, 0, 0)], 0, 1, no_pulse)
+    (rollout,) = Collector(run, random_policy(run.policy)).collect([Permit(0, 0, 0, 0, 0)], 0, 1, no_pulse)
     history.add(rollout, b"")
     resumed = Collector(run, random_policy(run.policy))
     assembler, episodes = EpisodeAssembler(action_leaves_of(run.policy)), []
     for n in range(6):
         past = None if n else history.past(0)
-        (rollout,) = resumed.collect([Assignment(n, 0, 1, n, n + 1, past=past)], 0, 1, no_pulse)
+        (rollout,) = resumed.collect([Permit(n, 0, 1, n, n + 1, past=past)], 0, 1, no_pulse)
         episodes += assembler.add(rollout, 1, history.add(rollout, b""))
     assert len(episodes) > 3
     assert {(episode.length, float(episode.obs[0][0, 0])) for episode in episodes} == {(5, 1.0)}
@@ -641,7 +641,7 @@ def test_an_episode_that_was_lost_is_not_joined_with_the_next_one_even_if_all_ob
         collector = Collector(run, random_policy(run.policy))
         for n in range(5):
             past = history.past(0) if incarnation and not n else None
-            (rollout,) = collector.collect([Assignment(n, 0, incarnation, n, n, past=past)], 0, 1, no_pulse)
+            (rollout,) = collector.collect([Permit(n, 0, incarnation, n, n, past=past)], 0, 1, no_pulse)
             fresh = history.add(rollout, b"") | (incarnation == n == 0)
             episodes += assembler.add(rollout, incarnation, fresh)
         history.start_anew(1, from_past=False)  # the environment has failed
@@ -653,7 +653,7 @@ def test_a_run_that_ends_before_a_whole_episode_leaves_no_dataset(root: Path, ca
     run = run_of(f"{TOY}Countdown-v0", T=3, N=1)
     collector = Collector(run, random_policy(run.policy))
     recorder = TrainingRecorder("ns/countdown-v0", described(run.env), run, "a test")
-    (rollout,) = collector.collect([Assignment(0, 0, 0, 0, 0)], 0, 1, no_pulse)
+    (rollout,) = collector.collect([Permit(0, 0, 0, 0, 0)], 0, 1, no_pulse)
     recorder.on_rollouts(Progress(rollouts=(rollout,), incarnations=(0,), fresh=(True,)))
     recorder.on_end(Progress(updates=1))
     assert caplog.messages == ["dataset ns/countdown-v0: 0 training episodes; 3 steps of others left out"]

@@ -25,8 +25,8 @@ from millrace.learner.config.layers import resolve
 from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.errors import UsageError
 from millrace.protocol.lane_past import LanePast
+from millrace.protocol.messages import Permit
 from millrace.protocol.specs import RunSpec
-from millrace.workers.conversation.held import Assignment
 from millrace.workers.copies.env_copies import LoopedCopies, StepResult, copy_seed
 from tests.support.envs.toy import Countdown
 from tests.support.examples import examples
@@ -161,7 +161,7 @@ def test_a_lane_gets_the_same_bits_alone_and_beside_others_and_others_by_its_see
         assert found[1]["obs"] != found[2]["obs"]
     firsts = [
         *collect(random_collector(run), run, lanes=(0, 1)),
-        *random_collector(run).collect([Assignment(0, 1, 1, 0, 0, past=LanePast.unknown(1, 5))], 0, 1, no_pulse),
+        *random_collector(run).collect([Permit(0, 1, 1, 0, 0, past=LanePast.unknown(1, 5))], 0, 1, no_pulse),
     ]
     assert len(np.unique(np.concatenate([rollout.obs[0][0] for rollout in firsts]), axis=0)) == 15
 

@@ -16,11 +16,11 @@ from millrace.learner.algorithms.replay.transitions import Transitions
 from millrace.learner.config.hyperparameters import HYPERPARAMETERS
 from millrace.learner.config.layers import resolve
 from millrace.protocol.errors import UsageError
+from millrace.protocol.messages import Permit
 from millrace.protocol.policy.encoder import RecurrentInput
 from millrace.protocol.policy.policy import make_policy
 from millrace.protocol.rollout import Batch, stack_rollouts
 from millrace.workers.collect.collector import Collector
-from millrace.workers.conversation.held import Assignment
 from tests.support.in_process.collectors import TOY, run_of
 from tests.support.numbers.batches import DISCRETE, GAUSSIAN, IMAGE, batch, no_pulse
 from tests.support.numbers.rounding import assert_within, in_float64, sampled
@@ -230,7 +230,7 @@ def learned(core: Core | None, updates: int) -> tuple[float, list[float]]:
     collector = Collector(run, make_policy(spec))
     for k in range(updates):
         collector.load(*algorithm.weights())
-        rollouts = collector.collect([Assignment(k, 0, 0, k, k)], k, 1, no_pulse)
+        rollouts = collector.collect([Permit(k, 0, 0, k, k)], k, 1, no_pulse)
         algorithm.update(stack_rollouts(rollouts), no_pulse)
     collector.lanes.close_all()
     policy = make_policy(spec)

@@ -11,11 +11,11 @@ from millrace.learner.algorithms.replay.replay_buffer import ReplayBuffer
 from millrace.learner.algorithms.running_statistics import RewardScaler, RunningMoments
 from millrace.learner.rollouts.lane_history import LaneHistories
 from millrace.learner.rollouts.lanes import TicketedLane
+from millrace.protocol.messages import Permit
 from millrace.protocol.policy.policy import make_policy
 from millrace.protocol.rollout import Batch, Rollout, stack_rollouts
 from millrace.protocol.specs import RunSpec
 from millrace.workers.collect.collector import Collector
-from millrace.workers.conversation.held import Assignment
 from tests.support.in_process.collectors import random_weights, run_of
 
 GAMMA, N_STEP = 0.9, 3
@@ -28,7 +28,7 @@ def collected(run: RunSpec) -> list[Rollout]:
     policy = make_policy(run.policy)
     policy.load(*random_weights(run.policy))
     collector = Collector(run, policy)
-    found = [collector.collect([Assignment(n, 0, 0, n, n)], 0, 1, lambda: None)[0] for n in range(len(ORDER))]
+    found = [collector.collect([Permit(n, 0, 0, n, n)], 0, 1, lambda: None)[0] for n in range(len(ORDER))]
     collector.lanes.close_all()
     return found
 

@@ -410,7 +410,7 @@ def test_work_between_two_failures_ends_the_row(between: str) -> None:
         session = noisy.joins("honest", 100 * nonce)
         ((number, ticket),) = noisy.coordinator.rollouts.held.items()
         if between == "a rollout":
-            noisy.hears("honest", fake_rollout(session, ticket.lane, number, noisy.coordinator.version, 0))
+            noisy.hears("honest", fake_rollout(session, ticket.permit.lane, number, noisy.coordinator.version, 0))
             noisy.hub.gather()
             noisy.hub.publish(noisy.coordinator.version + 1, PARAMETERS, BUFFERS)
         elif between != "nothing":

@@ -31,7 +31,7 @@ from millrace.learner.rollouts.lane_history import LaneHistories
 from millrace.learner.rollouts.lanes import TicketedLane
 from millrace.learner.rollouts.ledger import Ledger
 from millrace.learner.rollouts.past_rollouts import packed
-from millrace.learner.rollouts.rollout_dealer import RolloutDealer
+from millrace.learner.rollouts.rollout_dealer import AcceptedRollout, RolloutDealer
 from millrace.learner.rollouts.ticket_coordinator import MOST_NOTES, STRIKES, TicketCoordinator
 from millrace.protocol.lane_past import EpisodeBegin
 from millrace.protocol.messages import (
@@ -130,10 +130,10 @@ class Learner:
         ticket = self.coordinator.rollouts.held[number]
         return fake_rollout(
             self.session(ticket.peer),
-            ticket.lane,
+            ticket.permit.lane,
             number,
             ticket.version if version is None else version,
-            ticket.sequence if sequence is None else sequence,
+            ticket.permit.sequence if sequence is None else sequence,
         )
 
     def delivers(self, number: int) -> list[Outgoing]:
@@ -145,9 +145,9 @@ class Learner:
 
     def deliver_round(self) -> None:
         """What the next update still needs."""
-        tickets = self.coordinator.rollouts.held.values()
-        oldest = min(ticket.round for ticket in tickets)
-        for number in [ticket.number for ticket in tickets if ticket.round == oldest]:
+        tickets = self.coordinator.rollouts.held.items()
+        oldest = min(ticket.permit.round for _, ticket in tickets)
+        for number in [number for number, ticket in tickets if ticket.permit.round == oldest]:
             self.delivers(number)
 
     def beats(
@@ -329,7 +329,8 @@ def test_every_lane_has_a_ticket_for_every_open_round_and_no_other(max_lag: int,
     coordinator = learner.coordinator
     for update in range(5):
         open_rounds = {(number, lane) for number in range(update, update + max_lag + 1) for lane in range(lanes)}
-        assert {(ticket.round, ticket.lane) for ticket in coordinator.rollouts.held.values()} == open_rounds
+        dealt = {(ticket.permit.round, ticket.permit.lane) for ticket in coordinator.rollouts.held.values()}
+        assert dealt == open_rounds
         assert coordinator.begin_update() == []  # it has begun
         learner.deliver_round()
         assert len(coordinator.rollouts.held) == lanes * max_lag
@@ -376,11 +377,12 @@ def test_the_round_of_a_lost_ticket_is_dealt_again_under_its_version() -> None:
     learner.deliver_round()
     learner.take()
     learner.publish(1)
-    lost = next(ticket for ticket in learner.coordinator.rollouts.held.values() if ticket.round == 1 and ticket.lane == 0)
-    outs = learner.says(A, spoiled(learner.rollout_of(lost.number)))
+    tickets = learner.coordinator.rollouts.held.items()
+    lost = next(number for number, ticket in tickets if ticket.permit.round == 1 and ticket.permit.lane == 0)
+    outs = learner.says(A, spoiled(learner.rollout_of(lost)))
     (permit,) = permits(outs)
     again = learner.coordinator.rollouts.held[permit.ticket]
-    assert (again.lane, again.round, again.version, again.sequence) == (0, 1, 0, 3)  # two and one of round 2 were dealt
+    assert (permit.lane, permit.round, again.version, permit.sequence) == (0, 1, 0, 3)  # two and one of round 2 were dealt
 
 
 def test_in_a_synchronous_run_no_lane_gets_two_tickets_in_a_round_while_another_is_moving() -> None:
@@ -391,13 +393,13 @@ def test_in_a_synchronous_run_no_lane_gets_two_tickets_in_a_round_while_another_
     learner.joins(B)  # a lane moves to B, at a rollout boundary
     round_lanes = [
         *learner.coordinator.rollouts.ready[0],
-        *(ticket.lane for ticket in learner.coordinator.rollouts.held.values()),
+        *(ticket.permit.lane for ticket in learner.coordinator.rollouts.held.values()),
     ]
     assert sorted(round_lanes) == [0, 1, 2]
     learner.says(A, Goodbye(learner.session(A), "bye", ()))
     round_lanes = [
         *learner.coordinator.rollouts.ready[0],
-        *(ticket.lane for ticket in learner.coordinator.rollouts.held.values()),
+        *(ticket.permit.lane for ticket in learner.coordinator.rollouts.held.values()),
     ]
     assert sorted(round_lanes) == [0, 1, 2]
 
@@ -411,7 +413,7 @@ def test_a_lane_that_is_to_move_finishes_what_it_was_dealt_and_the_others_go_on(
     learner.take()
     dealt = {permit.lane for permit in permits(learner.publish(1))}
     assert dealt == {0, 1, 2} - {moving}
-    (last,) = [ticket.number for ticket in learner.coordinator.rollouts.held.values() if ticket.lane == moving]
+    (last,) = [number for number, ticket in learner.coordinator.rollouts.held.items() if ticket.permit.lane == moving]
     outs = learner.delivers(last)
     (permit,) = permits(outs, B)
     assert (permit.lane, permit.incarnation, permit.sequence) == (moving, 1, 0)
@@ -424,7 +426,7 @@ def test_a_lane_that_is_to_move_moves_when_its_last_rollout_is_bad() -> None:
     learner.joins(A)
     learner.joins(B)
     (moving,) = [lane.number for lane in learner.coordinator.rollouts.lanes if lane.moving]
-    (last,) = [ticket.number for ticket in learner.coordinator.rollouts.held.values() if ticket.lane == moving]
+    (last,) = [number for number, ticket in learner.coordinator.rollouts.held.items() if ticket.permit.lane == moving]
     outs = learner.says(A, spoiled(learner.rollout_of(last)))
     assert [permit.lane for permit in permits(outs, B)] == [moving]
 
@@ -436,7 +438,7 @@ def test_rounds_of_lost_tickets_are_dealt_again_in_their_order() -> None:
     process_ends(learner.coordinator, "a", "killed")
     learner.joins(B)
     held = learner.coordinator.rollouts.held
-    assert [held[number].round for number in learner.tickets(B)] == [0, 1, 2]
+    assert [held[number].permit.round for number in learner.tickets(B)] == [0, 1, 2]
 
 
 def test_when_every_worker_is_lost_no_ticket_is_dealt_until_one_joins() -> None:
@@ -475,7 +477,8 @@ def test_a_rollout_that_does_not_fit_its_ticket_is_not_used_and_dealt_again(chan
     learner.joins(A)
     learner.update()
     number, other = learner.tickets()
-    assert learner.coordinator.rollouts.held[number].version == learner.coordinator.rollouts.held[number].sequence == 1
+    ticket = learner.coordinator.rollouts.held[number]
+    assert ticket.version == ticket.permit.sequence == 1
     outs = learner.says(A, msgspec.structs.replace(learner.rollout_of(number), **change))
     ledger = learner.coordinator.rollouts.ledger
     assert (learner.coordinator.rollouts.ready, ledger.transitions_invalid, ledger.lost) == ({}, 1, 1)
@@ -515,7 +518,7 @@ def test_a_lost_workers_tickets_and_lanes_are_dealt_to_the_living_with_a_higher_
     learner.joins(B)
     learner.update()
     (lost,) = learner.tickets(A)
-    lane = learner.coordinator.rollouts.held[lost].lane
+    lane = learner.coordinator.rollouts.held[lost].permit.lane
     before = learner.coordinator.rollouts.lanes[lane].incarnation
     outs = learner.balanced(process_ends(learner.coordinator, "a", "killed"))
     assert [(p.lane, p.incarnation) for p in permits(outs, B)] == [(lane, before + 1)]
@@ -565,7 +568,7 @@ def test_release_travels_before_what_the_lanes_new_owner_is_told() -> None:
     learner.deliver_round()
     learner.take()
     learner.publish(1)
-    (last,) = [ticket.number for ticket in learner.coordinator.rollouts.held.values() if ticket.lane == 1]
+    (last,) = [number for number, ticket in learner.coordinator.rollouts.held.items() if ticket.permit.lane == 1]
     outs = learner.delivers(last)  # lane 1 has nothing outstanding any more: it moves, and is dealt a ticket at once
     assert [type(message) for _, message in outs] == [Release, Collect, Weights]
     assert [permit.lane for permit in permits(outs, B)] == [1]
@@ -1132,10 +1135,11 @@ def test_after_an_update_was_undone_all_is_as_before_its_rollouts_were_taken(max
     rollouts.histories = LaneHistories(copies=1, most_steps=100)
 
     def deliver(number: int, lanes: int = 2) -> None:
-        for ticket in [each for each in rollouts.held.values() if each.round == number and each.lane < lanes]:
+        permits = [ticket.permit for ticket in rollouts.held.values()]
+        for held in [each.ticket for each in permits if each.round == number and each.lane < lanes]:
             begun = (EpisodeBegin(0, 0, b""),) if number == 0 else ()
-            rollout = msgspec.structs.replace(learner.rollout_of(ticket.number), begun=begun, memory=fake_memory(number))
-            learner.says(ticket.peer, rollout)
+            rollout = msgspec.structs.replace(learner.rollout_of(held), begun=begun, memory=fake_memory(number))
+            learner.says(A, rollout)
 
     learner.joins(A)
     for number in range(2):
@@ -1154,9 +1158,36 @@ def test_after_an_update_was_undone_all_is_as_before_its_rollouts_were_taken(max
     assert rollouts.ledger.lost == 0
     process_ends(learner.coordinator, "a", "killed")
     learner.joins(B)
-    dealt = [(each.lane, each.round, len(each.past.action)) for each in rollouts.held.values() if each.past]
+    begun = [ticket.permit for ticket in rollouts.held.values()]
+    dealt = [(permit.lane, permit.round, len(permit.past.action)) for permit in begun if permit.past]
     assert dealt == [(1, 3, 3)] * max_lag, "the rollout that was put back is part of the past"
     assert [arrived.fresh for arrived in rollouts.take() or []] == [[False]] * 2
+
+
+def test_a_worker_that_continues_no_lane_is_sent_no_past_and_its_first_rollout_is_fresh() -> None:
+    """The past stays, for the next worker that continues lanes."""
+    learner = Learner(lanes=1)
+    rollouts = learner.coordinator.rollouts
+    rollouts.histories = LaneHistories(copies=1, most_steps=100)
+
+    def deliver(begun: EpisodeBegin) -> list[AcceptedRollout] | None:
+        (number,) = learner.tickets()
+        rollout = msgspec.structs.replace(learner.rollout_of(number), begun=(begun,), memory=fake_memory(1))
+        learner.says(rollouts.held[number].peer, rollout)
+        return rollouts.take()
+
+    learner.joins(A)
+    deliver(EpisodeBegin(0, 0, b""))
+    learner.publish(1)
+    process_ends(learner.coordinator, "a", "killed")
+    (permit,) = permits(learner.says(B, example(Hello, worker="b", continues=False)))
+    assert (permit.incarnation, permit.past) == (1, None)
+    (accepted,) = deliver(EpisodeBegin(0, 0, b"")) or []
+    assert np.all(accepted.fresh)
+    learner.publish(2)
+    process_ends(learner.coordinator, "b", "killed")
+    (permit,) = permits(learner.joins(A))
+    assert permit.past is not None
 
 
 def saved(learner: Learner) -> object:

@@ -68,8 +68,8 @@ class Unreliable:
         """Every lane collects, and an update is made of it. Raises what ends the run."""
         self.link.now += seconds
         for number, ticket in list(self.coordinator.rollouts.held.items()):
-            session = self.coordinator.members[ticket.peer].session
-            self.hears(ticket.peer, fake_rollout(session, ticket.lane, number, ticket.version, ticket.sequence))
+            session, permit = self.coordinator.members[ticket.peer].session, ticket.permit
+            self.hears(ticket.peer, fake_rollout(session, permit.lane, number, ticket.version, permit.sequence))
         self.hub.gather()
         self.publishes()
 

@@ -150,7 +150,7 @@ class Digests:
             case Leave():
                 return "Leave", value.exit_code, value.reason
             case RolloutTask():
-                without_pasts = tuple(replace(each, past=None) for each in value.assignments)
+                without_pasts = tuple(map(_without_past, value.permits))
                 return "RolloutTask", value.session, value.weights.version, without_pasts
             case EvaluationTask():
                 return "EvaluationTask", value.weights.version, self.of(value.order)

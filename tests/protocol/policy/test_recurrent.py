@@ -18,7 +18,7 @@ from millrace.learner.torch_setup import one_thread
 from millrace.protocol.arrays import Array
 from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.errors import BadRollout
-from millrace.protocol.messages import Evaluate
+from millrace.protocol.messages import Evaluate, Permit
 from millrace.protocol.policy.distributions import distribution
 from millrace.protocol.policy.encoder import RecurrentInput
 from millrace.protocol.policy.layout import buffer_size
@@ -32,7 +32,6 @@ from millrace.protocol.rollout import Rollout, stack_rollouts
 from millrace.protocol.rows.rollout_checks import validate
 from millrace.protocol.specs import PolicySpec, RunSpec
 from millrace.workers.collect.collector import Collector
-from millrace.workers.conversation.held import Assignment
 from millrace.workers.evaluate.evaluator import Evaluator
 from tests.support.conversation.example_messages import example
 from tests.support.envs.toy import Scripted
@@ -288,7 +287,7 @@ def learned(name: str, core: Core | None, updates: int) -> float:
     collector = Collector(run, make_policy(spec))
     for k in range(updates):
         collector.load(*algorithm.weights())
-        rollouts = collector.collect([Assignment(k, lane, 0, k, k) for lane in range(lanes)], k, 1, no_pulse)
+        rollouts = collector.collect([Permit(k, lane, 0, k, k) for lane in range(lanes)], k, 1, no_pulse)
         algorithm.update(stack_rollouts(rollouts), no_pulse)
     collector.lanes.close_all()
     policy = make_policy(spec)

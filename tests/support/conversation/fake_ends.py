@@ -147,7 +147,7 @@ def process_ends(coordinator: Coordinator[Any], worker: str, why: str = "killed"
 
 def fake_rollouts(task: RolloutTask) -> list[Rollout]:
     """What a collector would have made of this task."""
-    return [fake_rollout(task.session, a.lane, a.ticket, task.weights.version, a.sequence) for a in task.assignments]
+    return [fake_rollout(task.session, each.lane, each.ticket, task.weights.version, each.sequence) for each in task.permits]
 
 
 def held_count(session: Session) -> int:
@@ -223,14 +223,14 @@ class FakeWorker:
 
     def open_lanes(self, task: RolloutTask) -> None:
         """The env copies of these lanes are here in their incarnation, or they are made, and continue its past."""
-        for each in task.assignments:
+        for each in task.permits:
             if self.places.get(each.lane, (-1, 0))[0] != each.incarnation:
                 self.places[each.lane] = each.incarnation, 0 if each.past is None else place_of(each.past.memory)
 
     def collected(self, task: RolloutTask) -> list[Rollout]:
         """What it has collected. The env copies of each lane have made one rollout more."""
         found = []
-        for each in task.assignments:
+        for each in task.permits:
             incarnation, place = self.places[each.lane]
             self.places[each.lane] = incarnation, place + 1
             version = task.weights.version
@@ -394,7 +394,7 @@ class World:
             if weights.version in session.missing_versions() and is_of_learner(session.session, first_session):
                 self.say(worker, session.handle(weights, self.now))
         if worker.task is not None and session.is_unwanted(worker.task):
-            for each in worker.task.assignments if isinstance(worker.task, RolloutTask) else ():
+            for each in worker.task.permits if isinstance(worker.task, RolloutTask) else ():
                 worker.places.pop(each.lane, None)  # as a collector closes lanes whose rollout is abandoned
             worker.task = None
             self.say(worker, session.work_ended([]))

@@ -33,14 +33,14 @@ def check_tickets(coordinator: TicketCoordinator, max_lag: int, *, shares: bool 
     assert owners == known, f"{Rule.LANE_MOVES}: a lane has two owners, or its owner does not know"
     mine: list[set[int]] = [set() for _ in rollouts.lanes]
     for number, each in rollouts.held.items():
-        mine[each.lane].add(number)
+        mine[each.permit.lane].add(number)
     assert mine == [lane.outstanding for lane in rollouts.lanes], "a lane does not know its tickets"
     assert all(not lane.due or lane.number in rollouts._to_deal for lane in rollouts.lanes), (
         f"{Rule.LOST_TICKETS}: a lane gets no more tickets"
     )
     for number, each in rollouts.held.items():
         assert number in members[each.peer].tickets, f"{Rule.LOST_TICKETS}: an outstanding ticket is with nobody"
-        assert rollouts.lanes[each.lane].owner == each.peer, (
+        assert rollouts.lanes[each.permit.lane].owner == each.peer, (
             f"{Rule.LANE_MOVES}: a ticket of a lane that its worker does not own"
         )
     playing = [number for number, of_ticket in coordinator.evaluation.playing.items() for _ in of_ticket]

@@ -18,14 +18,13 @@ from millrace.learner.rollouts.evaluation_dealer import episode_seeds
 from millrace.protocol.arrays import Array
 from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.envs.spaces import action_spec, observation_leaves
-from millrace.protocol.messages import Evaluate
+from millrace.protocol.messages import Evaluate, Permit
 from millrace.protocol.policy.layout import acting_size, buffer_size
 from millrace.protocol.policy.policy import Policy, make_policy
 from millrace.protocol.rollout import Episode, Rollout
 from millrace.protocol.rows.rollout_checks import validate
 from millrace.protocol.specs import PolicySpec, RunSpec
 from millrace.workers.collect.collector import Collector, OpenEnvCopies, open_env_copies
-from millrace.workers.conversation.held import Assignment
 from millrace.workers.copies.env_copies import LoopedCopies
 from millrace.workers.evaluate.evaluator import Evaluator
 from tests.support.conversation.example_messages import example
@@ -103,11 +102,11 @@ def collect(
     collector: Collector, run: RunSpec, sequence: int = 0, lanes: Iterable[int] = (0,), incarnation: int = 0
 ) -> list[Rollout]:
     """Rollout number `sequence` of each lane, after a check that it keeps the row format."""
-    assignments = [Assignment(100 + lane, lane, incarnation, sequence, sequence) for lane in lanes]
-    rollouts = collector.collect(assignments, VERSION, SESSION, no_pulse)
-    for assignment, rollout in zip(assignments, rollouts, strict=True):
+    permits = [Permit(100 + lane, lane, incarnation, sequence, sequence) for lane in lanes]
+    rollouts = collector.collect(permits, VERSION, SESSION, no_pulse)
+    for permit, rollout in zip(permits, rollouts, strict=True):
         validate(rollout, run)
-        assert (rollout.lane, rollout.ticket, rollout.sequence) == (assignment.lane, assignment.ticket, sequence)
+        assert (rollout.lane, rollout.ticket, rollout.sequence) == (permit.lane, permit.ticket, sequence)
         assert (rollout.version, rollout.session) == (VERSION, SESSION)
     return rollouts
 

@@ -17,13 +17,13 @@ import torch
 from gymnasium.wrappers import OrderEnforcing, TimeLimit
 
 from millrace.protocol.arrays import Array
+from millrace.protocol.messages import Permit
 from millrace.protocol.policy.distributions import distribution
 from millrace.protocol.policy.features import features
 from millrace.protocol.policy.networks import ActorCriticNetwork
 from millrace.protocol.policy.normalize import normalize
 from millrace.protocol.specs import Leaf, RunSpec
 from millrace.workers.collect.collector import Collector
-from millrace.workers.conversation.held import Assignment
 from millrace.workers.copies.env_copies import copy_seed
 from tests.support.envs.toy import Countdown, Scripted
 from tests.support.in_process.collectors import (
@@ -278,7 +278,7 @@ def test_a_pulse_may_abandon_the_collection() -> None:
     run, collector, said = closable(T=50)
     collect(collector, run, lanes=(2,))
     with pytest.raises(Enough):
-        collector.collect([Assignment(0, 0, 0, 0, 0), Assignment(1, 1, 0, 0, 0)], 0, 0, pulse)
+        collector.collect([Permit(0, 0, 0, 0, 0), Permit(1, 1, 0, 0, 0)], 0, 0, pulse)
     assert sorted(said) == ["b", "c"]
     collect(collector, run, 1, lanes=(2,))  # lane 2 goes on,
     assert collector.steps == 80 + 2  # two lanes had made a step each when they were abandoned
@@ -287,7 +287,7 @@ def test_a_pulse_may_abandon_the_collection() -> None:
 
 def test_a_lane_released_by_a_pulse_is_closed_after_the_collection() -> None:
     _, collector, said = closable()
-    collector.collect([Assignment(0, 0, 0, 0, 0), Assignment(1, 1, 0, 0, 0)], 0, 0, lambda: collector.lanes.close([1]))
+    collector.collect([Permit(0, 0, 0, 0, 0), Permit(1, 1, 0, 0, 0)], 0, 0, lambda: collector.lanes.close([1]))
     assert said == ["b"]
 
 
@@ -310,14 +310,14 @@ def test_the_pulse_is_called_between_slow_copies(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr("millrace.workers.copies.env_loop.PULSE_S", -1.0)  # any step is a slow one
     run = run_of(f"{TOY}Countdown-v0", T=3, N=5)
     pulses: list[int] = []
-    random_collector(run).collect([Assignment(0, 0, 0, 0, 0)], 0, 0, lambda: pulses.append(1))
+    random_collector(run).collect([Permit(0, 0, 0, 0, 0)], 0, 0, lambda: pulses.append(1))
     assert len(pulses) >= 3 * 5
 
 
 def test_one_lane_cannot_be_collected_twice_at_once() -> None:
     run = run_of(f"{TOY}Countdown-v0")
-    with pytest.raises(ValueError, match="one assignment for each lane"):
-        random_collector(run).collect([Assignment(0, 3, 0, 0, 0), Assignment(1, 3, 0, 1, 1)], 0, 0, no_pulse)
+    with pytest.raises(ValueError, match="one permit for each lane"):
+        random_collector(run).collect([Permit(0, 3, 0, 0, 0), Permit(1, 3, 0, 1, 1)], 0, 0, no_pulse)
 
 
 def test_stages_and_steps_are_counted() -> None:
@@ -352,7 +352,7 @@ def test_steps_are_counted_while_a_rollout_is_under_way(
     collector, seen = random_collector(run), list[tuple[int, int]]()
     for k in range(3):
         pulse = lambda: seen.append((collector.steps, made))  # noqa: E731
-        collector.collect([Assignment(10 * k + lane, lane, 0, k, k) for lane in lanes], 0, 0, pulse)
+        collector.collect([Permit(10 * k + lane, lane, 0, k, k) for lane in lanes], 0, 0, pulse)
         assert collector.steps == made
     reported = [steps for steps, _ in seen]
     assert reported == sorted(reported)

@@ -18,14 +18,13 @@ from millrace.learner.config.hyperparameters import PPOConfig
 from millrace.learner.rollouts.opponent_pool import teams_of
 from millrace.protocol.arrays import Array, Floats
 from millrace.protocol.errors import PolicyFailed, UsageError
-from millrace.protocol.messages import Evaluate, Weights
+from millrace.protocol.messages import Evaluate, Permit, Weights
 from millrace.protocol.policy.layout import acting_size
 from millrace.protocol.policy.policy import make_policy
 from millrace.protocol.rollout import Episode, Rollout, stack_rollouts
 from millrace.protocol.rows.rollout_checks import validate, wrong_facts
 from millrace.protocol.specs import SCORE, PolicySpec, RunSpec
 from millrace.workers.collect.collector import Collector
-from millrace.workers.conversation.held import Assignment
 from millrace.workers.evaluate.evaluator import Evaluator
 from millrace.workers.opponents import KnownOpponents, Match, Opponent, OtherTeams
 from tests.support.conversation.example_messages import example
@@ -67,7 +66,7 @@ def collect(collector: Collector, run: RunSpec, opponents: Sequence[int | None],
     held = {number: always(number, number, run.policy) for number in opponents if number is not None and number >= 0}
     found = []
     for sequence, opponent in enumerate(opponents):
-        found += collector.collect([Assignment(sequence, lane, 0, sequence, sequence, opponent)], 0, 1, no_pulse, held)
+        found += collector.collect([Permit(sequence, lane, 0, sequence, sequence, opponent)], 0, 1, no_pulse, held)
         validate(found[-1], run)
     return found
 
@@ -173,7 +172,7 @@ def test_the_learner_finds_the_log_probabilities_of_its_team(form: str) -> None:
     collector, other = Collector(run, policy), PPO(PPOConfig(core="gru", core_size=7), run.policy, total_steps=1, seed=4)
     held = {4: Weights(4, *other.weights())}
     for k in range(6):
-        (rollout,) = collector.collect([Assignment(k, 0, 0, k, k, 4)], 0, 1, no_pulse, held)
+        (rollout,) = collector.collect([Permit(k, 0, 0, k, k, 4)], 0, 1, no_pulse, held)
         batch = stack_rollouts([rollout])
         found = log_probs(ppo.net, ppo.observations(batch), batch, no_pulse)
         # A chain of some hundred float32 operations on numbers of the size of 1, in other orders.

@@ -345,7 +345,7 @@ def test_a_late_repeat_of_a_ticket_whose_rollout_was_received_is_ignored() -> No
 
 def test_the_next_rollout_of_every_lane_is_collected_together_in_lane_order() -> None:
     session = ready(collect((5, 2), (3, 2), (9, 0), (4, 1)))
-    assert [(a.lane, a.ticket) for a in task_of(session).assignments] == [(0, 9), (1, 4), (2, 5)]
+    assert [(each.lane, each.ticket) for each in task_of(session).permits] == [(0, 9), (1, 4), (2, 5)]
 
 
 def test_a_permit_is_not_started_before_an_earlier_one_that_has_not_come() -> None:
@@ -361,7 +361,7 @@ def test_one_task_at_a_time() -> None:
     task = task_of(session)
     assert session.next_work() is None
     session.work_ended(fake_rollouts(task))
-    assert task_of(session).assignments[0].ticket == 1
+    assert task_of(session).permits[0].ticket == 1
 
 
 def test_an_evaluation_comes_before_rollouts() -> None:
@@ -371,7 +371,7 @@ def test_an_evaluation_comes_before_rollouts() -> None:
     assert session.next_work() is None
     answer = fake_evaluated(task)
     assert session.work_ended([answer]) == [SendMessage(answer)]
-    assert task_of(session).assignments[0].ticket == 0
+    assert task_of(session).permits[0].ticket == 0
 
 
 def test_an_evaluation_is_played_under_its_version_although_newer_weights_are_held() -> None:
@@ -485,7 +485,7 @@ def test_finished_with_nothing_puts_the_tickets_back() -> None:
     session = ready(collect((0, 0)))
     task_of(session)
     assert session.work_ended([]) == []
-    assert task_of(session).assignments[0].ticket == 0
+    assert task_of(session).permits[0].ticket == 0
 
 
 def test_the_worker_holds_at_most_what_the_learner_has_outstanding() -> None:
@@ -710,8 +710,8 @@ def test_a_higher_incarnation_starts_the_lane_anew_with_sequence_0() -> None:
     collected(session)
     session.handle(collect((2, 0), incarnation=1), 0.1)
     assert held_count(session) == 1  # the ticket and the rollout of the old incarnation are dropped
-    (assignment,) = task_of(session).assignments
-    assert (assignment.ticket, assignment.incarnation, assignment.sequence) == (2, 1, 0)
+    (permit,) = task_of(session).permits
+    assert (permit.ticket, permit.incarnation, permit.sequence) == (2, 1, 0)
 
 
 def test_a_rollout_of_a_lane_that_started_anew_while_it_was_collected_is_not_sent() -> None:
@@ -719,15 +719,15 @@ def test_a_rollout_of_a_lane_that_started_anew_while_it_was_collected_is_not_sen
     task = task_of(session)
     session.handle(collect((2, 0), incarnation=1), 0.1)
     assert sent(session.work_ended(fake_rollouts(task)), Rollout) == []
-    (assignment,) = task_of(session).assignments
-    assert (assignment.ticket, assignment.sequence) == (2, 0)
+    (permit,) = task_of(session).permits
+    assert (permit.ticket, permit.sequence) == (2, 0)
 
 
 def test_a_ticket_of_an_older_incarnation_is_ignored() -> None:
     session = ready(collect((2, 0), incarnation=1))
     session.handle(collect((1, 0), received=lanes(0, incarnation=1)), 0.1)
     assert held_count(session) == 1
-    assert task_of(session).assignments[0].ticket == 2
+    assert task_of(session).permits[0].ticket == 2
 
 
 def test_release_closes_the_lane_and_drops_its_tickets_and_rollouts() -> None:

@@ -17,12 +17,12 @@ from millrace.learner.vector_env.settings import VectorEnvSettings
 from millrace.protocol.arrays import Array
 from millrace.protocol.envs.env_actions import action_converter_of
 from millrace.protocol.errors import NoWorkers, WorkerLost
+from millrace.protocol.messages import Permit
 from millrace.protocol.policy.layout import acting_size, buffer_size
 from millrace.protocol.policy.torch_policy import TorchPolicy
 from millrace.protocol.specs import RunSpec
 from millrace.protocol.wire.plain_values import pack
 from millrace.workers.collect.collector import Collector
-from millrace.workers.conversation.held import Assignment
 from millrace.workers.copies.env_loop import Pulse
 from millrace.workers.copies.split_vector_env import SplitVectorEnv
 from tests.support.in_process.any_order import any_order
@@ -62,12 +62,12 @@ def test_a_lane_gets_the_bits_of_a_loop_over_its_copies(name: str) -> None:
 def test_a_lane_of_a_new_incarnation_starts_anew_and_the_others_go_on() -> None:
     run = RUNS["discrete"]
     loop = random_collector(run)
-    assignments = [Assignment(n, n, 1 if n == 1 else 0, 0 if n == 1 else 1, 1) for n in range(LANES)]
+    permits = [Permit(n, n, 1 if n == 1 else 0, 0 if n == 1 else 1, 1) for n in range(LANES)]
     with split_collector(run) as split:
         found = []
         for collector in (split, loop):
             collect(collector, run, 0, lanes=range(LANES))
-            found.append([bits(rollout) for rollout in collector.collect(assignments, 0, 0, no_pulse)])
+            found.append([bits(rollout) for rollout in collector.collect(permits, 0, 0, no_pulse)])
     assert found[0] == found[1]
 
 

@@ -15,12 +15,11 @@ from gymnasium import spaces
 from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.envs.spaces import action_spec, observation_leaves
 from millrace.protocol.errors import EnvironmentFailed, UsageError
-from millrace.protocol.messages import EpisodeRows, Evaluate, Evaluated
+from millrace.protocol.messages import EpisodeRows, Evaluate, Evaluated, Permit
 from millrace.protocol.policy.policy import Policy
 from millrace.protocol.specs import PolicySpec, RunSpec
 from millrace.protocol.wire.codec import encode
 from millrace.workers.collect.collector import Collector
-from millrace.workers.conversation.held import Assignment
 from millrace.workers.evaluate import episode_rows
 from millrace.workers.evaluate.evaluator import ROWS_AT_ONCE, Evaluator
 from tests.support.conversation.example_messages import example
@@ -287,7 +286,7 @@ def test_an_observation_from_which_no_policy_can_act_is_named_as_in_training() -
     with pytest.raises(EnvironmentFailed, match=f"while the policy was evaluated: {says}"):
         play(Evaluator(run, random_policy(run.policy)), order(1, 2))
     with pytest.raises(EnvironmentFailed, match=f"lane 0, {says}"):
-        Collector(run, random_policy(run.policy)).collect([Assignment(0, 0, 0, 0, 0)], 0, 1, no_pulse)
+        Collector(run, random_policy(run.policy)).collect([Permit(0, 0, 0, 0, 0)], 0, 1, no_pulse)
 
 
 def test_no_row_is_sent_with_an_observation_that_is_not_finite() -> None:

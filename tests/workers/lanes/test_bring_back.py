@@ -24,13 +24,12 @@ from millrace.protocol.envs.action_masks import without_mask
 from millrace.protocol.envs.spaces import action_spec, observation_leaves
 from millrace.protocol.errors import EnvironmentFailed
 from millrace.protocol.lane_past import LastEpisode
-from millrace.protocol.messages import LanePast
+from millrace.protocol.messages import LanePast, Permit
 from millrace.protocol.rollout import Rollout
 from millrace.protocol.rows.rollout_checks import validate
 from millrace.protocol.specs import PolicySpec, RunSpec, seat_returns
 from millrace.protocol.wire.plain_values import pack
 from millrace.workers.collect.collector import Collector
-from millrace.workers.conversation.held import Assignment
 from millrace.workers.copies.reset_ahead import ResetAhead
 from tests.support.in_process.collectors import (
     SESSION,
@@ -177,7 +176,7 @@ def rollout_of(collector: Collector, run: RunSpec, number: int, attributes: Attr
     collector.env_attributes = attributes(number)
     if past is None:
         return collect(collector, run, number)[0]
-    return collector.collect([Assignment(100, 0, 1, number, number, past=past)], VERSION, SESSION, no_pulse)[0]
+    return collector.collect([Permit(100, 0, 1, number, number, past=past)], VERSION, SESSION, no_pulse)[0]
 
 
 def past_of(
