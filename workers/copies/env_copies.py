@@ -161,6 +161,28 @@ def copy_seed(seed: int, lane: int, start: int, copy: int) -> int:  # rule INDEP
     return env_seed(seed, Purpose.COPIES, lane, start, copy)
 
 
+class CopySettings(NamedTuple):
+    """The settings of a run that apply to each of its copies in a loop."""
+
+    facts: Sequence[str] = ()
+    """names of numbers in `info` that describe an episode; the returns of seats aren't among them"""
+    masked: bool = False
+    """whether to read masks of the allowed actions"""
+    critic_keys: Sequence[str] = ()
+    """keys of a Dict observation whose arrays come last"""
+    restart_episodes: int = 0
+    """after this many episodes, a copy is closed and recreated; 0: never"""
+
+    @classmethod
+    def of(cls, run: RunSpec) -> CopySettings:
+        """The settings of this run."""
+        return cls(run.info_keys, run.masked, run.policy.critic_keys, run.restart_episodes)
+
+
+PLAIN_COPIES = CopySettings()
+"""No facts, masks or keys for the critic, and copies that are never recreated."""
+
+
 class LoopedCopies:
     """N environments that are stepped one after another, in a loop."""
 
@@ -168,40 +190,37 @@ class LoopedCopies:
         self,
         makes: Iterable[Callable[[], gymnasium.Env[Any, Any]]],
         pulse: Pulse,
-        facts: Sequence[str] = (),
-        *,
-        masked: bool = False,
-        critic_keys: Sequence[str] = (),
+        settings: CopySettings = PLAIN_COPIES,
         first: EnvCopy = FIRST_COPY,
-        restart_episodes: int = 0,
     ) -> None:
-        """Make the copies. If `masked`, read masks of the allowed actions. In an evaluation, no step resets a copy.
-
-        `facts` are names of numbers in `info` that describe an episode. `critic_keys` are keys of a Dict observation whose
-        arrays come last. `first` identifies the first copy. After `restart_episodes` episodes, a copy is closed and
-        recreated; 0 means never.
-        """
-        self._facts = facts
+        """Make the copies. `first` identifies the first copy. In an evaluation, no step resets a copy."""
+        self._facts = settings.facts
         self._activity = activity()
         evaluates = first.evaluation
         autoreset: Autoreset = "Disabled" if evaluates else "NextStep"
         stepping = EVALUATING if evaluates else STEPPING
         self._attributes: dict[str, bytes] = {}  # attributes that were set on every copy, by name; the values are packed
-        self._restart_episodes = restart_episodes
+        self._restart_episodes = settings.restart_episodes
         self._loop = EnvLoop(
-            makes, pulse, autoreset, first=first, stepping=stepping, dress=self._dressed, restart_episodes=restart_episodes
+            makes,
+            pulse,
+            autoreset,
+            first=first,
+            stepping=stepping,
+            dress=self._dressed,
+            restart_episodes=settings.restart_episodes,
         )
         self.envs = self._loop.envs
         self.count = len(self._loop.envs)
         with self._activity.during(MAKING):  # reading an attribute may run environment code
             self.observation_space = self.envs[0].observation_space
             self.action_space = self.envs[0].action_space
-        self._masks = MaskReader(self.observation_space, self.action_space) if masked else None
+        self._masks = MaskReader(self.observation_space, self.action_space) if settings.masked else None
         self.note = ""
         self.saves = all(saver(env) is not None for env in self.envs)
         """whether the environment can save its state"""
         self.observation_space = seen_space(
-            self.observation_space, self.action_space, masked=masked, critic_keys=critic_keys
+            self.observation_space, self.action_space, masked=settings.masked, critic_keys=settings.critic_keys
         )
         self._nested = isinstance(self.observation_space, gymnasium.spaces.Dict | gymnasium.spaces.Tuple)
         self._read = make_flatten(self.observation_space)

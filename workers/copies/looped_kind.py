@@ -10,7 +10,7 @@ import gymnasium
 from millrace.protocol.envs.kinds_of_copies import CopiesKind
 from millrace.protocol.envs.which_copy import EnvCopy
 from millrace.protocol.specs import RunSpec
-from millrace.workers.copies.env_copies import LoopedCopies
+from millrace.workers.copies.env_copies import CopySettings, LoopedCopies
 from millrace.workers.copies.env_loop import Pulse
 from millrace.workers.copies.seated_copies import SeatedCopies
 from millrace.workers.copy_slots import EnvMaker
@@ -26,13 +26,10 @@ def loop_over(
 ) -> LoopedCopies:
     """Make `count` copies for a run."""
     makes = [make] * count
-    keys = run.policy.critic_keys
-    anew = run.restart_episodes
+    settings = CopySettings.of(run)
     if run.seats:
-        return SeatedCopies(
-            makes, pulse, run.seats, run.info_keys, masked=run.masked, critic_keys=keys, first=first, restart_episodes=anew
-        )
-    return LoopedCopies(makes, pulse, run.facts, masked=run.masked, critic_keys=keys, first=first, restart_episodes=anew)
+        return SeatedCopies(makes, pulse, run.seats, settings, first)
+    return LoopedCopies(makes, pulse, settings, first)
 
 
 LOOP = CopiesKind(open_loop)

@@ -16,7 +16,7 @@ from millrace.protocol.arrays import Array, Bools
 from millrace.protocol.envs.answers import WrongAnswer
 from millrace.protocol.envs.seats import SeatedEnv, SeatStep, side_by_side
 from millrace.protocol.envs.which_copy import FIRST_COPY, EnvCopy
-from millrace.workers.copies.env_copies import Leaves, LoopedCopies, SeatColumns, StepResult
+from millrace.workers.copies.env_copies import PLAIN_COPIES, CopySettings, Leaves, LoopedCopies, SeatColumns, StepResult
 from millrace.workers.copies.env_errors import CopyFailed
 from millrace.workers.copies.env_loop import CopyInfos, Pulse
 from millrace.workers.copies.episode_facts import facts_of_info
@@ -32,19 +32,11 @@ class SeatedCopies(LoopedCopies):
         makes: Iterable[Callable[[], gymnasium.Env[Any, Any]]],
         pulse: Pulse,
         seats: Sequence[str],
-        facts: Sequence[str] = (),
-        *,
-        masked: bool = False,
-        critic_keys: Sequence[str] = (),
+        settings: CopySettings = PLAIN_COPIES,
         first: EnvCopy = FIRST_COPY,
-        restart_episodes: int = 0,
     ) -> None:
-        """`seats` are the names of the A agents. `facts` don't include the returns of seats. For the other parameters, see
-        `LoopedCopies`.
-        """
-        super().__init__(
-            makes, pulse, facts, masked=masked, critic_keys=critic_keys, first=first, restart_episodes=restart_episodes
-        )
+        """`seats` are the names of the A agents. For the other parameters, see `LoopedCopies`."""
+        super().__init__(makes, pulse, settings, first)
         self._names = seats
         self._seats = len(seats)
         self._allowed: list[Bools | None] = [None] * (self.count * len(seats))  # None: all actions are allowed

@@ -16,7 +16,7 @@ from millrace.protocol.envs.tuple_of_agents import TupleOfAgents
 from millrace.protocol.errors import UsageError
 from millrace.protocol.random_streams import Purpose, env_seed
 from millrace.protocol.wire.plain_values import pack
-from millrace.workers.copies.env_copies import CANNOT_RESTART, LoopedCopies
+from millrace.workers.copies.env_copies import CANNOT_RESTART, CopySettings, LoopedCopies
 from millrace.workers.copies.env_errors import CopyFailed
 from millrace.workers.copies.reset_ahead import ResetAhead
 from millrace.workers.copies.seated_copies import SeatedCopies
@@ -177,12 +177,10 @@ def pair() -> gymnasium.Env[Any, Any]:
 
 def copies_of(agents: int, restart_episodes: int = 0) -> LoopedCopies:
     """One copy that resets ahead, with one agent or with two in tuples."""
+    settings = CopySettings(restart_episodes=restart_episodes)
     if agents == 1:
-        return LoopedCopies(
-            [lambda: ResetAhead(gymnasium.make("tests/Traced-v0"))], no_pulse, restart_episodes=restart_episodes
-        )
-
-    return SeatedCopies([pair], no_pulse, ("agent_0", "agent_1"), restart_episodes=restart_episodes)
+        return LoopedCopies([lambda: ResetAhead(gymnasium.make("tests/Traced-v0"))], no_pulse, settings)
+    return SeatedCopies([pair], no_pulse, ("agent_0", "agent_1"), settings)
 
 
 @pytest.mark.parametrize("agents", [1, 2])

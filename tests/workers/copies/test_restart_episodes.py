@@ -8,15 +8,18 @@ from __future__ import annotations
 from typing import Any
 
 import gymnasium
+import msgspec
 import numpy as np
 import pytest
 
+from millrace.protocol.envs.which_copy import FIRST_COPY
 from millrace.protocol.wire.plain_values import pack
-from millrace.workers.copies.env_copies import LoopedCopies
+from millrace.workers.copies.env_copies import CopySettings, LoopedCopies
 from millrace.workers.copies.env_errors import CopyFailed
 from millrace.workers.copies.env_loop import EnvLoop
+from millrace.workers.copies.looped_kind import loop_over
 from millrace.workers.copy_slots import env_copy
-from tests.support.in_process.collectors import no_pulse
+from tests.support.in_process.collectors import no_pulse, run_around
 
 ACTIONS = np.zeros(2, np.int64)
 EPISODE = 2
@@ -64,7 +67,7 @@ class Unreadable(OneStep):
 
 
 def copies_of(made: list[OneStep], restart_episodes: int, kind: type[OneStep] = OneStep) -> LoopedCopies:
-    copies = LoopedCopies([lambda: kind(made)] * 2, no_pulse, restart_episodes=restart_episodes)
+    copies = LoopedCopies([lambda: kind(made)] * 2, no_pulse, CopySettings(restart_episodes=restart_episodes))
     copies.reset([3, 4], no_pulse)
     return copies
 
@@ -87,6 +90,16 @@ def test_each_copy_is_made_anew_after_so_many_episodes(episodes: int) -> None:
     assert [env.closed for env in made] == [True] * (len(made) - 2) + [False] * 2
     assert [env.which.copy for env in made] == [0, 1] * (len(made) // 2)
     assert {env.resets[0] for env in made if env.which.copy == 0} == {3}, "each begins with the seed of its start"
+    copies.close()
+
+
+def test_the_copies_of_a_run_are_made_anew_after_as_many_episodes_as_it_says() -> None:
+    made: list[OneStep] = []
+    run = msgspec.structs.replace(run_around(OneStep([]), T=1), restart_episodes=3)
+    copies = loop_over(run, lambda: OneStep(made), 2, FIRST_COPY, no_pulse)
+    copies.reset([3, 4], no_pulse)
+    played(copies, 6)
+    assert len(made) == 2 * (1 + 6 // 3)
     copies.close()
 
 
@@ -165,7 +178,7 @@ def test_a_copy_that_cannot_be_made_anew_is_a_failure_of_it() -> None:
             raise OSError("no licence")
         return OneStep(made)
 
-    copies = LoopedCopies([make], no_pulse, restart_episodes=1)
+    copies = LoopedCopies([make], no_pulse, CopySettings(restart_episodes=1))
     copies.reset([1], no_pulse)
     copies.step(ACTIONS[:1], no_pulse)
     with pytest.raises(CopyFailed) as caught:
