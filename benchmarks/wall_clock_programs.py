@@ -27,7 +27,7 @@ LEARNING_STARTS = 512
 """env steps before the first gradient step in a run whose rate is measured"""
 WARM_UP_STEPS = 768
 """env steps of such a run that aren't counted"""
-THEIR_PPO_STEPS = 2048
+THEIR_PPO_STEPS = 2048 // COPIES
 """steps of each env copy in a rollout of Stable-Baselines3's PPO"""
 THEIR_PROGRAM = "benchmarks.wall_clock_stable_baselines3"
 

@@ -32,7 +32,15 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
 from benchmarks.slow_env import StepTime
 from benchmarks.train_stable_baselines3 import PrintUpdates
-from benchmarks.wall_clock_programs import COPIES, EVAL_EPISODES, EVAL_EVERY, MOST_STEPS, THEIR_PROGRAM, THEIRS
+from benchmarks.wall_clock_programs import (
+    COPIES,
+    EVAL_EPISODES,
+    EVAL_EVERY,
+    MOST_STEPS,
+    THEIR_PPO_STEPS,
+    THEIR_PROGRAM,
+    THEIRS,
+)
 from benchmarks.writing import processor
 
 KINDS: dict[str, Any] = {"ppo": PPO, "sac": SAC, "tqc": TQC, "crossq": CrossQ}
@@ -76,8 +84,8 @@ class WriteCurve(BaseCallback):
 
 
 def make(algo: str, env: VecEnv, seed: int, device: str, learning_starts: int | None = None) -> BaseAlgorithm:
-    """Make the algorithm with the library's settings."""
-    more: dict[str, Any] = {} if algo == "ppo" else {"train_freq": 1, "gradient_steps": COPIES}
+    """Make the algorithm with the library's settings. PPO learns from 2,048 env steps at once, as with one env copy."""
+    more: dict[str, Any] = {"n_steps": THEIR_PPO_STEPS} if algo == "ppo" else {"train_freq": 1, "gradient_steps": COPIES}
     if learning_starts is not None:
         more["learning_starts"] = learning_starts
     made: BaseAlgorithm = KINDS[algo]("MlpPolicy", env, seed=seed, device=device, **more)
