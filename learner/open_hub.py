@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from msgspec.structs import asdict
+
 from millrace.learner.config.rollout_config import RolloutConfig
 from millrace.learner.members.lobby import Lobby, LobbySettings
 from millrace.learner.rollouts.hub import Hub, HubObserver, HubSettings
@@ -64,7 +66,7 @@ def open_hub(
 def lobby_settings(config: RolloutConfig, progress: RunProgress = NO_PROGRESS) -> LobbySettings:
     """The settings that matter before the run begins. In a resumed run, `progress` says how far the run has got."""
     return LobbySettings(
-        wait=WaitSpec(config.call_timeouts(), config.heartbeat_s()),
+        wait=WaitSpec(**asdict(config.terms())),
         worker_timeout_s=config.worker_timeout_s,
         no_workers_timeout_s=config.no_workers_timeout_s,
         stall_timeout_s=config.stall_timeout_s(),

@@ -171,8 +171,7 @@ class PolicyPlayer:
             masked=policy.masked,
             seats=policy.seats,
             takes_turns=bool(policy.seats),  # with several agents, they may take turns
-            call_timeouts=settings.call_timeouts(),
-            heartbeat_s=settings.heartbeat_s(),
+            **msgspec.structs.asdict(settings.terms()),
         )
         if (against := policy.against) is None:
             hub = open_hub(settings, run, self._lobby, self._check_interrupt)

@@ -5,6 +5,8 @@ It imports no torch.
 
 from __future__ import annotations
 
+from msgspec.structs import asdict
+
 from millrace.learner.config.rollout_config import RolloutConfig
 from millrace.learner.env_spaces import EnvSpaces
 from millrace.protocol.env_spec import EnvSpec
@@ -62,9 +64,8 @@ def rollout_spec(
         takes_turns=spaces.takes_turns,
         teams=teams,
         scripted=scripted,
-        call_timeouts=config.call_timeouts(),
-        heartbeat_s=config.heartbeat_s(),
         restart_episodes=config.restart_episodes,
+        **asdict(config.terms()),
     )
     _check_weights_can_be_sent(env.id, policy, config)
     check_can_be_sent(env.id, run)

@@ -250,21 +250,37 @@ class ExtraArray(msgspec.Struct, frozen=True, array_like=True):
     dtype: str
 
 
-class WaitSpec(msgspec.Struct, frozen=True, tag=True):
-    """The run has not begun, because the learner does not know the environment yet. The worker waits in its session for
-    orders to describe an environment, and for a second `Welcome`, which contains the run.
+class SessionTerms(msgspec.Struct, frozen=True, kw_only=True):
+    """What each worker of a learner must follow, whatever it does in its session. Every spec contains these fields.
+
+    `learner_timeout_s` isn't one of them, because it depends on how long the learner may read no messages meanwhile.
     """
 
     call_timeouts: CallTimeouts = CallTimeouts()
     """how long a call to user code may take before the worker is ended by its supervisor, if it has one"""
     heartbeat_s: float = HEARTBEAT_S
+
+
+def session_terms(call_timeouts: CallTimeouts, worker_timeout_s: float) -> SessionTerms:
+    """The terms of workers that count as lost if they are silent for `worker_timeout_s`.
+
+    Heartbeats are so frequent that a worker doesn't count as silent if some arrive late.
+    """
+    return SessionTerms(call_timeouts=call_timeouts, heartbeat_s=min(HEARTBEAT_S, worker_timeout_s / 5))
+
+
+class WaitSpec(SessionTerms, frozen=True, tag=True):
+    """The run has not begun, because the learner does not know the environment yet. The worker waits in its session for
+    orders to describe an environment, and for a second `Welcome`, which contains the run.
+    """
+
     learner_timeout_s: float = 600.0
     """how many seconds after a Heartbeat a worker says Hello again if the learner has sent nothing since. Before the run
     begins, the learner may read a checkpoint or a dataset for a long time, without reading messages
     """
 
 
-class RunSpec(msgspec.Struct, frozen=True, tag=True):
+class RunSpec(SessionTerms, frozen=True, tag=True):
     """Everything that a worker needs to know about a run for which it collects rollouts."""
 
     env: EnvSpec
@@ -300,9 +316,6 @@ class RunSpec(msgspec.Struct, frozen=True, tag=True):
     """opponents that aren't weights: each is a callable that makes a policy (`protocol/policy/called_policy.py`)"""
     opponent: PolicySpec | None = None
     """the policy of the opponents, if it differs from `policy`"""
-    call_timeouts: CallTimeouts = CallTimeouts()
-    """how long a call to user code may take before the worker is ended by its supervisor, if it has one"""
-    heartbeat_s: float = HEARTBEAT_S
     restart_episodes: int = 0
     """after this many episodes, a worker that can do so closes an env copy and creates a new one, which continues exactly as
     the old one would have; 0: never
@@ -400,7 +413,7 @@ SEAT_LEAVES = (Leaf("acts", "box", (), "bool"), Leaf("complete", "box", (), "boo
 """
 
 
-class StepSpec(msgspec.Struct, frozen=True, tag=True):
+class StepSpec(SessionTerms, frozen=True, tag=True):
     """Everything that a worker needs to know about a vector environment whose copies it steps on order."""
 
     envs: tuple[EnvSpec, ...]
@@ -423,9 +436,6 @@ class StepSpec(msgspec.Struct, frozen=True, tag=True):
     instead of N, where the rows of a copy are adjacent, and three more arrays follow those of the observation: `acts` and
     `complete` (bool), and `outside` (float64)
     """
-    call_timeouts: CallTimeouts = CallTimeouts()
-    """how long a call to user code may take before the worker is ended by its supervisor, if it has one"""
-    heartbeat_s: float = HEARTBEAT_S
     learner_timeout_s: float = 600.0
     """how many seconds after a Heartbeat a worker says Hello again if the learner has sent nothing since. Between two steps,
     the caller may compute for a long time, without reading messages; infinite for workers that end with the learner's

@@ -19,7 +19,7 @@ from millrace.protocol.env_spec import Scalar
 from millrace.protocol.envs.kinds_of_copies import KINDS
 from millrace.protocol.envs.seats import STATE
 from millrace.protocol.envs.wrappers import WrapperLike
-from millrace.protocol.specs import HEARTBEAT_S
+from millrace.protocol.specs import SessionTerms, session_terms
 from millrace.protocol.wire.weight_dtypes import ActingDtype
 
 SEAT_ID = "millrace.protocol.envs.seats:seat_id"
@@ -196,6 +196,6 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
         """The run ends if no env step, reset or construction finishes for this many seconds. Each one takes less time."""
         return max(STALL_TIMEOUT_S, self.call_timeouts().longest_s())
 
-    def heartbeat_s(self) -> float:
-        """Seconds between a worker's heartbeats: so few that a worker doesn't count as silent if some arrive late."""
-        return min(HEARTBEAT_S, self.worker_timeout_s / 5)
+    def terms(self) -> SessionTerms:
+        """The terms of all workers, before the run begins and in the run."""
+        return session_terms(self.call_timeouts(), self.worker_timeout_s)

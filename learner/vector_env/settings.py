@@ -19,6 +19,7 @@ from millrace.protocol.env_spec import EnvLike, EnvSpec, Scalar
 from millrace.protocol.envs.wrappers import WrapperLike
 from millrace.protocol.errors import UsageError, safe_repr
 from millrace.protocol.machine.cpu_cores import usable_cores
+from millrace.protocol.specs import SessionTerms, session_terms
 
 ObservationMode = Literal["same", "different"] | tuple[Space[Any], Space[Any]]
 """Gymnasium's `observation_mode`. A tuple has the observation spaces of the batch and of a single copy."""
@@ -69,6 +70,11 @@ class VectorEnvSettings:
         mode = self.observation_mode
         if isinstance(mode, tuple) and [isinstance(space, Space) for space in mode] != [True, True]:
             raise UsageError(f"observation_mode: expected the spaces of the batch and of a single copy, got {mode}")
+
+    @property
+    def terms(self) -> SessionTerms:
+        """The terms of all workers, before the spaces of the copies are known and afterwards."""
+        return session_terms(self.call_timeouts, self.worker_timeout_s)
 
     @property
     def envs(self) -> list[EnvLike | EnvSpec]:

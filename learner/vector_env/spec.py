@@ -16,15 +16,15 @@ from gymnasium import Space
 from gymnasium.spaces.utils import is_space_dtype_shape_equiv
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_differing_spaces, batch_space
+from msgspec.structs import asdict
 
 from millrace.learner.members.describe_coordinator import Unknown
 from millrace.learner.vector_env.settings import ObservationMode, VectorEnvSettings
-from millrace.protocol.call_timeouts import CallTimeouts
 from millrace.protocol.env_spec import EnvSpec, PickledCallable
 from millrace.protocol.envs.description import DescribedEnv
 from millrace.protocol.envs.spaces import leaves_with_own_dtype
 from millrace.protocol.errors import EnvironmentFailed, UsageError, safe_repr
-from millrace.protocol.specs import Leaf, StepSpec, WaitSpec
+from millrace.protocol.specs import Leaf, SessionTerms, StepSpec, WaitSpec
 from millrace.protocol.wire.codec import check_can_be_sent
 
 
@@ -53,7 +53,7 @@ class RequestedCopies:
     """the number of copies of each lane"""
     autoreset: Literal["NextStep", "SameStep", "Disabled"]
     render_mode: str | None
-    call_timeouts: CallTimeouts
+    terms: SessionTerms
     learner_timeout_s: float
     evaluation_copies: int
     """the number of evaluation copies, which are the last ones"""
@@ -66,7 +66,7 @@ class RequestedCopies:
     @property
     def wait(self) -> WaitSpec:
         """The spec that is sent to workers that join before the spaces of the copies are known."""
-        return WaitSpec(self.call_timeouts, learner_timeout_s=self.learner_timeout_s)
+        return WaitSpec(learner_timeout_s=self.learner_timeout_s, **asdict(self.terms))
 
     def description(self, env: DescribedEnv) -> VectorEnvDescription:
         """The vector environment of these copies. Raises `UsageError` for spaces that are not supported."""
@@ -78,10 +78,10 @@ class RequestedCopies:
             action=_action_leaves(env.action_space),
             autoreset=self.autoreset,
             render_mode=self.render_mode,
-            call_timeouts=self.call_timeouts,
             learner_timeout_s=self.learner_timeout_s,
             evaluation_copies=self.evaluation_copies,
             seats=env.seats,
+            **asdict(self.terms),
         )
         check_can_be_sent(self.envs[0].id, step)
         metadata = {**env.metadata, "autoreset_mode": AutoresetMode(step.autoreset)}
@@ -121,7 +121,7 @@ def requested_copies(settings: VectorEnvSettings, learner_timeout_s: float = mat
         lanes=settings.lane_sizes,
         autoreset=_autoreset_mode(settings.autoreset_mode),
         render_mode=settings.render_mode,
-        call_timeouts=settings.call_timeouts,
+        terms=settings.terms,
         learner_timeout_s=learner_timeout_s,
         evaluation_copies=N if settings.evaluates else settings.single_lanes,
     )

@@ -21,6 +21,7 @@ from millrace.learner.config.rollout_config import RolloutConfig
 from millrace.learner.run_folder import run_folder
 from millrace.protocol import errors
 from millrace.protocol.errors import UserFacingError
+from millrace.protocol.specs import SessionTerms
 from tests.extras.datasets.test_cloning import CONTINUOUS, DISCRETE, cloned, episodes_of, made
 from website import commands_page, python_page, settings_page
 from website.doctest_fences import with_fences
@@ -75,7 +76,8 @@ def logged(which: str) -> tuple[set[str], set[str]]:
         **sizes,
         **RUNS[which],
     }
-    often = mock.patch.object(RolloutConfig, "heartbeat_s", return_value=0.05)  # the figures of workers come with heartbeats
+    terms = SessionTerms(heartbeat_s=0.05)  # the figures of workers come with heartbeats
+    often = mock.patch.object(RolloutConfig, "terms", return_value=terms)
     with tempfile.TemporaryDirectory() as folder, often:
         run = millrace.train(**chosen, run_dir=folder, progress=False, callbacks=[Log()])
         rows = [json.loads(line) for line in (run.path / "metrics.jsonl").read_text().splitlines()]

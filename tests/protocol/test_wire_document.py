@@ -249,21 +249,22 @@ def _limit(value: ast.expr) -> int:
 
 
 def fields_of(kind: type) -> list[tuple[str, str, str, str]]:
-    """Name, type, default and meaning of each field, as they are written."""
-    rows: list[tuple[str, str, str]] = []
-    body = class_of(kind).body
-    for node, after in zip(body, [*body[1:], None], strict=True):
+    """Name, type, default and meaning of each field, as they are written in the class or in its base."""
+    bases = [base for base in kind.__bases__ if base is not msgspec.Struct]
+    bodies = [class_of(each).body for each in (kind, *bases)]
+    written: dict[str, tuple[str, str]] = {}
+    for node, after in (pair for body in bodies for pair in zip(body, [*body[1:], None], strict=True)):
         if not isinstance(node, ast.AnnAssign) or not isinstance(node.target, ast.Name):
             continue
         meaning = ""
         if isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant) and isinstance(after.value.value, str):
             meaning = after.value.value
-        rows.append((node.target.id, in_words(node.annotation), meaning))
+        written[node.target.id] = in_words(node.annotation), meaning
     fields = msgspec.structs.fields(kind)
-    assert [row[0] for row in rows] == [field.name for field in fields]
+    assert list(written) == [field.name for field in fields]
     return [
-        (field.encode_name, row[1], "" if field.required else default_of(field), row[2])
-        for field, row in zip(fields, rows, strict=True)
+        (field.encode_name, of_type, "" if field.required else default_of(field), meaning)
+        for field, (of_type, meaning) in zip(fields, written.values(), strict=True)
     ]
 
 

@@ -4,8 +4,8 @@ Rule: only one thread at a time uses the link and the session. The first thread 
 it runs the environment's code; during that time, the second thread acquires it now and then.
 
 This file determines only how often the second thread checks whether a Heartbeat is due. `Session.heartbeat_if_due`
-(session.py) determines when one is due. The interval between two Heartbeats is `RolloutConfig.heartbeat_s`
-(learner/config/rollout_config.py) for a run, and `HEARTBEAT_S` (protocol/specs.py) for a vector environment.
+(session.py) determines when one is due. The interval between two Heartbeats is `SessionTerms.heartbeat_s`
+(protocol/specs.py).
 """
 
 from __future__ import annotations

@@ -21,6 +21,7 @@ from millrace.learner.policy_player import SavedPolicy
 from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan
 from millrace.learner.run_folder.metrics_log import read_rows
 from millrace.protocol.errors import EnvironmentFailed, UserFacingError
+from millrace.protocol.specs import SessionTerms
 from tests.support.gymnasium_versions import CLIFF
 from tests.support.in_process.collectors import TOY, random_weights, run_of
 from tests.system.stage.processes import START_S, Stage, crowding, wait_for
@@ -103,7 +104,8 @@ def test_the_evaluation_after_a_short_run_is_small_and_says_so(tmp_path: Path, c
 def test_a_run_reports_the_same_evaluation_whatever_the_number_of_workers(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(RolloutConfig, "heartbeat_s", lambda self: 0.05)  # the figures of workers come with heartbeats
+    often = SessionTerms(heartbeat_s=0.05)  # the figures of workers come with heartbeats
+    monkeypatch.setattr(RolloutConfig, "terms", lambda self: often)
     settings: dict[str, Any] = {
         "steps": 3_000, "eval_every": 1_000, "eval_episodes": 10, "seed": 3, "n_epochs": 2,
     }  # fmt: skip
