@@ -21,7 +21,6 @@ from typing import Generic
 
 from millrace.learner.members.events import Event, WorkerStartFailed
 from millrace.learner.members.member import Member
-from millrace.learner.members.member_states import MemberState, SentUnusable
 from millrace.learner.members.membership import Answered, M, Membership, Outgoing
 from millrace.protocol.alive import StartFailed
 from millrace.protocol.bounds import one_line
@@ -125,14 +124,14 @@ class Coordinator(ABC, Generic[M]):
 
     def _unusable(self, member: M, why: str) -> list[Outgoing]:
         """Handle a member's message that could not be used."""
-        return self.membership.refuse(member, SentUnusable, why)
+        return self.membership.refuse(member, why)
 
     # ---------------------------------------------------------------- inside
 
     def _heartbeat(self, member: M, heartbeat: Heartbeat) -> list[Outgoing]:
         """Send lost messages again, then the reply."""
         lost = member.record_heartbeat(heartbeat)
-        if member.state is MemberState.DRAINING:
+        if member.draining:
             return [(member.peer, Drain(one_line(self.membership.draining or "")))]  # rule DRAIN_AGAIN
         out = self.membership.welcome_again(member, heartbeat)
         out += self._again(member, heartbeat, lost)

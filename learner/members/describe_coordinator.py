@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 from millrace.learner.members.coordinator import Coordinator
 from millrace.learner.members.member import Member
-from millrace.learner.members.membership import MAX_MEMBERS, Membership, Outgoing
+from millrace.learner.members.membership import MAX_MEMBERS, Gone, Membership, Outgoing
 from millrace.protocol.alive import NO_SLOT
 from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.envs.description import DescribedEnv, read_description
@@ -85,7 +85,7 @@ class DescribeCoordinator(Coordinator[Member]):
 
     # ---------------------------------------------------------------- inside
 
-    def _removed(self, member: Member, why: str) -> None:
+    def _removed(self, member: Member, gone: Gone) -> None:
         if self._tickets in member.tickets:
             self._double()
 
@@ -132,9 +132,9 @@ class DescribeCoordinator(Coordinator[Member]):
             described = read_description(message.description)
             self._unknown.accept(described)
         except BadMessage as error:
-            return self._unsuitable(member, Described, f"its description of the environment: {error}")
+            return self._unsuitable(member, f"its description of the environment: {error}")
         except UsageError as error:
-            return self._unsuitable(member, Described, str(error))
+            return self._unsuitable(member, str(error))
         self.described = described
         return []
 
@@ -143,11 +143,11 @@ class DescribeCoordinator(Coordinator[Member]):
         if must_leave or self.described is not None or _was_not_asked(member):
             self.membership.leave(member, reason)
             return []
-        return self._unsuitable(member, Goodbye, reason)
+        return self._unsuitable(member, reason)
 
-    def _unsuitable(self, member: Member, event: type, reason: str) -> list[Outgoing]:
+    def _unsuitable(self, member: Member, reason: str) -> list[Outgoing]:
         """Refuse a worker whose environment the run cannot use."""
-        refusal = self.membership.refuse(member, event, reason)
+        refusal = self.membership.refuse(member, reason)
         if self._decliners_to_end:
             self._decliners.add(member.hello.worker)
             if len(self._decliners) >= self._decliners_to_end:

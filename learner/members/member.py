@@ -11,7 +11,6 @@ from dataclasses import dataclass, field
 
 import msgspec
 
-from millrace.learner.members.member_states import MemberState
 from millrace.protocol.bounds import Stages
 from millrace.protocol.call_timeouts import OUR_CODE
 from millrace.protocol.messages import Heartbeat, Hello, WorkerActivity, WorkerStatus
@@ -77,7 +76,8 @@ class Member:
     """Time when the worker joined."""
     takeovers: int = 0
     """How many times in a row another process has taken this name from a live process."""
-    state: MemberState = MemberState.ACTIVE
+    draining: bool = False
+    """Whether the learner has asked it to leave."""
     lanes: set[int] = field(default_factory=set)
     tickets: dict[int, int] = field(default_factory=dict)
     """The tickets that the worker holds, each with the value of `replies` when the ticket was last sent."""
@@ -101,10 +101,6 @@ class Member:
     """What the worker is doing, according to its supervisor's last statement."""
     activity_s: float = 0.0
     """Time of the supervisor's last statement."""
-    failed_lane: int | None = None
-    """The lane whose environment failed, if the worker left because of that."""
-    hung: bool = False
-    """Whether its process was ended because a call took too long."""
     in_env_code_s: float = -math.inf
     """Time when the supervisor last reported that the worker was running code of the environment or of a user-written
     policy. Up to that time, the worker doesn't count as silent.
@@ -121,7 +117,7 @@ class Member:
     @property
     def role(self) -> str:
         """The worker's role: draining, evaluating (it only evaluates), active (it has lanes), or spare (it has none)."""
-        if self.state is MemberState.DRAINING:
+        if self.draining:
             return "draining"
         return "evaluating" if self.hello.evaluates else "active" if self.lanes else "spare"
 

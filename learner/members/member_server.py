@@ -44,7 +44,6 @@ from millrace.learner.members.join_limiter import JoinLimiter
 from millrace.learner.members.key_revocation import KeyRevocation
 from millrace.learner.members.member import Member
 from millrace.learner.members.member_log import MemberLog
-from millrace.learner.members.member_states import SentUnusable
 from millrace.learner.members.membership import Membership, Outgoing
 from millrace.learner.members.worker_processes import WorkerProcesses
 from millrace.protocol.address import advertised_address, name_for_people
@@ -303,7 +302,7 @@ class MemberServer:
         if self.unexpected_errors == 1:
             log.error("%r: %s; please report it", name_for_people(peer), line, exc_info=error)
         member = self._membership.members.get(peer)
-        return [(peer, Refuse(line))] if member is None else self._membership.refuse(member, SentUnusable, line)
+        return [(peer, Refuse(line))] if member is None else self._membership.refuse(member, line)
 
     def _status_frames(self, now: float) -> Sequence[Buffer]:
         """The frames of a status, which are reused for `STATUS_SHARE` times as long as they took to compute."""

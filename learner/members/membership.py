@@ -17,7 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Generic, TypeVar
+from typing import Generic, NamedTuple, TypeVar
 
 from millrace.learner.members.events import (
     EnvironmentRaised,
@@ -32,7 +32,6 @@ from millrace.learner.members.events import (
     WorkerToldToRejoin,
 )
 from millrace.learner.members.member import Member, SharingSupervisor
-from millrace.learner.members.member_states import TABLE, KeyRevoked, MemberState, TimedOut
 from millrace.protocol.address import key_of_peer, name_for_people, worker_name
 from millrace.protocol.bounds import Stage, Stages, escaped, one_line
 from millrace.protocol.messages import (
@@ -75,6 +74,21 @@ class Answered:
     """Whether a worker joined or members were removed. If so, work may have to be dealt."""
 
 
+class Gone(NamedTuple):
+    """How a membership ended."""
+
+    why: str
+    """The reason, as the words after the worker's name."""
+    on_purpose: bool = False
+    """Whether the worker said Goodbye."""
+    refusal: str | None = None
+    """The reason that is sent to the worker, if it is refused."""
+    failed_lane: int | None = None
+    """The lane whose environment failed, if the worker reported this as a Failure."""
+    hung: bool = False
+    """Whether its process was ended because a call took too long."""
+
+
 M = TypeVar("M", bound=Member)
 K = TypeVar("K")
 V = TypeVar("V")
@@ -87,11 +101,12 @@ class Membership(Generic[M]):
         self,
         run: WaitSpec | RunSpec | StepSpec,
         member_class: type[M],
-        on_removed: Callable[[M, str], None],
+        on_removed: Callable[[M, Gone], None],
         first_session: int,
         is_spare: Callable[[M], bool] = lambda member: False,
     ) -> None:
-        """`on_removed` is called with each member that was removed, and why. It must take back the work of that member.
+        """`on_removed` is called with each member that was removed, and how its membership ended. It must take back the
+        member's work.
 
         `is_spare` says whether the run doesn't need a member, so that its failures don't count.
         """
@@ -119,7 +134,7 @@ class Membership(Generic[M]):
 
     def active(self) -> list[M]:
         """The members that may be given work, in the order in which they joined."""
-        return [each for each in self.members.values() if each.state is MemberState.ACTIVE and not each.describes]
+        return [each for each in self.members.values() if not (each.draining or each.describes)]
 
     def collectors(self) -> list[M]:
         """The members that may have lanes."""
@@ -196,7 +211,7 @@ class Membership(Generic[M]):
                 why = f"another process, on {hello.host}, joined as {hello.worker}; give each worker a name of its own"
                 self._remember_refusal(earlier, why)
             # rule LATER_HELLO
-            self.remove(earlier, TimedOut, "began again" if same_process else f"replaced by process {hello.pid}")
+            self.remove(earlier, Gone("began again" if same_process else f"replaced by process {hello.pid}"))
         member = self._member_class(peer, hello, self._next_session, self._joins, now, joined_s=now, takeovers=takeovers)
         self._next_session += 1
         self._joins += 1
@@ -230,16 +245,16 @@ class Membership(Generic[M]):
 
     def leave(self, member: M, reason: str) -> None:
         """Remove a member that said Goodbye."""
-        self.remove(member, Goodbye, f"left: {reason}")
+        self.remove(member, Gone(f"left: {reason}", on_purpose=True))
 
-    def refuse(self, member: M, event: type, why: str) -> list[Outgoing]:
+    def refuse(self, member: M, why: str) -> list[Outgoing]:
         """Remove a member, and refuse its process from now on."""
         self._remember_refusal(member, why)
-        return self._refuse_and_remove(member, event, f"refused: {why}", why)
+        return self._refuse_and_remove(member, f"refused: {why}", why)
 
     def revoke(self, peer: bytes, why: str) -> list[Outgoing]:
         """Remove a member at once, whatever work it has, because its key was revoked."""
-        return self._refuse_and_remove(self.members[peer], KeyRevoked, f"was shut out: {why}", why)
+        return self._refuse_and_remove(self.members[peer], f"was shut out: {why}", why)
 
     def hear_supervisor(self, peer: bytes, alive: Alive, now: float) -> tuple[list[Outgoing], list[WorkerExit]]:
         """Record a supervisor's statements about members.
@@ -284,12 +299,11 @@ class Membership(Generic[M]):
         reason = worker_exit.reason
         member = self._of_process.get((worker, worker_exit.process_nonce))
         if member is not None and (key is None or key == key_of_peer(member.peer)):
-            member.hung = worker_exit.hung
             if worker_exit.failed:
                 by_policy = worker_exit.of_policy and self.has_policy_code
                 kind = PolicyRaised if by_policy else WorkerProcessFailed
                 self.events.append(self._failed(kind, member, f"its process {reason}"))
-            self.remove(member, TimedOut, reason)
+            self.remove(member, Gone(reason, hung=worker_exit.hung))
             return True
         if self._removed_for_silence.get(worker) == worker_exit.process_nonce:  # this explains why it was silent
             del self._removed_for_silence[worker]
@@ -303,30 +317,29 @@ class Membership(Generic[M]):
         silent = [member for member in self.members.values() if now - member.alive_s > timeout_s]
         for member in silent:
             _remember(self._removed_for_silence, member.hello.worker, member.hello.process_nonce)
-            self.remove(member, TimedOut, f"silent for {timeout_s:.0f} s")
+            self.remove(member, Gone(f"silent for {timeout_s:.0f} s"))
         self._none_silent_before_s = min((member.alive_s for member in self.members.values()), default=now) + timeout_s
         return silent
 
-    def remove(self, member: M, event: type, why: str, refusal: str | None = None) -> None:
-        """Remove a member. If the member is refused, `refusal` is the reason that is sent to it."""
-        member.state = TABLE[member.state][event]
+    def remove(self, member: M, gone: Gone) -> None:
+        """Remove a member. Nothing is sent to it."""
         del self.members[member.peer]
         _add(self._stages_of_left, member.stages())
         self._of_process.pop((member.hello.worker, member.hello.process_nonce), None)
         worker = member.hello.worker
         tickets = len(member.tickets)
-        left = WorkerLeft(worker, why, tickets, event is Goodbye)
-        self.events.append(left if refusal is None else WorkerRefused(worker, refusal, tickets))
-        self._on_removed(member, why)
+        left = WorkerLeft(worker, gone.why, tickets, gone.on_purpose)
+        self.events.append(left if gone.refusal is None else WorkerRefused(worker, gone.refusal, tickets))
+        self._on_removed(member, gone)
 
     def drain(self, reason: str) -> list[Outgoing]:
         """Ask every member to leave. From now on, nobody can join."""
         self.draining = reason
         out: list[Outgoing] = []
         for member in self.members.values():
-            if member.state is not MemberState.ACTIVE:
+            if member.draining:
                 continue
-            member.state = TABLE[member.state][Drain]
+            member.draining = True
             out.append((member.peer, Drain(one_line(reason))))
         return out
 
@@ -355,8 +368,7 @@ class Membership(Generic[M]):
         by_policy = failure.of_policy and self.has_policy_code
         kind = PolicyRaised if by_policy else EnvironmentRaised
         self.events.append(self._failed(kind, member, failure.error, failure.traceback, failure.lane))
-        member.failed_lane = failure.lane
-        self.remove(member, Failure, "failed")
+        self.remove(member, Gone("failed", failed_lane=failure.lane))
 
     def _failed(self, kind: type[Failed], member: M, error: str, traceback: str = "", lane: int | None = None) -> Failed:
         """The event of a member's failure: in `lane` if the member has this lane, otherwise in all of its lanes."""
@@ -374,8 +386,8 @@ class Membership(Generic[M]):
         member.welcomed = member.replies
         return member.peer, Welcome(member.session, member.hello.attempt, self._run)
 
-    def _refuse_and_remove(self, member: M, event: type, why: str, refusal: str) -> list[Outgoing]:
-        self.remove(member, event, why, refusal)
+    def _refuse_and_remove(self, member: M, why: str, refusal: str) -> list[Outgoing]:
+        self.remove(member, Gone(why, refusal=refusal))
         return [(member.peer, Refuse(one_line(refusal)))]
 
     def _remember_refusal(self, member: M, why: str) -> None:

@@ -13,7 +13,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from millrace.learner.members.member import Member
-from millrace.learner.members.membership import Outgoing
+from millrace.learner.members.membership import Gone, Outgoing
 from millrace.learner.rollouts.lag_rule import Rounds
 from millrace.learner.rollouts.lane_history import LaneHistories
 from millrace.learner.rollouts.lanes import TakenRollouts, Ticket, TicketedLane
@@ -217,11 +217,11 @@ class RolloutDealer:
         before = max(self._steps_before, self._first_round * rollout_steps)
         return before + (last + 1 - self._first_round) * rollout_steps
 
-    def worker_lost(self, member: Member) -> None:
+    def worker_lost(self, member: Member, gone: Gone) -> None:
         """Count the failures and losses of a lost member's lanes. Lanes that fail too often aren't replayed."""
         for number in member.lanes:
             lane = self.lanes[number]
-            failed = number == member.failed_lane or (member.hung and bool(lane.outstanding))
+            failed = number == gone.failed_lane or (gone.hung and bool(lane.outstanding))
             if failed or lane.outstanding:
                 lane.lost(failed=failed)
 

@@ -19,8 +19,7 @@ from millrace.learner.members.coordinator import Coordinator
 from millrace.learner.members.events import EnvironmentNoted, EpisodesArrived, LaneContinued, RolloutArrived, RolloutRejected
 from millrace.learner.members.lane_placement import LanePlacement, is_spare
 from millrace.learner.members.member import Member
-from millrace.learner.members.member_states import SentUnusable
-from millrace.learner.members.membership import Answered, Membership, Outgoing
+from millrace.learner.members.membership import Answered, Gone, Membership, Outgoing
 from millrace.learner.rollouts.collecting_member import CollectingMember
 from millrace.learner.rollouts.evaluation_dealer import EvaluationDealer, EvaluationPlan, OnRows
 from millrace.learner.rollouts.past_rollouts import PastRollouts, RoundsState
@@ -86,7 +85,7 @@ class TicketCoordinator(Coordinator[CollectingMember]):
 
     def refuse(self, member: CollectingMember, why: str) -> list[Outgoing]:
         """Refuse a worker that holds tickets without working on them, and deal its tickets again."""
-        return self.membership.refuse(member, SentUnusable, why) + self._deal()
+        return self.membership.refuse(member, why) + self._deal()
 
     # ---------------------------------------------------------------- the learner's side
 
@@ -277,9 +276,9 @@ class TicketCoordinator(Coordinator[CollectingMember]):
     def _received(self, member: CollectingMember) -> tuple[Received, ...]:
         return self.rollouts.received(member)
 
-    def _removed(self, member: CollectingMember, why: str) -> None:
+    def _removed(self, member: CollectingMember, gone: Gone) -> None:
         """Count a lost worker's tickets as lost, and take away its lanes, so that `_deal` gives both to other workers."""
-        self.rollouts.worker_lost(member)
+        self.rollouts.worker_lost(member, gone)
         for number in list(member.tickets):
             dealer = self.rollouts if number in self.rollouts.held else self.evaluation
             dealer.lose(member, number)

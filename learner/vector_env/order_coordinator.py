@@ -17,8 +17,7 @@ from dataclasses import dataclass
 from millrace.learner.members.coordinator import Coordinator
 from millrace.learner.members.lane_placement import LanePlacement, PlacedLane, is_spare
 from millrace.learner.members.member import Member
-from millrace.learner.members.member_states import TimedOut
-from millrace.learner.members.membership import Membership, Outgoing
+from millrace.learner.members.membership import Gone, Membership, Outgoing
 from millrace.protocol.errors import BadMessage
 from millrace.protocol.messages import (
     Answer,
@@ -81,7 +80,7 @@ class OrderCoordinator(Coordinator[Member]):
 
         A worker with the same name but another key stays.
         """
-        self.membership.remove(member, TimedOut, why)
+        self.membership.remove(member, Gone(why))
         return []
 
     # ---------------------------------------------------------------- the vector environment's side
@@ -169,12 +168,12 @@ class OrderCoordinator(Coordinator[Member]):
     def _received(self, member: Member) -> tuple[Received, ...]:
         return tuple(Received(lane, self.lanes[lane].incarnation, 0) for lane in sorted(member.lanes))
 
-    def _removed(self, member: Member, why: str) -> None:
+    def _removed(self, member: Member, gone: Gone) -> None:
         for ticket in member.tickets:
             del self.orders[ticket]
         for lane in member.lanes:
             if self.lanes[lane].started:
-                self.lost[lane] = f"worker {member.hello.worker} ({member.hello.host}) {why}"
+                self.lost[lane] = f"worker {member.hello.worker} ({member.hello.host}) {gone.why}"
         self._placement.removed(member)
 
 

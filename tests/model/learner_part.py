@@ -66,9 +66,7 @@ NOT_SAVED: dict[type, set[str]] = {
     | {"_first_session", "_removed_for_silence", "_stages_of_left"},
     CollectingMember: {
         "joined_s",
-        "hung",
-        "failed_lane",
-        "state",
+        "draining",
         "heartbeat",
         "stages_before",
         "activity",

@@ -22,7 +22,6 @@ import numpy as np
 import pytest
 
 from millrace.learner.members import join_limiter, membership
-from millrace.learner.members import member_states as standing
 from millrace.learner.rollouts import ticket_coordinator
 from millrace.protocol import (
     bounds,
@@ -432,7 +431,6 @@ PARTS = {
     "dtypes": part_dtypes,
     "messages": part_messages,
     "worker table": lambda: state_table(worker_states.TABLE),
-    "learner table": lambda: state_table(standing.TABLE),
     "limits": part_limits,
 }
 
@@ -519,15 +517,12 @@ def test_every_limit_is_in_the_document() -> None:
 
 def test_every_state_has_a_row_in_its_table() -> None:
     assert set(worker_states.TABLE) == set(worker_states.WorkerState)
-    assert set(standing.TABLE) == set(standing.MemberState)
 
 
 def test_a_worker_is_told_by_its_table_what_to_do_with_every_message() -> None:
-    """Every message to a worker is heeded in some state, and every message to a learner in some standing."""
+    """Every message to a worker is heeded in some state."""
     heeded = {event for row in worker_states.TABLE.values() for event in row if is_message(event)}
     assert heeded == set(ToWorker.__args__)
-    heard = {event for row in standing.TABLE.values() for event in row if is_message(event)}
-    assert heard - {messages.Drain} == set(ToLearner.__args__)
 
 
 def test_a_difference_is_noticed() -> None:

@@ -17,8 +17,7 @@ from gymnasium import spaces
 from millrace.learner.members.describe_coordinator import FIRST_TICKET, Accept, DescribeCoordinator, Unknown, accept_any
 from millrace.learner.members.events import EnvironmentRaised, Failed, WorkerJoined, WorkerProcessFailed
 from millrace.learner.members.lobby import Lobby, LobbySettings
-from millrace.learner.members.member_states import TimedOut
-from millrace.learner.members.membership import Outgoing
+from millrace.learner.members.membership import Gone, Outgoing
 from millrace.learner.members.worker_processes import WorkerProcesses
 from millrace.learner.rollouts.lag_rule import Rounds
 from millrace.learner.rollouts.rollout_dealer import RolloutDealer
@@ -133,7 +132,7 @@ def test_a_worker_that_only_evaluates_describes_if_no_other_is_there() -> None:
     made.receive(B, hello(B), 0.0)
     ((peer, _),) = made.ask(Unknown(ENV))
     assert peer == B
-    made.membership.remove(made.members[B], TimedOut, "left")
+    made.membership.remove(made.members[B], Gone("left"))
     ((peer, _),) = made.ask_more()
     assert peer == A
 

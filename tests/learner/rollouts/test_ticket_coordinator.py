@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TypeVar
+from typing import Literal, TypeVar
 
 import msgspec
 import numpy as np
@@ -23,7 +23,6 @@ from millrace.learner.members.events import (
     WorkerRefused,
     describe,
 )
-from millrace.learner.members.member_states import TABLE, MemberState, SentUnusable, TimedOut
 from millrace.learner.members.membership import Outgoing
 from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan
 from millrace.learner.rollouts.lag_rule import Rounds
@@ -57,6 +56,7 @@ from millrace.protocol.messages import (
     ToLearner,
     Weights,
     Welcome,
+    WorkerExit,
 )
 from millrace.protocol.rollout import Episode
 from millrace.protocol.specs import OwnPolicySpec
@@ -1293,45 +1293,81 @@ def test_a_rollout_continues_only_one_of_its_own_incarnation() -> None:
     assert [bool(fresh) for fresh in used] == [True, False, True, False]
 
 
-# -------------------------------------------------------------------- the table
+# -------------------------------------------------------------------- how a worker stands with the learner
+
+Standing = Literal["unknown", "active", "draining"]
 
 
-def standing_of(learner: Learner, peer: bytes) -> MemberState:
+def standing_of(learner: Learner, peer: bytes) -> Standing:
     member = learner.coordinator.members.get(peer)
-    return MemberState.UNKNOWN if member is None else member.state
+    return "unknown" if member is None else "draining" if member.draining else "active"
 
 
-def in_standing(standing: MemberState) -> Learner:
+def in_standing(standing: Standing) -> Learner:
     learner = Learner(lanes=1)
-    if standing is not MemberState.UNKNOWN:
+    if standing != "unknown":
         learner.joins(A)
-    if standing is MemberState.DRAINING:
+    if standing == "draining":
         learner.coordinator.drain("finished")
-    assert standing_of(learner, A) is standing
+    assert standing_of(learner, A) == standing
     return learner
 
 
 EVERY_MESSAGE = to_learner(100, "a", 1001)
+CHANGES: dict[Standing, dict[type, Standing]] = {
+    "unknown": {Hello: "active"},
+    "active": {Goodbye: "unknown", Failure: "unknown"},
+    "draining": {Goodbye: "unknown", Failure: "unknown"},
+}
 
 
-@pytest.mark.parametrize("standing", MemberState)
+@pytest.mark.parametrize("standing", CHANGES)
 @pytest.mark.parametrize("message", EVERY_MESSAGE, ids=lambda message: type(message).__name__)
-def test_the_table_names_the_standing_that_follows(standing: MemberState, message: ToLearner) -> None:
+def test_a_worker_joins_with_a_hello_and_leaves_with_a_goodbye_or_a_failure(standing: Standing, message: ToLearner) -> None:
     learner = in_standing(standing)
     learner.says(A, message)
-    assert standing_of(learner, A) is TABLE[standing].get(type(message), standing)
+    assert standing_of(learner, A) == CHANGES[standing].get(type(message), standing)
 
 
-@pytest.mark.parametrize("standing", [MemberState.ACTIVE, MemberState.DRAINING])
-@pytest.mark.parametrize("event", [TimedOut, SentUnusable])
-def test_the_table_names_the_standing_that_follows_an_event(standing: MemberState, event: type) -> None:
+@pytest.mark.parametrize("standing", ["active", "draining"])
+@pytest.mark.parametrize("ends", ["silent", "sent rubbish", "key revoked", "process ended"])
+def test_a_membership_ends_in_every_standing(standing: Standing, ends: str) -> None:
     learner = in_standing(standing)
-    if event is TimedOut:
-        learner.coordinator.remove_silent(1e6)
-    else:
-        for _ in range(STRIKES):
-            learner.coordinator.reject_message(A, "rubbish", 0.0)
-    assert standing_of(learner, A) is TABLE[standing][event] is MemberState.UNKNOWN
+    match ends:
+        case "silent":
+            learner.coordinator.remove_silent(1e6)
+        case "sent rubbish":
+            for _ in range(STRIKES):
+                learner.coordinator.reject_message(A, "rubbish", 0.0)
+        case "key revoked":
+            learner.coordinator.revoke(A, "its key was revoked")
+        case "process ended":
+            nonce = learner.coordinator.members[A].hello.process_nonce
+            learner.coordinator.process_ended(WorkerExit("a", nonce, "was killed by SIGKILL", failed=True))
+    assert standing_of(learner, A) == "unknown"
+
+
+@pytest.mark.parametrize(
+    ("how", "failures", "losses"),
+    [("silent", [0, 0], [1, 1]), ("failed in lane 1", [0, 1], [1, 0]), ("killed", [0, 0], [1, 1]), ("hung", [1, 1], [0, 0])],
+)
+def test_how_a_worker_was_lost_decides_in_which_of_its_lanes_the_environment_counts_as_failed(
+    how: str, failures: list[int], losses: list[int]
+) -> None:
+    learner = Learner(lanes=2)
+    learner.joins(A)
+    member = learner.coordinator.members[A]
+    match how:
+        case "silent":
+            learner.coordinator.remove_silent(1e6)
+        case "failed in lane 1":
+            learner.says(A, example(Failure, session=member.session, lane=1))
+        case _:
+            nonce = member.hello.process_nonce
+            learner.coordinator.process_ended(WorkerExit("a", nonce, "was ended", failed=True, hung=how == "hung"))
+    lanes = learner.coordinator.rollouts.lanes
+    assert [lane.failures for lane in lanes] == failures
+    assert [lane.losses for lane in lanes] == losses
 
 
 def test_why_one_was_silent_is_told_once_it_is_known() -> None:
