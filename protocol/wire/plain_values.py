@@ -33,6 +33,7 @@ NUMBER_KINDS = "biuf"
 NUMPY_PROTOCOL = ("__array__", "__array_interface__", "__array_struct__")
 MAX_DEPTH = 32
 MAX_REPR = 1000  # characters
+MAX_DTYPE = 40  # characters of numpy's name of a dtype
 
 
 class _Code(IntEnum):
@@ -46,6 +47,10 @@ class _Code(IntEnum):
     INT = 6
     COMPLEX = 7
     REPR = 8
+
+
+_NOT_MSGPACK = (_Code.INT, _Code.REPR)
+"""Extensions whose payload isn't msgpack."""
 
 
 class ReprString(str):
@@ -213,6 +218,7 @@ def _unpack(data: bytes | memoryview, limit: KeyLimit, depth: int) -> Any:
 
 
 def _check_depth(value: object, depth: int) -> None:
+    """Raise `BadMessage` for too many levels. Visits every path, which is quick because no object occurs in two places."""
     if depth > MAX_DEPTH:
         raise BadMessage(f"plain value: expected at most {MAX_DEPTH} levels, got more")
     match value:
@@ -229,47 +235,46 @@ def _check_depth(value: object, depth: int) -> None:
 
 
 def _from_extension(code: int, data: bytes, limit: KeyLimit, depth: int) -> Any:
-    match code:
-        case _Code.TUPLE:
-            return tuple(_unpack(data, limit, depth))
-        case _Code.PAIRS:
-            keys, values = _unpack(data, limit, depth)
+    match code, data if code in _NOT_MSGPACK else _unpack(data, limit, depth):
+        case _Code.TUPLE, list(items):
+            return tuple(items)
+        case _Code.PAIRS, [list(keys), list(values)]:
             if _too_slow(keys, limit):
                 raise BadMessage(f"plain value: got dicts with {TOO_SLOW}")
             return dict(zip(keys, values, strict=True))
-        case _Code.ARRAY:
-            dtype, shape, raw = _unpack(data, limit, depth)
+        case _Code.ARRAY, [str(dtype), list(shape), bytes(raw)]:
+            return _array(_dtype(dtype), shape, raw)
+        case _Code.SCALAR, [str(dtype), bytes(raw)]:
             kind = _dtype(dtype)
-            if len(raw) != math.prod(shape) * kind.itemsize:
-                raise BadMessage(f"array {dtype}{shape}: expected {math.prod(shape) * kind.itemsize} bytes, got {len(raw)}")
-            if not kind.itemsize:  # numpy would allocate a byte for each element
-                raise BadMessage(f"array {dtype}{shape}: expected elements of a byte or more")
-            _check_characters(raw, kind)
-            return np.frombuffer(raw, kind).reshape(shape).copy() if raw else np.zeros(shape, kind)
-        case _Code.SCALAR:
-            dtype, raw = _unpack(data, limit, depth)
-            kind = _dtype(dtype)
+            if kind.itemsize and len(raw) != kind.itemsize:  # numpy gives an empty text a byte or more
+                raise BadMessage(f"scalar {dtype}: expected {kind.itemsize} bytes, got {len(raw)}")
             _check_characters(raw, kind)
             return np.frombuffer(raw, kind)[0] if kind.itemsize else kind.type()
-        case _Code.OBJECTS:
-            shape, values = _unpack(data, limit, depth)
-            array = np.empty(len(values), object)
-            array[:] = values
-            return array.reshape(shape)
-        case _Code.INT:
-            return int(data)
-        case _Code.COMPLEX:
-            return complex(*_unpack(data, limit, depth))
-        case _Code.REPR:
-            return ReprString(data.decode())
+        case _Code.OBJECTS, [list(shape), list(values)]:
+            return np.fromiter(values, object, len(values)).reshape(shape)  # `array[:] = values` would open inner lists
+        case _Code.COMPLEX, [float() | int() as real, float() | int() as imaginary]:
+            return complex(real, imaginary)
+        case _Code.INT, bytes(digits):
+            return int(digits)
+        case _Code.REPR, bytes(text):
+            return ReprString(text.decode())
         case _:
-            raise BadMessage(f"plain value: expected a known extension, got {code}")
+            raise BadMessage(f"plain value: expected a known extension with its kind of payload, got extension {code}")
 
 
-def _dtype(name: object) -> np.dtype[Any]:
-    kind = np.dtype(str(name))
-    if kind.kind not in DTYPE_KINDS:
-        raise BadMessage(f"array dtype: expected one for plain data, got {str(name)[:20]!r}")
+def _array(kind: np.dtype[Any], shape: list[Any], raw: bytes) -> Any:
+    if len(raw) != math.prod(shape) * kind.itemsize:
+        raise BadMessage(f"array {kind.str}{shape}: expected {math.prod(shape) * kind.itemsize} bytes, got {len(raw)}")
+    if not kind.itemsize:  # numpy would allocate a byte for each element
+        raise BadMessage(f"array {kind.str}{shape}: expected elements of a byte or more")
+    _check_characters(raw, kind)
+    return np.frombuffer(raw, kind).reshape(shape).copy() if raw else np.zeros(shape, kind)
+
+
+def _dtype(name: str) -> np.dtype[Any]:
+    kind = np.dtype(name) if len(name) <= MAX_DTYPE else None
+    if kind is None or kind.kind not in DTYPE_KINDS:
+        raise BadMessage(f"array dtype: expected one for plain data, got {name[:20]!r}")
     return kind
 
 

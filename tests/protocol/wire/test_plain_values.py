@@ -349,6 +349,66 @@ def test_spoiled_bytes_raise_one_error(value: Any, at: int, byte: int) -> None:
         unpack(bytes(data))
 
 
+def extension(code: int, payload: object) -> msgpack.ExtType:
+    return msgpack.ExtType(code, msgpack.packb(payload))
+
+
+def in_two_places(value: object, code: int) -> bytes:
+    """Three levels, each of which a careless reader would put into several places: 10 times an item, once a text key."""
+    for _ in range(3):
+        many = {str(n): None for n in range(9)} | {"inside": value}
+        value = extension(code, [[10], many] if code == OBJECTS else many)
+    packed: bytes = msgpack.packb(value)
+    return packed
+
+
+TUPLE, PAIRS, ARRAY, SCALAR, OBJECTS, COMPLEX = 1, 2, 3, 4, 5, 7
+
+
+@pytest.mark.parametrize(
+    "packed",
+    [
+        in_two_places(None, OBJECTS),
+        in_two_places(None, TUPLE),
+        *(
+            msgpack.packb(extension(code, payload))
+            for code, payload in [
+                (OBJECTS, [[3], "abc"]),
+                (OBJECTS, [[3], b"abc"]),
+                (OBJECTS, [[1], extension(TUPLE, [1])]),
+                (TUPLE, "abc"),
+                (TUPLE, b"abc"),
+                (PAIRS, ["abc", [1, 2, 3]]),
+                (PAIRS, [[1, 2, 3], "abc"]),
+                (PAIRS, [{1: None}, {2: None}]),
+                (PAIRS, {"a": 1, "b": 2}),
+                (COMPLEX, "12"),
+                (COMPLEX, ["1", 2.0]),
+                (COMPLEX, [extension(COMPLEX, [1.0, 2.0]), 1.0]),
+                (SCALAR, ["<i8", [0] * 8]),
+                (SCALAR, ["<i8", bytes(16)]),
+                (ARRAY, ["<i8", [1], [0] * 8]),
+                (ARRAY, [["<i8"], [1], bytes(8)]),
+            ]
+        ),
+    ],
+)
+def test_the_parts_of_an_extension_have_the_types_that_a_packer_gives_them(packed: bytes) -> None:
+    """A dict in the place of a list would be every element of an array, and each level of such arrays would multiply the
+    paths that a reader visits.
+    """
+    with pytest.raises(BadMessage):
+        unpack(packed)
+
+
+@pytest.mark.parametrize("items", [[[1], [2]], [[1, 2], [3, 4]], [[5]], [(1, 2)], [np.eye(2), {"a": 1}], [np.float32(1)]])
+def test_an_array_of_objects_may_contain_lists_and_arrays(items: list[Any]) -> None:
+    array = np.empty(len(items), object)
+    for n, item in enumerate(items):
+        array[n] = item
+    assert bit_equal(unpack(pack(array)).tolist(), items)
+
+
 def packed_array(dtype: str, shape: list[int], raw: bytes) -> bytes:
     packed: bytes = msgpack.packb(msgpack.ExtType(3, msgpack.packb([dtype, shape, raw])))
     return packed
