@@ -33,6 +33,8 @@ NUMBER_KINDS = "biuf"
 NUMPY_PROTOCOL = ("__array__", "__array_interface__", "__array_struct__")
 MAX_DEPTH = 32
 MAX_REPR = 1000  # characters
+MAX_DIMENSIONS = 64  # numpy's own limit
+MAX_SIZE = 1 << 48  # of one dimension
 MAX_DTYPE = 40  # characters of numpy's name of a dtype
 
 
@@ -251,6 +253,8 @@ def _from_extension(code: int, data: bytes, limit: KeyLimit, depth: int) -> Any:
             _check_characters(raw, kind)
             return np.frombuffer(raw, kind)[0] if kind.itemsize else kind.type()
         case _Code.OBJECTS, [list(shape), list(values)]:
+            if len(values) != _elements(shape):
+                raise BadMessage(f"array of objects of shape {shape}: got {len(values)} objects")
             return np.fromiter(values, object, len(values)).reshape(shape)  # `array[:] = values` would open inner lists
         case _Code.COMPLEX, [float() | int() as real, float() | int() as imaginary]:
             return complex(real, imaginary)
@@ -263,12 +267,22 @@ def _from_extension(code: int, data: bytes, limit: KeyLimit, depth: int) -> Any:
 
 
 def _array(kind: np.dtype[Any], shape: list[Any], raw: bytes) -> Any:
-    if len(raw) != math.prod(shape) * kind.itemsize:
-        raise BadMessage(f"array {kind.str}{shape}: expected {math.prod(shape) * kind.itemsize} bytes, got {len(raw)}")
     if not kind.itemsize:  # numpy would allocate a byte for each element
-        raise BadMessage(f"array {kind.str}{shape}: expected elements of a byte or more")
+        raise BadMessage(f"array {kind.str}: expected elements of a byte or more")
+    if len(raw) != _elements(shape) * kind.itemsize:
+        raise BadMessage(f"array {kind.str} of shape {shape}: got {len(raw)} bytes")
     _check_characters(raw, kind)
     return np.frombuffer(raw, kind).reshape(shape).copy() if raw else np.zeros(shape, kind)
+
+
+def _elements(shape: list[Any]) -> int:
+    """The number of elements of an array with this shape.
+
+    The dimensions are checked before they are multiplied, because a product of other objects could be of any size.
+    """
+    if len(shape) > MAX_DIMENSIONS or not all(type(size) is int and 0 <= size <= MAX_SIZE for size in shape):
+        raise BadMessage(f"array shape: expected at most {MAX_DIMENSIONS} whole numbers from 0 to {MAX_SIZE}")
+    return math.prod(shape)
 
 
 def _dtype(name: str) -> np.dtype[Any]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import itertools
+import math
 import tracemalloc
 from array import array as buffer
 from collections import OrderedDict, UserString, defaultdict, deque
@@ -23,7 +24,7 @@ from millrace.protocol.bounds import MOST_OTHER_KEYS, MOST_WITH_ONE_HASH
 from millrace.protocol.errors import BadMessage
 from millrace.protocol.key_limit import KeyLimit
 from millrace.protocol.wire import plain_values
-from millrace.protocol.wire.plain_values import MAX_DEPTH, ReprString, pack, repr_paths, unpack
+from millrace.protocol.wire.plain_values import MAX_DEPTH, MAX_DIMENSIONS, ReprString, pack, repr_paths, unpack
 from tests.support.numbers.bit_equality import bit_equal
 
 scalars = hnp.arrays(
@@ -418,6 +419,36 @@ def packed_array(dtype: str, shape: list[int], raw: bytes) -> bytes:
 def test_an_array_cannot_be_larger_than_its_bytes(dtype: str) -> None:
     with pytest.raises(BadMessage, match="expected elements of a byte or more"):
         unpack(packed_array(dtype, [10**12], b""))
+
+
+@pytest.mark.parametrize("code", [ARRAY, OBJECTS])
+@pytest.mark.parametrize(
+    "shape",
+    [
+        [10**6, "x"],  # its product is a text of a million characters
+        [10**6, b"x"],
+        [3, [0]],
+        [1] * (MAX_DIMENSIONS + 1),
+        [2**63, 0],
+        [-1],
+        [-1, -1],
+        [1.0],
+        [True],
+        [None],
+    ],
+)
+def test_a_shape_has_few_and_small_dimensions(code: int, shape: list[Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Python would multiply text, and whole numbers of any length."""
+    monkeypatch.setattr(math, "prod", None)  # so that a call fails
+    packed = msgpack.packb(extension(code, ["|i1", shape, b"\0"] if code == ARRAY else [shape, [None]]))
+    with pytest.raises(BadMessage, match="shape: expected at most 64 whole numbers"):
+        unpack(packed)
+
+
+def test_a_shape_that_does_not_fit_the_content_is_refused() -> None:
+    for packed in (packed_array("|i1", [3], b"\0"), msgpack.packb(extension(OBJECTS, [[3], [None]]))):
+        with pytest.raises(BadMessage, match=r"of shape \[3\]: got 1 "):
+            unpack(packed)
 
 
 @pytest.mark.parametrize("inside", [b"\x91", b"\x81\xa1a"], ids=["lists", "dicts"])
