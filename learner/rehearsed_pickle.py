@@ -29,6 +29,7 @@ ORDERED = "collections OrderedDict"  # the empty dict of a tensor's hooks; also 
 BYTES = "_codecs encode"  # creates a bytes object, whose content the pickle holds as text
 CALLED = REBUILD | {ORDERED, BYTES}
 MOST_KEY = 1 << 60  # limit on the size of a number that is a key; larger numbers may all have the same hash
+MOST_FULL_DICTS = 10  # dicts with as many numbers as keys as one dict may have
 MOST_REPEATED = 1 << 20  # limit on how often a visitor finds an object that it has already found,
 REPEATED_PER_BYTE = 16  # plus this number for each byte of the pickle, because many dicts have the same keys
 TYPES = ("torch ", "torch.storage ")  # prefixes of the names of storage types and dtypes, which aren't called
@@ -72,7 +73,7 @@ def rehearse(content: bytes) -> None:
     marks = list[int]()
     notes = dict[int, _Made]()
     bytes_left = len(content)
-    limit = KeyLimit()
+    limit = KeyLimit(MOST_FULL_DICTS)
     values_left = MOST_REPEATED + REPEATED_PER_BYTE * len(content)
     for opcode, argument, _ in pickletools.genops(content):
         match opcode.name, argument:

@@ -30,7 +30,7 @@ MAX_SAVED_BYTES = 1 << 22  # bytes of one env copy's state, as its environment s
 MAX_SEEDS = 1_024  # seeds in one Evaluate order
 MAX_FACTS = 32  # facts about one episode
 MOST_OTHER_KEYS = 10_000  # keys of one dict that aren't text: anybody can choose such keys so that each hits all others
-MOST_KEYS_SQUARED = 10 * MOST_OTHER_KEYS**2  # sum of these squared numbers over all dicts of a message: under a second
+MOST_KEYS_SQUARED = MOST_OTHER_KEYS**2  # sum of these squared numbers over all dicts of one value: half a second at most
 MOST_WITH_ONE_HASH = 64  # of these keys, those with the same hash: Python compares them, and they can be long
 MOST_FRAMES = 1_500  # frames of one episode that are sent: a minute of video at 25 frames per second
 

@@ -7,11 +7,11 @@ from contextlib import suppress
 from typing import Any
 
 from millrace.learner.vector_env.batch_layout import BatchLayout
-from millrace.learner.vector_env.lane_orders import call_order
+from millrace.learner.vector_env.lane_orders import call_order, packed, packed_each
 from millrace.learner.vector_env.lost_lanes import RESET_ATTEMPTS
 from millrace.learner.vector_env.order_coordinator import MakeOrder
 from millrace.learner.vector_env.send_recv import SendRecv, VectorEnvParts
-from millrace.protocol.bounds import MAX_LINE, one_line
+from millrace.protocol.bounds import MAX_COPIES, MAX_LINE, one_line
 from millrace.protocol.envs.description import DescribedEnv, read_description
 from millrace.protocol.errors import BadMessage, EnvironmentFailed, UsageError, WorkerLost, safe_repr
 from millrace.protocol.messages import DESCRIPTION, Described, Returned
@@ -89,10 +89,8 @@ def call_orders(
     _check_name(name)
     if name in USE_INSTEAD:
         raise ValueError(f"call of {name!r}: use {name}() of the vector environment")
-    return {
-        lane: call_order(chosen, name, (args, kwargs), assign=False)
-        for lane, chosen in layout.by_lane(sorted(copies)).items()
-    }
+    given = packed((args, kwargs))
+    return {lane: call_order(chosen, name, given, assign=False) for lane, chosen in layout.by_lane(sorted(copies)).items()}
 
 
 def assign_orders(layout: BatchLayout, copies: Sequence[int], name: str, values: Sequence[Any]) -> dict[int, MakeOrder]:
@@ -103,7 +101,7 @@ def assign_orders(layout: BatchLayout, copies: Sequence[int], name: str, values:
     _check_name(name)
     by_copy = dict(zip(copies, values, strict=True))
     return {
-        lane: call_order(chosen, name, [by_copy[layout.copies(lane)[n]] for n in chosen], assign=True)
+        lane: call_order(chosen, name, packed_each([by_copy[layout.copies(lane)[n]] for n in chosen]), assign=True)
         for lane, chosen in layout.by_lane(copies).items()
     }
 
@@ -122,7 +120,7 @@ def _results(name: str, answers: Mapping[int, Returned]) -> tuple[Any, ...]:
         answer = answers[lane]
         if answer.error:
             raise _error(name, lane, answer)
-        results += unpack(answer.results.data)
+        results += unpack(answer.results.data, MAX_COPIES)  # `order_coordinator.py` has checked it
     return tuple(results)
 
 
@@ -133,7 +131,7 @@ def _descriptions(answer: Returned, count: int) -> list[DescribedEnv | None]:
     """
     if answer.error:
         return [None] * count
-    sent = unpack(answer.results.data)
+    sent = unpack(answer.results.data, count)
     described = dict[tuple[bytes, ...], DescribedEnv]()
     for frames in sent:
         if not isinstance(frames, list) or not all(type(frame) is bytes for frame in frames):

@@ -69,7 +69,7 @@ def merged(by_row: Mapping[int, Infos], env: VectorEnv[Any, Any, Array], rows: S
 def unpack_infos(packed: bytes, rows: Sequence[int]) -> dict[int, Infos]:
     """Unpack the infos of a lane that has these rows. Returns them by row. Raises `BadMessage` if that is impossible."""
     try:
-        pairs = [(n, info) for n, info in unpack(packed)]
+        pairs = [(n, info) for n, info in unpack(packed, len(rows))]
     except (TypeError, ValueError) as error:
         raise BadMessage(str(error)) from error
     for n, info in pairs:

@@ -7,18 +7,24 @@ lane are known.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
 from millrace.learner.vector_env.order_coordinator import MakeOrder
 from millrace.protocol.arrays import Array, Bytes
 from millrace.protocol.messages import Call, LaneIncarnation, Reset, Step
-from millrace.protocol.wire.plain_values import pack
+from millrace.protocol.wire.plain_values import pack, pack_each
 
 
 def packed(value: object) -> Bytes:
     """A plain value as an array of bytes. Raises `TypeError` if the value isn't plain data."""
     return np.frombuffer(pack(value), np.uint8)
+
+
+def packed_each(values: Sequence[Any]) -> Bytes:
+    """A list with one plain value for each copy, as an array of bytes. Raises `TypeError` if one isn't plain data."""
+    return np.frombuffer(pack_each(values), np.uint8)
 
 
 def reset_order(copies: Sequence[int], seeds: Sequence[int | None], options: Bytes) -> MakeOrder:
@@ -40,11 +46,10 @@ def step_order(actions: Sequence[Array]) -> MakeOrder:
     return make
 
 
-def call_order(copies: Sequence[int], name: str, arguments: object, *, assign: bool) -> MakeOrder:
-    """An order to get, call or assign an attribute of these copies of the lane."""
-    packed_arguments = packed(arguments)
+def call_order(copies: Sequence[int], name: str, given: Bytes, *, assign: bool) -> MakeOrder:
+    """An order to get, call or assign an attribute of these copies of the lane. `given`: packed arguments or values."""
 
     def make(session: int, ticket: int, life: LaneIncarnation) -> Call:
-        return Call(session, ticket, life.lane, life.incarnation, tuple(copies), name, assign, packed_arguments)
+        return Call(session, ticket, life.lane, life.incarnation, tuple(copies), name, assign, given)
 
     return make

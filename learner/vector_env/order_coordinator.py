@@ -198,7 +198,7 @@ def check(answer: Answer, order: Order, spec: StepSpec) -> None:
 
 
 def _check_results(answer: Returned, order: Call) -> None:
-    results = unpack(answer.results.data)
+    results = unpack(answer.results.data, len(order.copies))
     expected = 0 if order.assign else len(order.copies)
     if not isinstance(results, list) or len(results) != expected:
         got = f"{len(results)} in a list" if isinstance(results, list) else type(results).__name__

@@ -16,7 +16,7 @@ from gymnasium.error import AlreadyPendingCallError, NoAsyncCallError
 
 from millrace.learner.vector_env.batch_arrays import BatchArrays
 from millrace.learner.vector_env.batch_layout import BatchLayout
-from millrace.learner.vector_env.lane_orders import packed, step_order
+from millrace.learner.vector_env.lane_orders import packed, packed_each, step_order
 from millrace.learner.vector_env.lost_lanes import LostLanes, replacement_seeds, worker_lost
 from millrace.learner.vector_env.order_coordinator import MakeOrder
 from millrace.learner.vector_env.sent_lanes import (
@@ -309,8 +309,8 @@ class SendRecv:
 
     def _asked_reset(self, lane: int, chosen: Sequence[int], seeds: Sequence[int | None], options: Options) -> AskedReset:
         copies = [self._parts.layout.copies(lane)[n] for n in chosen]
-        of_lane = [options[n] for n in copies] if isinstance(options, list) else options
-        return AskedReset(tuple(chosen), tuple(seeds[n] for n in copies), packed(of_lane))
+        of_lane = packed_each([options[n] for n in copies]) if isinstance(options, list) else packed(options)
+        return AskedReset(tuple(chosen), tuple(seeds[n] for n in copies), of_lane)
 
     def _reset_instead(self, lane: int, reset: AskedReset, last_observations: Mapping[int, Any]) -> None:
         """Reset the new copies of a lost lane before the lane comes back."""

@@ -74,13 +74,21 @@ def pack(value: object, use_repr: bool = False) -> bytes:
     return _pack(_Packer(use_repr).convert(value))
 
 
-def unpack(data: bytes | memoryview) -> Any:
-    """The value of these bytes. Raises `BadMessage` for invalid bytes, and no other error.
+def pack_each(values: Iterable[object], use_repr: bool = False) -> bytes:
+    """Convert a list of values, such as one for each env copy, to bytes. How a value arrives, and whether it is plain,
+    doesn't depend on the other values, because the number of values in a message follows from the number of workers.
+    """
+    return _pack([_Packer(use_repr).convert(each, f"[{n}]", 1) for n, each in enumerate(values)])
+
+
+def unpack(data: bytes | memoryview, values: int = 1) -> Any:
+    """The value of these bytes, or a list that `pack_each` has packed, with at most this number of values. Raises
+    `BadMessage` for invalid bytes, and no other error.
 
     The result has at most `MAX_DEPTH` levels, so it is safe to traverse recursively.
     """
     try:
-        value = _unpack(data, KeyLimit(), 0)
+        value = _unpack(data, KeyLimit(values), 0)
         _check_depth(value, 0)
         return value
     except BadMessage:

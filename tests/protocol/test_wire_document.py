@@ -168,7 +168,10 @@ LIMITS: Mapping[tuple[ModuleType, str], str] = {
     (lane_past, "MAX_RANDOM_BYTES"): "bytes of a `RandomState`",
     (bounds, "MAX_SEEDS"): "episodes of one Evaluate",
     (bounds, "MOST_OTHER_KEYS"): "keys of one dict in `plain_values` that aren't strings",
-    (bounds, "MOST_KEYS_SQUARED"): "sum of the squares of these numbers over all dicts in one value",
+    (
+        bounds,
+        "MOST_KEYS_SQUARED",
+    ): "sum of the squares of these numbers over all dicts in one value, such as the info of one copy",
     (
         bounds,
         "MOST_WITH_ONE_HASH",

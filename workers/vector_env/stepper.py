@@ -20,7 +20,7 @@ from millrace.protocol.machine.cpu_cores import usable_cores
 from millrace.protocol.messages import DESCRIPTION, Answer, Array, Call, Described, Order, Reset, Returned, Step, Stepped
 from millrace.protocol.specs import StepSpec
 from millrace.protocol.wire.codec import encode
-from millrace.protocol.wire.plain_values import pack, unpack
+from millrace.protocol.wire.plain_values import pack_each, unpack
 from millrace.protocol.wire.shared_memory import InheritedDescriptors, SharedMemory
 from millrace.protocol.wire.wake_up import CAN_SPIN, SPIN_S, SpinWait, WakePipe, WakeReason
 from millrace.workers.activity import STEPPING, activity
@@ -67,7 +67,7 @@ class Stepper:
                 match order:
                     case Reset():
                         began = perf_counter()
-                        infos = lane.reset(order.copies, order.seeds, unpack(order.options.data), pulse)
+                        infos = lane.reset(order.copies, order.seeds, unpack(order.options.data, len(order.copies)), pulse)
                         self.stages["open"] += perf_counter() - began
                     case Step():
                         infos = self._step(lane, order.actions, pulse)
@@ -169,7 +169,7 @@ class Stepper:
 
 def pack_infos(infos: CopyInfos) -> bytes:
     """Pack the infos as bytes; empty if there are none. Values that aren't plain arrive as numbers or as their `repr`."""
-    return pack(infos, use_repr=True) if infos else b""
+    return pack_each(infos, use_repr=True) if infos else b""
 
 
 def _array(data: bytes) -> npt.NDArray[np.uint8]:
@@ -207,7 +207,7 @@ def _call(order: Call, lane: SteppedLane, allow_private_names: bool) -> Returned
     results: list[Any] = []
     error = detail = ""
     try:
-        arguments = unpack(order.given.data)
+        arguments = unpack(order.given.data, len(order.copies))
         if (private := _private_name(order, arguments)) and not allow_private_names:
             raise UsageError(
                 f"{private[:40]!r} begins with an underscore: this worker gives private attributes only to a learner "
@@ -221,7 +221,7 @@ def _call(order: Call, lane: SteppedLane, allow_private_names: bool) -> Returned
                 lane.assign(order.copies, order.name, arguments)
             else:
                 results = lane.call(order.copies, order.name, *arguments)
-        packed = pack(results)
+        packed = pack_each(results)
     except BaseException as raised:
         packed = b""
         error = one_line(f"{type(raised).__name__}: {first_line(raised)}")

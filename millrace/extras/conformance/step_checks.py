@@ -227,7 +227,7 @@ def resets_otherwise(learner: Learner, mode: Mode) -> Script[None]:
         which = "first observation of the next" if resets else "last observation of its"
         raise Broken(rule, f"the {which} episode in the step that ends that of copy {n}, as with NextStep", "another")
     if resets:
-        info = dict(unpack(row.infos.tobytes()) if row.infos.size else ()).get(n, {})
+        info = dict(unpack(row.infos.tobytes(), row.reward.size) if row.infos.size else ()).get(n, {})
         leaves = make_flatten(steps.env.observation_space)(info["final_obs"]) if "final_obs" in info else ()
         if b"".join(np.asarray(leaf).tobytes() for leaf in leaves) != _of_copy(last, n) or "final_info" not in info:
             expected = f"final_obs, the last observation of the episode, and final_info in the info of copy {n}"

@@ -58,7 +58,9 @@ def make_order(kind: str, seed: int) -> MakeOrder:
     """The order of this kind for a lane. `seed` is that of a reset."""
     if kind == "reset":
         return reset_order([0], [seed], NOTHING)
-    return step_order([np.zeros(1, np.int64)]) if kind == "step" else call_order([0], "state", ((), {}), assign=False)
+    return (
+        step_order([np.zeros(1, np.int64)]) if kind == "step" else call_order([0], "state", packed(((), {})), assign=False)
+    )
 
 
 def executed(order: Order, before: Copy) -> Copy:

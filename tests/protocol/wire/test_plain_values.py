@@ -24,7 +24,7 @@ from millrace.protocol.bounds import MOST_OTHER_KEYS, MOST_WITH_ONE_HASH
 from millrace.protocol.errors import BadMessage
 from millrace.protocol.key_limit import KeyLimit
 from millrace.protocol.wire import plain_values
-from millrace.protocol.wire.plain_values import MAX_DEPTH, MAX_DIMENSIONS, ReprString, pack, repr_paths, unpack
+from millrace.protocol.wire.plain_values import MAX_DEPTH, MAX_DIMENSIONS, ReprString, pack, pack_each, repr_paths, unpack
 from tests.support.numbers.bit_equality import bit_equal
 
 scalars = hnp.arrays(
@@ -105,17 +105,29 @@ def test_a_dict_whose_keys_have_the_same_hash_is_refused(key: Callable[[int], An
 
 
 def test_dicts_that_would_together_take_too_long_are_refused() -> None:
-    large = dict.fromkeys(range(MOST_OTHER_KEYS))
-    few = [large, {"a": large}, (large,) * 8]
+    half = dict.fromkeys(range(MOST_OTHER_KEYS // 2))
+    few = [half, {"a": half}, (half,) * 2]
     assert unpack(pack(few)) == few
-    one = packed_dict(large)
-    assert unpack(b"\x9a" + one * 10) == [large] * 10
-    for packed in (b"\x9b" + one * 10 + packed_dict([1]), b"\x92" + one + b"\x9a" + one * 10):
+    one = packed_dict(half)
+    assert unpack(b"\x94" + one * 4) == [half] * 4
+    for packed in (b"\x95" + one * 4 + packed_dict([1]), b"\x92" + one + b"\x94" + one * 4):
         with pytest.raises(BadMessage, match="or too many such dicts"):
             unpack(packed)
     with pytest.raises(TypeError, match=r"^\[3\]: expected plain data .*, got dicts with .*, or too many such dicts$"):
         pack([*few, {1: None}])
     assert unpack(pack([*few, {1: None}, {"a": 1}], use_repr=True)) == [*few, "{1: None}", {"a": 1}]
+
+
+def test_each_of_several_values_arrives_as_it_would_alone() -> None:
+    full = dict.fromkeys(range(MOST_OTHER_KEYS))
+    values = [{"a": full}, full, {"a": full, "b": {1: 2}}]
+    for each in values[:2]:
+        assert unpack(pack_each([each]), 1) == [each]
+    assert unpack(pack_each(values, use_repr=True), 3) == [*values[:2], {"a": full, "b": "{1: 2}"}]
+    with pytest.raises(TypeError, match=r"^\[2\]\.b: expected plain data"):
+        pack_each(values)
+    with pytest.raises(BadMessage, match="or too many such dicts"):
+        unpack(pack_each(values[:2]), 1)
 
 
 def test_a_dict_may_have_any_number_of_names() -> None:
