@@ -7,7 +7,8 @@ UTF-8 cannot encode, integers with more decimal digits than Python converts, and
 sent as its `repr` and arrives as a `ReprString`, which cannot be confused with a string. For such a caller, subclasses of
 dict, list and tuple are plain too: they arrive as dicts, lists and tuples. Other numbers, buffers, and objects with
 numpy's protocol, such as tensors, arrive as numpy scalars or arrays if numpy reads numbers from them. A deque arrives as
-a list. Other sequences don't, because some never end, or contain themselves, as a character of a `UserString` does.
+a list. Other sequences don't, because some never end, or contain themselves, as a character of a `UserString` does. A
+container that contains itself isn't plain; of a value with more than `MAX_DEPTH` levels, the innermost containers aren't.
 """
 
 from __future__ import annotations
@@ -110,6 +111,8 @@ class _Packer:
 
     use_repr: bool
     limit: KeyLimit = field(default_factory=KeyLimit)
+    around: set[int] = field(default_factory=set)
+    """`id` of each container that contains the current value"""
 
     def convert(self, value: Any, where: str = "", depth: int = 0) -> Any:
         """`where` is the value's path in errors. Raises `TypeError` for a value that isn't plain, unless `use_repr`."""
@@ -122,19 +125,12 @@ class _Packer:
             return value
         if kind is int and (digits := _digits(value)) is not None:
             return msgpack.ExtType(_Code.INT, digits)
-        if self._is_a(list, value) or (self.use_repr and isinstance(value, deque)):
-            return self._items(value, where, depth)
-        if self._is_a(tuple, value):
-            return msgpack.ExtType(_Code.TUPLE, _pack(self._items(value, where, depth)))
-        if self._is_a(dict, value) and not _too_slow(value, self.limit):
-            return self._dict(value, where, depth)
+        if self._is_container(value):
+            return self._container(value, where, depth)
         if kind is complex:
             return msgpack.ExtType(_Code.COMPLEX, _pack([value.real, value.imag]))
         if kind is np.ndarray and value.dtype.kind in DTYPE_KINDS:
             return msgpack.ExtType(_Code.ARRAY, _pack([value.dtype.str, list(value.shape), value.tobytes()]))
-        if kind is np.ndarray and value.dtype.kind == "O":
-            items = self._items(value.ravel().tolist(), where, depth)
-            return msgpack.ExtType(_Code.OBJECTS, _pack([list(value.shape), items]))
         if isinstance(value, np.generic) and value.dtype.kind in DTYPE_KINDS:
             return msgpack.ExtType(_Code.SCALAR, _pack([value.dtype.str, value.tobytes()]))
         if self.use_repr:
@@ -149,6 +145,30 @@ class _Packer:
 
     def _is_a(self, kind: type, value: object) -> bool:
         return type(value) is kind or (self.use_repr and isinstance(value, kind))
+
+    def _is_container(self, value: Any) -> bool:
+        if type(value) is np.ndarray:
+            return bool(value.dtype.kind == "O")
+        if self._is_a(dict, value):
+            return not _too_slow(value, self.limit)
+        return self._is_a(list, value) or self._is_a(tuple, value) or (self.use_repr and isinstance(value, deque))
+
+    def _container(self, value: Any, where: str, depth: int) -> Any:
+        """Convert a container. With `use_repr`, it becomes its `repr` on the last level, or if it contains itself."""
+        if self.use_repr and (depth == MAX_DEPTH or id(value) in self.around):
+            return _repr(value)
+        self.around.add(id(value))
+        try:
+            if isinstance(value, dict):
+                return self._dict(value, where, depth)
+            if isinstance(value, tuple):
+                return msgpack.ExtType(_Code.TUPLE, _pack(self._items(value, where, depth)))
+            if isinstance(value, np.ndarray):
+                items = self._items(value.ravel().tolist(), where, depth)
+                return msgpack.ExtType(_Code.OBJECTS, _pack([list(value.shape), items]))
+            return self._items(value, where, depth)
+        finally:
+            self.around.discard(id(value))
 
     def _items(self, values: Iterable[Any], where: str, depth: int) -> list[Any]:
         return [self.convert(each, f"{where}[{i}]", depth + 1) for i, each in enumerate(values)]
@@ -221,7 +241,7 @@ def _digits(value: int) -> bytes | None:
 
 
 def _unpack(data: bytes | memoryview, limit: KeyLimit, depth: int) -> Any:
-    if depth > MAX_DEPTH:
+    if depth > MAX_DEPTH + 1:  # an extension on the last level has a payload
         raise BadMessage(f"plain value: expected at most {MAX_DEPTH} levels, got more")
     extension = partial(_from_extension, limit=limit, depth=depth + 1)
     return msgpack.unpackb(data, ext_hook=extension, strict_map_key=True)

@@ -130,13 +130,13 @@ class EnvLoop:
             try:
                 with self._activity.during(RESETTING):
                     into[n], info = self._reset(n, seed, **further)
+                if info:
+                    infos.append((n, _kept(info)))
             except BaseException as error:
                 raise CopyFailed(n, "reset") from error
             self.reward[n] = 0.0  # rule AFTER_RESET
             self.terminated[n] = False
             self.truncated[n] = False
-            if info:
-                infos.append((n, _kept(info)))
         return infos
 
     def step(self, actions: Iterable[Any], into: list[Any], pulse: Pulse, copies: Sequence[int] | None = None) -> CopyInfos:
@@ -194,11 +194,11 @@ class EnvLoop:
                         begin(stepping)
                         info = last | dict(info)
                 into[n] = observation
+                if info:
+                    infos.append((n, _kept(info)))  # copied now, because the next copy may change the same dict
             except BaseException as error:
                 begin(WAITING)
                 raise CopyFailed(n, "reset" if resets else f"step {self.steps}") from error
-            if info:
-                infos.append((n, _kept(info)))  # copied now, because the next copy may change the same dict
             if (now_s := perf_counter()) > pulse_due_s:
                 numbers[ENV_CALLS] += (done := chosen.index(n) + 1) - counted
                 counted = done

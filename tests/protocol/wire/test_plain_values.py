@@ -348,6 +348,56 @@ def test_what_is_too_deep_is_refused() -> None:
         pack(deep)
 
 
+def in_array(value: object) -> Any:
+    array = np.empty(1, object)
+    array[0] = value
+    return array
+
+
+NESTS: dict[str, Callable[[Any], Any]] = {
+    "list": lambda inner: [inner],
+    "tuple": lambda inner: (inner,),
+    "dict": lambda inner: {"a": inner},
+    "dict with a number as key": lambda inner: {1: inner},
+    "array": in_array,
+    "deque": lambda inner: deque([inner]),
+}
+
+
+@pytest.mark.parametrize("nest", NESTS.values(), ids=NESTS)
+@pytest.mark.parametrize("leaf", [1, "a", 10**30, np.float32(1), 1j], ids=["int", "text", "large int", "scalar", "complex"])
+@pytest.mark.parametrize("use_repr", [False, True])
+def test_what_can_be_packed_at_any_depth_can_be_read(nest: Callable[[Any], Any], leaf: Any, use_repr: bool) -> None:
+    value = leaf
+    for depth in range(MAX_DEPTH + 4):
+        if nest is NESTS["tuple"]:
+            unpack(pack({value: 1}, use_repr=True))
+        try:
+            packed = pack(value, use_repr)
+        except TypeError:
+            assert not use_repr
+        else:
+            back = unpack(packed)
+            assert depth >= MAX_DEPTH - 1 or use_repr or bit_equal(back, value)
+            assert bool([*repr_paths(back)]) <= (depth >= MAX_DEPTH - 1)
+        value = nest(value)
+
+
+@pytest.mark.parametrize("kind", [list, dict, deque, in_array])
+def test_what_contains_itself_is_shown_if_asked_so(kind: Callable[[Any], Any]) -> None:
+    value = kind({} if kind is dict else [0, 0])
+    if kind is in_array:
+        value = np.empty(2, object)
+    for key in (0, 1):  # twice, so that the number of paths would double with each level
+        value[key] = value
+    with pytest.raises(TypeError):
+        pack(value)
+    back = unpack(pack([value, value], use_repr=True))
+    assert type(back[0][0]) is ReprString
+    assert len(pack(value, use_repr=True)) < 1_000
+    assert bit_equal(back[0], back[1])
+
+
 @given(st.binary(max_size=200))
 def test_hostile_bytes_raise_one_error(data: bytes) -> None:
     with suppress(BadMessage):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections import defaultdict
+from collections import defaultdict, deque
 from collections.abc import Callable
 from functools import partial
 from types import ModuleType
@@ -18,7 +18,7 @@ import millrace
 from millrace.learner.vector_env.settings import VectorEnvSettings
 from millrace.protocol.errors import EnvironmentFailed
 from millrace.protocol.messages import Call, Reset, Returned, Step, Stepped
-from millrace.protocol.wire.plain_values import pack, unpack
+from millrace.protocol.wire.plain_values import ReprString, pack, unpack
 from millrace.workers.copies.env_loop import EnvLoop
 from millrace.workers.vector_env.stepper import Stepper
 from tests.support.conversation.example_messages import example
@@ -125,6 +125,32 @@ def test_an_observation_that_does_not_fit_is_refused_at_every_step(nested: bool,
         stepped(partial(Changes, nested, later=later), 4)
     expected = f"{named}: expected float32[2] as its space says, got {got}; fix the environment or its observation_space"
     assert str(caught.value) == f"lane 0, copy 0, step 3: {expected}"
+
+
+class Encloses(Countdown):
+    """The info of each step contains itself."""
+
+    def __init__(self, kind: type) -> None:
+        super().__init__(50)
+        self._kind = kind
+
+    def step(self, action: Any) -> Any:
+        info: dict[str, Any] = {"a": 1}
+        info["inner"] = info if self._kind is dict else self._kind([0])
+        if self._kind is not dict:
+            info["inner"].append(info["inner"])
+        return *super().step(action)[:4], info
+
+
+@pytest.mark.parametrize("kind", [list, deque])
+def test_a_sequence_that_contains_itself_arrives_as_its_repr(kind: type) -> None:
+    for _, info in unpack(stepped(partial(Encloses, kind), 1)[-1].infos.data):
+        assert (info["a"], info["inner"][0], type(info["inner"][1])) == (1, 0, ReprString)
+
+
+def test_an_info_that_contains_itself_is_an_error_of_the_environment() -> None:
+    with pytest.raises(EnvironmentFailed, match="lane 0, copy 0, step 0: its environment raised RecursionError"):
+        stepped(partial(Encloses, dict), 1)
 
 
 class Blind(Countdown):
