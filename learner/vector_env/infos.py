@@ -17,6 +17,9 @@ from millrace.protocol.wire.plain_values import repr_paths, unpack
 log = logging.getLogger("millrace.learner")
 
 
+MOST_WARNED = 32  # paths that the log names, because workers choose the keys, which may contain a step number
+
+
 class OfSomeRows(VectorEnv[Any, Any, Array]):
     """Merges the infos of some rows, as gymnasium's vector environments merge those of all rows."""
 
@@ -33,7 +36,8 @@ class InfoReader:
         """`refuse` is called with a lane whose infos cannot be read, and the reason."""
         self._layout = layout
         self._refuse = refuse
-        self._warned: set[str] = set()  # info keys about which the log has warned, because their values arrived as text
+        self._warned: set[str] = set()  # paths about which the log has warned, because their values arrived as text
+        self._warned_of_more = False
 
     def by_row(self, ready: Ready) -> dict[int, Infos]:
         """The infos that are not empty, by row, in the order of the rows."""
@@ -49,11 +53,22 @@ class InfoReader:
         if not infos:
             return infos
         for n in sorted(infos):
-            for key in repr_paths(infos[n]):
-                if key not in self._warned:
-                    self._warned.add(key)
-                    log.warning("info %s of row %d is not plain data: it arrives as its repr, a string", key, n)
+            self._warn(n, infos[n])
         return dict(sorted(infos.items()))
+
+    def _warn(self, n: int, info: Infos) -> None:
+        """Log each path in the info of row n whose value arrived as its repr, unless it was logged before."""
+        if self._warned_of_more:
+            return
+        for path in repr_paths(info, MOST_WARNED + 1):
+            if path in self._warned:
+                continue
+            if len(self._warned) == MOST_WARNED:
+                self._warned_of_more = True
+                log.warning("more infos are not plain data; the log doesn't name them")
+                return
+            self._warned.add(path)
+            log.warning("info %s of row %d is not plain data: it arrives as its repr, a string", path, n)
 
 
 def merged(by_row: Mapping[int, Infos], env: VectorEnv[Any, Any, Array], rows: Sequence[int] | None = None) -> Infos:

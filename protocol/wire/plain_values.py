@@ -25,7 +25,7 @@ from typing import Any
 import msgpack
 import numpy as np
 
-from millrace.protocol.bounds import MOST_OTHER_KEYS, MOST_WITH_ONE_HASH
+from millrace.protocol.bounds import MAX_LINE, MAX_NAME, MOST_OTHER_KEYS, MOST_WITH_ONE_HASH, one_line
 from millrace.protocol.errors import BadMessage, safe_repr
 from millrace.protocol.key_limit import KeyLimit
 
@@ -326,16 +326,47 @@ def _check_characters(raw: bytes, kind: np.dtype[Any]) -> None:
         raise BadMessage(f"text of {kind.str}: expected characters up to {sys.maxunicode}, got {last}")
 
 
-def repr_paths(value: object, where: str = "") -> list[str]:
-    """The paths inside the value that lead to a `ReprString`."""
+@dataclass(slots=True)
+class _KeyPath:
+    """The place of a value in dicts. Its path is computed once, and only if it is needed."""
+
+    around: _KeyPath | None
+    key: object
+    known: str = ""
+
+    def path(self) -> str:
+        """The keys that lead to the place, short and safe to show."""
+        if not self.known:
+            key = one_line(str(self.key)[:MAX_NAME], MAX_NAME)
+            self.known = (f"{self.around.path()}.{key}" if self.around else key)[:MAX_LINE]
+        return self.known
+
+
+def repr_paths(value: object, most: int) -> list[str]:
+    """The first paths inside the value that lead to a `ReprString`: at most this number, short and safe to show."""
+    paths: dict[str, None] = {}
+    _add_repr_paths(value, None, paths, most)
+    return list(paths)
+
+
+def _add_repr_paths(value: object, place: _KeyPath | None, paths: dict[str, None], most: int) -> None:
+    if len(paths) == most:
+        return
     match value:
         case ReprString():
-            return [where]
+            paths[place.path() if place else ""] = None
         case dict():
-            return [at for key, inner in value.items() for at in repr_paths(inner, f"{where}.{key}" if where else str(key))]
+            for key, inner in value.items():
+                if isinstance(inner, _MAY_HAVE_PATHS):
+                    _add_repr_paths(inner, _KeyPath(place, key), paths, most)
         case list() | tuple():
-            return [at for inner in value for at in repr_paths(inner, where)]
+            for inner in value:
+                if isinstance(inner, _MAY_HAVE_PATHS):
+                    _add_repr_paths(inner, place, paths, most)
         case np.ndarray() if value.dtype.kind == "O":
-            return [at for inner in value.ravel().tolist() for at in repr_paths(inner, where)]
+            _add_repr_paths(value.ravel().tolist(), place, paths, most)
         case _:
-            return []
+            pass
+
+
+_MAY_HAVE_PATHS = (ReprString, dict, list, tuple, np.ndarray)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
+from collections.abc import Sequence
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -12,14 +14,15 @@ import pytest
 import millrace
 from millrace.learner.vector_env.batch_layout import BatchLayout
 from millrace.learner.vector_env.calls import _descriptions
-from millrace.learner.vector_env.infos import unpack_infos
+from millrace.learner.vector_env.infos import MOST_WARNED, InfoReader, unpack_infos
 from millrace.learner.vector_env.lost_lanes import LostLanes, replacement_seeds
+from millrace.learner.vector_env.sent_lanes import Ready
 from millrace.learner.vector_env.settings import VectorEnvSettings
 from millrace.protocol.envs.description import describe_env
 from millrace.protocol.errors import BadMessage
 from millrace.protocol.messages import Described, Goodbye, Returned, ToLearner
 from millrace.protocol.wire.codec import encode
-from millrace.protocol.wire.plain_values import pack
+from millrace.protocol.wire.plain_values import pack, pack_each
 from tests.support.conversation.example_messages import example
 
 
@@ -36,6 +39,25 @@ def test_lanes_have_consecutive_rows() -> None:
 
 def test_infos_get_the_number_of_their_env_copy() -> None:
     assert unpack_infos(pack([(0, {"a": 1}), [1, {}], [2, {"b": 1}]]), range(4, 6)) == {4: {"a": 1}, 5: {}}
+
+
+def read(reader: InfoReader, infos: Sequence[tuple[int, Any]]) -> None:
+    reader.by_row(Ready({0: pack_each(infos, use_repr=True)}, {}))
+
+
+def test_infos_that_arrive_as_their_repr_are_reported_once_and_few_of_them(caplog: pytest.LogCaptureFixture) -> None:
+    """The keys come from a worker: it must not fill the log or the memory with them, or forge a line."""
+    reader = InfoReader(BatchLayout([2]), lambda lane, why: pytest.fail(why))
+    for _ in range(2):
+        read(reader, [(1, {"a\nWARNING forged": object()})])
+    assert [record.getMessage() for record in caplog.records] == [
+        r"info a\nWARNING forged of row 1 is not plain data: it arrives as its repr, a string"
+    ]
+    for step in range(3):
+        read(reader, [(0, {f"{step}.{n}": object() for n in range(100)})])
+    assert len(caplog.records) == MOST_WARNED + 1
+    assert caplog.records[-1].getMessage() == "more infos are not plain data; the log doesn't name them"
+    assert len(reader._warned) == MOST_WARNED
 
 
 @pytest.mark.parametrize("value", [7, [7], [[0]], [[0, 1, 2]], [[0, "text"]], [[0.0, {}]], [[True, {}]]])

@@ -20,7 +20,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from millrace.protocol.bounds import MOST_OTHER_KEYS, MOST_WITH_ONE_HASH
+from millrace.protocol.bounds import MAX_LINE, MOST_OTHER_KEYS, MOST_WITH_ONE_HASH
 from millrace.protocol.errors import BadMessage
 from millrace.protocol.key_limit import KeyLimit
 from millrace.protocol.wire import plain_values
@@ -156,7 +156,32 @@ def test_what_is_not_plain_is_shown_if_asked_so_and_can_be_found() -> None:
     back = unpack(pack({"a": {"b": Odd()}, "c": "<odd>"}, use_repr=True))
     assert back == {"a": {"b": "<odd>"}, "c": "<odd>"}
     assert type(back["a"]["b"]) is ReprString
-    assert repr_paths(back) == ["a.b"]
+    assert repr_paths(back, 9) == ["a.b"]
+
+
+def test_a_path_is_short_and_safe_to_show() -> None:
+    odd = ReprString("odd")
+    nest: Any = odd
+    for _ in range(MAX_DEPTH):
+        nest = {"x" * 1_000: nest}
+    (long,) = repr_paths(nest, 9)
+    assert len(long) <= MAX_LINE
+    assert repr_paths({"\x1b[2J\n": [odd, odd], 1: {(2, "b"): odd}}, 2) == [r"\x1b[2J\n", "1.(2, 'b')"]
+
+
+def test_only_keys_that_lead_to_a_repr_are_shown_and_each_of_them_once() -> None:
+    """Otherwise, a long key would be copied for each of many values below it."""
+
+    class Key(int):
+        shown = 0
+
+        def __str__(self) -> str:
+            Key.shown += 1
+            return "key"
+
+    values = {Key(0): {str(n): n for n in range(9)}, Key(1): {str(n): ReprString() for n in range(9)}}
+    assert repr_paths({Key(2): values}, 8) == [f"key.key.{n}" for n in range(8)]
+    assert Key.shown == 2
 
 
 class WithoutRepr:
@@ -379,7 +404,7 @@ def test_what_can_be_packed_at_any_depth_can_be_read(nest: Callable[[Any], Any],
         else:
             back = unpack(packed)
             assert depth >= MAX_DEPTH - 1 or use_repr or bit_equal(back, value)
-            assert bool([*repr_paths(back)]) <= (depth >= MAX_DEPTH - 1)
+            assert bool(repr_paths(back, 9)) <= (depth >= MAX_DEPTH - 1)
         value = nest(value)
 
 
@@ -515,7 +540,7 @@ def test_a_shape_that_does_not_fit_the_content_is_refused() -> None:
 
 @pytest.mark.parametrize("inside", [b"\x91", b"\x81\xa1a"], ids=["lists", "dicts"])
 def test_what_arrives_can_be_walked_recursively(inside: bytes) -> None:
-    repr_paths(unpack(inside * MAX_DEPTH + b"\xc0"))
+    assert not repr_paths(unpack(inside * MAX_DEPTH + b"\xc0"), 9)
     with pytest.raises(BadMessage, match=f"at most {MAX_DEPTH} levels"):
         unpack(inside * (MAX_DEPTH + 1) + b"\xc0")
 
