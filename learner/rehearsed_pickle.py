@@ -11,6 +11,7 @@ without creating its objects.
 from __future__ import annotations
 
 import pickletools
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum, auto
 from typing import NamedTuple
@@ -33,6 +34,17 @@ MOST_FULL_DICTS = 10  # dicts with as many numbers as keys as one dict may have
 MOST_REPEATED = 1 << 20  # limit on how often a visitor finds an object that it has already found,
 REPEATED_PER_BYTE = 16  # plus this number for each byte of the pickle, because many dicts have the same keys
 TYPES = ("torch ", "torch.storage ")  # prefixes of the names of storage types and dtypes, which aren't called
+
+
+STORAGES = {
+    "torch.storage UntypedStorage": 1,
+    **dict.fromkeys(("torch BoolStorage", "torch ByteStorage", "torch CharStorage"), 1),
+    **dict.fromkeys(("torch BFloat16Storage", "torch HalfStorage", "torch ShortStorage"), 2),
+    **dict.fromkeys(("torch FloatStorage", "torch IntStorage"), 4),
+    **dict.fromkeys(("torch ComplexFloatStorage", "torch DoubleStorage", "torch LongStorage"), 8),
+    "torch ComplexDoubleStorage": 16,
+}
+"""The size of an element, in bytes, by the name of a storage type. torch.save writes tensors of other dtypes untyped."""
 
 
 class Unfit(Exception):
@@ -64,9 +76,10 @@ class _Made:
     """the number of its keys that are numbers"""
 
 
-def rehearse(content: bytes) -> None:
+def rehearse(content: bytes, storage_bytes: Mapping[str, int]) -> None:
     """Interpret a pickle to its end. Raises `Unfit` for anything that isn't allowed.
 
+    `storage_bytes` has the size of each storage's content in the file, by its key in lower case.
     Damaged bytes raise other exceptions, from `pickletools` or from an empty stack.
     """
     stack = list[_Made]()
@@ -106,7 +119,7 @@ def rehearse(content: bytes) -> None:
                     raise Unfit("it contains the same values too often")
                 stack.append(notes[note])
             case "BINPERSID", _:  # a storage, whose content torch reads from elsewhere in the file
-                _check_storage(stack[-1].value)
+                _check_storage(stack[-1].value, storage_bytes)
                 stack[-1] = _Made(None)
             case "GLOBAL", str(name) if name in CALLED or name.startswith(TYPES):
                 stack.append(_Made(_Function(name)))
@@ -158,11 +171,15 @@ def _set_items(stack: list[_Made], first: int, limit: KeyLimit) -> None:
     _add(stack, first)
 
 
-def _check_storage(storage: object) -> None:
-    """Raise `Unfit` unless this names a storage in the way torch.save does. torch uses the third item as a key."""
+def _check_storage(storage: object, storage_bytes: Mapping[str, int]) -> None:
+    """Raise `Unfit` unless this names a storage in the way torch.save does. torch uses the third item as a key.
+
+    The size must be that of the content: until October 2025, torch read the memory behind the content of a larger storage.
+    """
     match storage:
-        case "storage", _Function(), str(), str(), int():
-            pass
+        case "storage", _Function(kind), str(key), str(), int(elements) if kind in STORAGES:
+            if elements * STORAGES[kind] != storage_bytes.get(key.lower()):
+                raise Unfit("expected tensors and plain data, got a storage of another size than its content")
         case _:
             raise Unfit("expected tensors and plain data, got a storage of another form")
 

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 PICKLE = "data.pkl"  # suffix of the pickle's name in the archive; torch accepts capital letters, too
+CONTENTS = "data"  # name of the folder with the storages' contents in the archive, in small or capital letters, too
 MOST_STEPS = 20  # limit on the steps of the path to a part; in a nest that is too deep to be pickled, each part is wrong
 MOST_VIEWS = 16  # limit on views of the same numbers; an algorithm may save parts of a tensor in addition to the whole
 
@@ -46,9 +47,14 @@ def write_state(file: BinaryIO, record: object, state: object, where: str) -> No
 
 def check_pickles(archive: zipfile.ZipFile) -> None:
     """Raise `Unfit` if the pickle of an archive contains something that isn't allowed."""
+    storage_bytes: dict[str, int] = {}
+    for entry in archive.infolist():
+        folder, _, key = entry.filename.lower().partition("/")[2].partition("/")
+        if folder == CONTENTS and storage_bytes.setdefault(key, entry.file_size) != entry.file_size:
+            raise Unfit("expected one content of each storage, got two for a storage")
     for entry in archive.infolist():
         if entry.filename.lower().endswith(PICKLE):
-            rehearse(archive.read(entry))
+            rehearse(archive.read(entry), storage_bytes)
 
 
 def check_memory(record: object, size: int) -> None:

@@ -9,6 +9,7 @@ import resource
 import shutil
 import signal
 import struct
+import zipfile
 import zlib
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
@@ -19,9 +20,12 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 import torch
+from torch.storage import _dtype_to_storage_type_map
 
+from millrace.learner.rehearsed_pickle import STORAGES, Unfit
 from millrace.learner.run_folder import checkpoint
 from millrace.learner.run_folder.archive_directory import ENTRY
+from millrace.learner.written_state import check_pickles
 from millrace.protocol.errors import CheckpointError, UsageError
 
 
@@ -344,11 +348,54 @@ def test_an_archive_in_which_torch_may_find_another_pickle_than_the_rehearsed_on
         checkpoint.load(path)
 
 
+def with_storage(path: Path, kind: str, key: str, numel: int, records: dict[str, bytes]) -> None:
+    """Write an archive with these records, and with a storage that its pickle describes thus."""
+    content = b"(X\x07\x00\x00\x00storagec%s\nX%c\x00\x00\x00%sX\x03\x00\x00\x00cpuJ%stQ" % (
+        kind.replace(" ", "\n").encode(), len(key), key.encode(), numel.to_bytes(4, "little", signed=True),
+    )  # fmt: skip
+    writer = torch._C.PyTorchFileWriter(str(path))
+    for name, record in {"data.pkl": b"\x80\x02" + content + b".", **records}.items():
+        writer.write_record(name, record, len(record))
+    writer.write_end_of_file()
+
+
+@pytest.mark.parametrize(
+    ("kind", "key", "numel", "records"),
+    [
+        ("torch FloatStorage", "0", 5, {"data/0": bytes(16)}),
+        ("torch FloatStorage", "0", 3, {"data/0": bytes(16)}),
+        ("torch FloatStorage", "0", -4, {"data/0": bytes(16)}),
+        ("torch DoubleStorage", "0", 4, {"data/0": bytes(16)}),
+        ("torch.storage UntypedStorage", "0", 17, {"data/0": bytes(16)}),
+        ("torch OtherStorage", "0", 4, {"data/0": bytes(16)}),
+        ("torch FloatStorage", "1", 4, {"data/0": bytes(16)}),
+        ("torch FloatStorage", "0", 4, {}),
+        ("torch FloatStorage", "a", 4, {"data/a": bytes(16), "data/A": bytes(8)}),
+    ],
+)
+def test_a_storage_has_the_size_of_its_content(
+    tmp_path: Path, kind: str, key: str, numel: int, records: dict[str, bytes]
+) -> None:
+    """Until October 2025, torch would read the memory behind the content."""
+    with_storage(tmp_path / "whole.pt", "torch FloatStorage", "A", 4, {"data/a": bytes(16)})
+    with zipfile.ZipFile(tmp_path / "whole.pt") as archive:
+        check_pickles(archive)
+    with_storage(tmp_path / "model.pt", kind, key, numel, records)
+    with zipfile.ZipFile(tmp_path / "model.pt") as archive, pytest.raises(Unfit, match="a storage"):
+        check_pickles(archive)
+
+
 def test_all_that_a_state_may_hold_passes_the_rehearsal(tmp_path: Path) -> None:
     dtypes = [torch.float64, torch.bfloat16, torch.bool, torch.int64, torch.uint16, torch.complex64, torch.float8_e4m3fn]
     saved: dict[str, Any] = {
         "tensors": [torch.zeros(3, dtype=dtype) for dtype in dtypes],
         "parameter": torch.nn.Parameter(torch.ones(2)),
+        "storages": [
+            torch.zeros(0),
+            torch.zeros(2, 0, 3),
+            *torch.split(torch.zeros(9), 5),
+            torch.zeros(3).untyped_storage(),
+        ],
         "plain": [(), (1,), (1, 2), (1, 2, 3), (1, 2, 3, 4), 2**70, -1, 300, 70_000, 0.5, True, False, None, "ä", [], {}],
         "bytes": [b"a", b"\xff" * 300, b"a"],
         "many": list(range(2000)),
@@ -358,7 +405,14 @@ def test_all_that_a_state_may_hold_passes_the_rehearsal(tmp_path: Path) -> None:
     found = checkpoint.newest(tmp_path)[0].state
     assert all(map(torch.equal, found.pop("tensors"), saved.pop("tensors")))
     assert torch.equal(found.pop("parameter"), saved.pop("parameter"))
+    assert [each.nbytes for each in found.pop("storages")[:4]] == [each.nbytes for each in saved.pop("storages")[:4]]
     assert found == saved
+
+
+def test_all_storages_that_torch_writes_have_a_known_size() -> None:
+    kinds = {kind: dtype for dtype, kind in _dtype_to_storage_type_map().items() if kind[0] != "Q"}  # without quantized ones
+    sizes = {f"torch {kind}": torch.empty(0, dtype=dtype).element_size() for kind, dtype in kinds.items()}
+    assert sizes | {"torch.storage UntypedStorage": 1} == STORAGES
 
 
 def cycle() -> list[Any]:
