@@ -358,6 +358,10 @@ class PolicyFailed(RunError):
 class PeerError(MillraceError):
     """A peer sent something wrong."""
 
+    def __init__(self, line: str) -> None:
+        """`line` may quote what the peer sent: control characters in it are escaped."""
+        super().__init__(one_line(line))
+
 
 class BadMessage(PeerError):
     """Bytes that are not a valid message."""

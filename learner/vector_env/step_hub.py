@@ -7,7 +7,6 @@ long are removed only while the hub listens, so the caller may take as long as i
 
 from __future__ import annotations
 
-import logging
 import math
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -24,8 +23,6 @@ from millrace.protocol.errors import NoWorkers
 from millrace.protocol.messages import Answer, Order, Status
 from millrace.protocol.specs import StepSpec
 from millrace.protocol.wire.learner_link import LearnerLink
-
-log = logging.getLogger("millrace.learner")
 
 POLL_S = 0.05  # interval at which to check whether a child process has ended
 LISTEN_EVERY_S = 0.5  # interval at which heartbeats are answered while steps go through shared memory
@@ -206,7 +203,6 @@ class StepHub:
     def refuse_owner(self, lane: int, why: str) -> None:
         """Refuse this lane's worker because it sent something unusable."""
         if (member := self.coordinator.owner(lane)) is not None:
-            log.warning("worker %s: %s", member.hello.worker, why)
             self._server.send(self.coordinator.reject_message(member.peer, why, self.now()))
 
     def wait_for(self, workers: int, timeout_s: float) -> None:
