@@ -87,15 +87,15 @@ class Lobby:
 
         Raises `UsageError` if a worker started by this program, or each of `launched_workers`, reports that there is no such
         environment or gives a description that is not accepted. Raises `EnvironmentFailed` if the environment fails too
-        often, and `NoWorkers` or `Stalled` if a deadline passes. Time without workers is no stall, nor is it part of
-        `described_in_s`.
+        often, and `NoWorkers` or `Stalled` if a deadline passes. Neither time without workers nor time in the
+        environment's code is a stall. Time without workers isn't part of `described_in_s` either.
         """
         coordinator = self._coordinator
         server = self._server
         stall_timeout_s = self._settings.stall_timeout_s
         members = coordinator.members
         began_s = self._clock()  # since then, there has always been a worker that could describe the environment
-        looked_s = counted_s = began_s  # `counted_s` moves on with the time without workers, so that it doesn't count
+        looked_s = counted_s = began_s  # `counted_s` moves on with the time that doesn't count as a stall
         wait = LongWait(began_s)
         wait_for_answer = LongWait(began_s)
         server.send(coordinator.ask(unknown))
@@ -104,14 +104,14 @@ class Lobby:
             check_interrupt()
             self._check()
             now = self._clock()
+            # Time in the environment's code doesn't count, because those calls have their own timeouts, with better errors.
+            counted_s = max([counted_s, *(member.in_env_code_s for member in members.values())])
             if not members:
                 counted_s += now - looked_s
                 began_s = now
                 wait_for_answer = LongWait(now)
             looked_s = now
-            # Time in the environment's code doesn't count, because those calls have their own timeouts, with better errors.
-            busy_s = max((member.in_env_code_s for member in members.values()), default=counted_s)
-            if now - max(counted_s, busy_s) > stall_timeout_s:
+            if now - counted_s > stall_timeout_s:
                 told = server.what_workers_do()
                 raise Stalled(f"no description of the environment within {stall_timeout_s:.0f} s; {told}")
             if wait.due(now):

@@ -541,6 +541,41 @@ def test_workers_that_join_and_die_one_after_the_other_stall_the_start() -> None
     assert link.now - began_s == pytest.approx(63, abs=2), "the time of the fourth worker: three others took 15 s together"
 
 
+@pytest.mark.parametrize("lives_s", [(20.3,), (10.0, 11.0, 12.0)], ids=["timeout", "crashes"])
+def test_time_in_the_environments_code_is_no_stall_even_after_its_worker_was_lost(lives_s: tuple[float, ...]) -> None:
+    """Each worker dies while it makes the environment, and is restarted. The last one describes the environment."""
+    link = FakeLink()
+    began_s = link.now
+    dies_s = [began_s + sum(lives_s[: n + 1]) for n in range(len(lives_s))]
+
+    def process() -> int:
+        """The number of the worker's process."""
+        return sum(link.now >= at_s for at_s in dies_s) + 1
+
+    joined: list[int] = []
+
+    def ended() -> list[WorkerExit]:
+        died = joined[-1:] if joined and joined[-1] < process() else []
+        return [WorkerExit("w0", nonce, "ended in the construction of its environment", failed=True) for nonce in died]
+
+    processes = FakeProcesses(
+        expected=1, of_ended=ended, of_activities=lambda: [WorkerActivity("w0", process(), "describing", 0.0, 0)]
+    )
+    settings = replace(SETTINGS, stall_timeout_s=20, max_env_failures=3)
+    lobby = Lobby(cast(LearnerLink, link), processes, settings, lambda: link.now)
+
+    def join_and_describe() -> None:
+        if process() not in joined:
+            link.inbox.append((A, hello(A, process())))
+            joined.append(process())
+        for member in lobby._coordinator.members.values():
+            if member.tickets and link.now >= dies_s[-1] + 10.0:
+                link.inbox.append((A, Described(member.session, max(member.tickets), DESCRIPTION)))
+
+    lobby.describe(Unknown(ENV), join_and_describe)
+    assert link.now - dies_s[-1] == pytest.approx(10.0, abs=0.2)
+
+
 def test_more_workers_describe_only_once_those_that_joined_have_had_time_to() -> None:
     """The log mentions the wait earlier, because it counts the time without workers too."""
     link = FakeLink()
