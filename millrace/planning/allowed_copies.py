@@ -13,7 +13,7 @@ from millrace.planning.measurements import Measurements
 from millrace.planning.recommendation import ChosenSetting
 
 EVALUATION_COPIES = Config().eval_copies
-MORE_FAILED = "more copies did not work side by side, and evaluations need copies too"
+MORE_FAILED = "more copies did not work at the same time, and evaluations need copies too"
 
 
 class AllowedCopies(NamedTuple):
@@ -36,8 +36,8 @@ class AllowedCopies(NamedTuple):
     def after(self, measured: Measurements) -> AllowedCopies:
         """What these measurements allow.
 
-        If more copies have failed than worked side by side, only the latter number; if several have failed in one worker, as
-        few as possible there.
+        If more copies have failed than worked at the same time, only the latter number; if several have failed because they
+        were in one worker, as few as possible there.
         """
         allowed = self._replace(apart=bool(measured.failed_in_one_worker))
         if not measured.copies_failed or 0 < self.here <= measured.copies_worked:

@@ -199,7 +199,7 @@ def _advice(sizes: Sizes, situation: Situation, rate: float) -> list[str]:
             f"evaluations need a second copy, but {measured.copies_failed} did not work side by side: the evaluation of "
             "this command fails unless a second copy works"
         )
-    elif measured.failed_in_one_worker:
+    elif measured.failed_in_one_worker and measured.worked_in_one_worker == 1:
         lines.append(
             f"evaluations need a second copy in a worker, but {measured.failed_in_one_worker} in one worker did not work: "
             "the evaluation of this command fails unless 2 work. If the environment allows only one copy in each process, "

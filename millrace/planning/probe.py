@@ -103,7 +103,7 @@ def probe(env: ProbedEnv, machine: Machine, seconds: float) -> Probed:
         if costs.steps_per_s < WORTH_WHILE * measured.side_by_side[-1].steps_per_s:
             break
         measured = msgspec.structs.replace(measured, side_by_side=(*measured.side_by_side, costs))
-    if first.is_whole and not any(session.size.each > 1 or session.failed_with_two for session in sessions):
+    if first.is_whole and not any(session.decides_about_two for session in sessions):
         # An evaluation makes a second copy in a worker. It also shows whether the environment is deterministic.
         sessions.append(_session(env, SessionSize(each=2 if two_fit(measured, machine) else 1), EACH_S, end_s))
     return Probed(_with_all(measured, sessions), first.observation_space, first.action_space, first.seats)
@@ -142,9 +142,9 @@ class _SteppedCopies(NamedTuple):
         return not self.is_whole and not self.wrong
 
     @property
-    def failed_with_two(self) -> bool:
-        """Whether two copies failed, in one worker or side by side."""
-        return bool(self.wrong) and self.size.copies == 2
+    def decides_about_two(self) -> bool:
+        """Whether two copies in one worker would show nothing more: two have failed, or several in one worker have not."""
+        return self.size.copies == 2 if self.wrong else self.size.each > 1
 
     @property
     def finding(self) -> str:
@@ -306,7 +306,10 @@ def _with_all(measured: Measurements, sessions: Sequence[_SteppedCopies]) -> Mea
     steps = sum(int(np.count_nonzero(each.steps[:, 0] < each.resets[-1, 0])) for each in times)  # steps of complete episodes
     share = max(each.others_cpu_share for each in times)
     worked = max((each.size.copies for each in sessions if each.is_whole), default=1)
+    worked_in_one = max((each.size.each for each in sessions if each.is_whole), default=1)
     failed = [each.size for each in sessions if each.wrong and each.size.copies > 1]
+    # If several copies have worked in one worker, a process allows several, so the number of copies may be the problem.
+    too_many = [size for size in failed if size.copies > worked and (size.workers > 1 or worked_in_one > 1)]
     wrong_masks = next((each.masks.wrong for each in sessions if each.masks.wrong), "")
     return msgspec.structs.replace(
         measured,
@@ -316,8 +319,9 @@ def _with_all(measured: Measurements, sessions: Sequence[_SteppedCopies]) -> Mea
         reset_cpu_s=float((resets[:, 2] + share * resets[:, 1]).mean()),
         resets=len(resets),
         copies_worked=worked,
-        copies_failed=min((size.copies for size in failed if size.workers > 1 and size.copies > worked), default=0),
-        failed_in_one_worker=min((size.each for size in failed if size.workers == 1), default=0),
+        copies_failed=min((size.copies for size in too_many), default=0),
+        worked_in_one_worker=worked_in_one,
+        failed_in_one_worker=min((size.each for size in failed if size.workers == 1 and size not in too_many), default=0),
         episode_steps=steps / sum(map(len, later)) if later else sessions[0].time_limit,
         deterministic=_deterministic([trace for session in sessions for trace in session.traces]),
         findings=tuple(session.finding for session in sessions if not session.is_whole),

@@ -102,7 +102,7 @@ def test_after_a_failure_a_run_needs_no_more_copies_than_have_worked_even_when_i
     assert config.workers is not None
     assert config.workers <= config.lanes <= config.envs
     why = {each.name: each.why for each in settings}
-    assert why["max_env_copies"].startswith("more copies did not work side by side")
+    assert why["max_env_copies"].startswith("more copies did not work at the same time")
     assert "may train here" in why["envs"] or config.envs < allowed.training
 
 

@@ -7,6 +7,7 @@ import os
 import re
 import shlex
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -132,21 +133,29 @@ def compute(seconds: float) -> None:
 
 
 class Licensed(gymnasium.Env[Any, Any]):
-    """Computes for 3 ms in each step. Only one copy may exist on this machine: another one fails or, if `waits`, hangs."""
+    """Computes for `step_s` in each step. Only `licences` copies may exist on this machine: another one fails or, if
+    `waits`, hangs.
+    """
 
     observation_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
     action_space = gymnasium.spaces.Discrete(2)
 
-    def __init__(self, licence: str, waits: bool = False) -> None:
-        self._licence = os.open(licence, os.O_CREAT | os.O_RDWR)
-        fcntl.flock(self._licence, fcntl.LOCK_EX if waits else fcntl.LOCK_EX | fcntl.LOCK_NB)
+    def __init__(self, licence: str, waits: bool = False, licences: int = 1, step_s: float = 0.003) -> None:
+        self._step_s = step_s
+        for n in range(licences):
+            self._licence = os.open(f"{licence}{n}", os.O_CREAT | os.O_RDWR)
+            with suppress(BlockingIOError):
+                fcntl.flock(self._licence, fcntl.LOCK_EX if waits else fcntl.LOCK_EX | fcntl.LOCK_NB)
+                return
+            os.close(self._licence)
+        raise RuntimeError("no licence is free")
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
         super().reset(seed=seed)
         return np.zeros(1, np.float32), {}
 
     def step(self, action: Any) -> Any:
-        compute(0.003)
+        compute(self._step_s)
         return np.zeros(1, np.float32), 0.0, False, False, {}
 
     def close(self) -> None:
@@ -166,6 +175,19 @@ def test_a_plan_for_an_environment_of_which_a_second_copy_fails_has_one_copy(
     assert plan.settings["eval_copies"] == 1
     assert any(line.startswith("evaluations need a second copy, but 2 did not work side by side") for line in plan.advice)
     assert not any("measured at most" in line for line in plan.advice)
+
+
+def test_a_limit_on_the_number_of_copies_is_not_taken_for_one_copy_in_each_process_if_steps_are_short(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("millrace.planning.plan.usable_cores", lambda: 2)
+    env_kwargs: dict[str, Any] = {"licence": str(tmp_path / "licence"), "licences": 3, "step_s": 0.0}
+    plan = millrace.plan(Licensed, env_kwargs=env_kwargs, seconds=4 * BRIEF_S)
+    measured = plan.measured
+    assert (measured.copies_worked, measured.worked_in_one_worker, measured.failed_in_one_worker) == (2, 2, 0)
+    assert 3 < measured.copies_failed <= COPIES_OF_SHORT
+    assert plan.settings["envs"] + plan.settings["eval_copies"] <= plan.settings["max_env_copies"] <= 3
+    assert not any("OwnProcess" in line for line in plan.advice)
 
 
 def test_a_plan_with_more_copies_than_were_measured_says_so_and_that_those_that_took_too_long_may_hang(
@@ -234,17 +256,17 @@ def test_if_steps_take_so_long_that_only_one_copy_is_measured_a_line_says_so() -
     assert reported == ["side by side"] * (2 - measured.copies_worked) + ["in one worker"]
 
 
-class OneInEachProcess(gymnasium.Env[Any, Any]):
-    """Computes for `step_s` in each step. A process may make only one copy."""
+class FewInEachProcess(gymnasium.Env[Any, Any]):
+    """Computes for `step_s` in each step. A process may make only `few` copies."""
 
     observation_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
     action_space = gymnasium.spaces.Discrete(2)
-    made = False
+    made = 0
 
-    def __init__(self, step_s: float) -> None:
-        if OneInEachProcess.made:
+    def __init__(self, step_s: float, few: int = 1) -> None:
+        if FewInEachProcess.made >= few:
             raise RuntimeError("cannot create multiple simulators in a process")
-        OneInEachProcess.made = True
+        FewInEachProcess.made += 1
         self._step_s = step_s
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
@@ -259,12 +281,25 @@ class OneInEachProcess(gymnasium.Env[Any, Any]):
 @pytest.mark.parametrize(("step_s", "cores"), [(0.0, 2), (0.005, 2), (0.005, 1)])
 def test_an_environment_that_allows_one_copy_in_each_process_is_found_out(step_s: float, cores: int) -> None:
     machine = Machine(cores=cores)
-    measured = probe(ProbedEnv(OneInEachProcess, {"step_s": step_s}, ()), machine, seconds=2 * BRIEF_S).measured
+    measured = probe(ProbedEnv(FewInEachProcess, {"step_s": step_s}, ()), machine, seconds=2 * BRIEF_S).measured
     assert (measured.copies_worked, measured.copies_failed) == (cores, 0)
-    assert 2 <= measured.failed_in_one_worker <= COPIES_OF_SHORT
-    (line,) = measured.findings
-    assert line.startswith(f"{measured.failed_in_one_worker} copies in one worker: ")
-    assert "multiple simulators" in line
+    assert (measured.worked_in_one_worker, measured.failed_in_one_worker) == (1, 2)
+    assert measured.findings[-1].startswith("2 copies in one worker: ")
+    assert all(re.match("[2-8] copies in one worker: .*multiple simulators", line) for line in measured.findings)
+
+
+def test_more_copies_than_a_process_allows_are_no_limit_on_copies_if_as_many_work_side_by_side(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("millrace.planning.probe_sizes.COPIES_OF_SHORT", 3)
+    monkeypatch.setattr("millrace.planning.plan.usable_cores", lambda: 3)
+    plan = millrace.plan(FewInEachProcess, env_kwargs={"step_s": 0.0, "few": 2}, seconds=4 * BRIEF_S)
+    measured = plan.measured
+    assert (measured.copies_worked, measured.copies_failed) == (3, 0)
+    assert (measured.worked_in_one_worker, measured.failed_in_one_worker) == (2, 3)
+    assert plan.settings["workers"] == plan.settings["envs"]
+    assert plan.settings["eval_copies"] == 1
+    assert not any("OwnProcess" in line for line in plan.advice)
 
 
 def test_if_no_step_can_be_made_the_error_says_why() -> None:
