@@ -25,7 +25,7 @@ from rich.table import Table
 
 from benchmarks.programs import Contender, run
 from benchmarks.writing import write
-from millrace.protocol.policy.networks import ActorCriticNetwork
+from millrace.learner.algorithms.bodies.networks import ActorCriticNetwork
 from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
 
 OURS = "millrace"

@@ -55,7 +55,7 @@ def one_thread(*, uses_torch: bool = True) -> Iterator[None]:
     try:
         with ExitStack() as of_this_thread:
             if uses_torch:
-                from millrace.protocol.policy.networks import defaults_of_thread
+                from millrace.protocol.policy.torch_defaults import defaults_of_thread
 
                 of_this_thread.enter_context(defaults_of_thread())
             yield

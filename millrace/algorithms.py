@@ -45,9 +45,9 @@ What an algorithm learns from:
 Tools:
 
 - `gae` and `vtrace`: compute advantages and value targets from arrays [T, N] and their `EpisodeEnds`.
-- `ActorCriticNetwork`, `QNetwork` and `ActorAndCritics`: the networks that workers act with. `log_prob_and_entropy`,
-  `policy_log_prob` and `squashed_sample` take the outputs of these networks. `trainable`: makes a flat tensor a leaf of the
-  autograd graph.
+- `ActorCriticNetwork`, `QNetwork` and `ActorAndCritics`: networks whose first parameters are those that workers act with.
+  `log_prob_and_entropy`, `policy_log_prob` and `squashed_sample` take the outputs of these networks. `trainable`: makes a
+  flat tensor a leaf of the autograd graph.
 - `ReplayBuffer`: returns a `Sample` of transitions. `MixedReplay` also samples prior data; `Hindsight` replaces the goals of
   transitions; `SequenceReplay` returns a `SequenceSample`, for a policy with memory. `Transitions`: the tensors of either
   kind of sample, with their `Sequences`. `CriticLoss`: the loss of the critics, or of the Q-network, on a minibatch.
@@ -64,6 +64,8 @@ from __future__ import annotations
 from millrace.learner.algorithms.a2c import A2C
 from millrace.learner.algorithms.actor_critic import ActorCritic, Estimates
 from millrace.learner.algorithms.algorithm import Algorithm, Start
+from millrace.learner.algorithms.bodies.autograd_leaves import trainable
+from millrace.learner.algorithms.bodies.networks import ActorAndCritics, ActorCriticNetwork, QNetwork
 from millrace.learner.algorithms.crossq import CrossQ
 from millrace.learner.algorithms.dqn import DQN
 from millrace.learner.algorithms.gradient_descent import GradientDescent, UpdateMetrics, check_finite, scheduled
@@ -106,10 +108,8 @@ from millrace.learner.config.hyperparameters import (
 )
 from millrace.learner.config.resume_rules import Adaptable, Fixed, Free
 from millrace.protocol.errors import UsageError
-from millrace.protocol.policy.autograd_leaves import trainable
 from millrace.protocol.policy.encoder import Encoder, RecurrentInput
 from millrace.protocol.policy.features import features
-from millrace.protocol.policy.networks import ActorAndCritics, ActorCriticNetwork, QNetwork
 from millrace.protocol.policy.normalize import normalize
 from millrace.protocol.policy.torch_distributions import log_prob_and_entropy, policy_log_prob, squashed_sample
 from millrace.protocol.random_streams import Purpose, torch_seed

@@ -41,6 +41,7 @@ REAL_PROCESSES = "tests/system/"
 OF_TOOLS = "tests/benchmarks/"
 """Tests of what users do not install."""
 NO_PROCESS = (
+    "tests/learner/algorithms/bodies/test_networks.py",
     "tests/learner/algorithms/replay/",
     "tests/learner/algorithms/test_a2c.py",
     "tests/learner/algorithms/test_action_masks.py",

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from millrace.learner.algorithms import losses
 from millrace.learner.algorithms.algorithm import Algorithm
+from millrace.learner.algorithms.bodies.networks import ActorCriticNetwork
 from millrace.learner.algorithms.gradient_descent import GradientDescent, UpdateMetrics, clip_norm
 from millrace.learner.algorithms.kernels.optimizer_step import make_optimizer, take_step
 from millrace.learner.algorithms.kernels.trained_networks import actor_critic_network
@@ -36,7 +37,6 @@ from millrace.learner.config.hyperparameters import ActorCriticConfig, Algorithm
 from millrace.protocol.arrays import Array, Bools, Floats
 from millrace.protocol.errors import RunError, UsageError
 from millrace.protocol.policy.encoder import RecurrentInput
-from millrace.protocol.policy.networks import ActorCriticNetwork
 from millrace.protocol.random_streams import Purpose, torch_seed
 from millrace.protocol.rollout import Batch
 from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec

@@ -16,9 +16,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from millrace.learner.algorithms.bodies.networks import ActorCriticNetwork
 from millrace.protocol.arrays import Array, Bools, Floats
 from millrace.protocol.policy.encoder import RecurrentInput
-from millrace.protocol.policy.networks import ActorCriticNetwork
 from millrace.protocol.rollout import Batch
 
 Index = Tensor | slice

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from millrace.learner.algorithms.algorithm import Start
+from millrace.learner.algorithms.bodies.autograd_leaves import trainable
 from millrace.learner.algorithms.gradient_descent import UpdateMetrics
 from millrace.learner.algorithms.kernels.optimizer_step import make_optimizer
 from millrace.learner.algorithms.replay.continuous import Continuous
@@ -20,7 +21,6 @@ from millrace.learner.algorithms.replay.off_policy import CriticLoss
 from millrace.learner.algorithms.replay.transitions import Transitions
 from millrace.learner.config.hyperparameters import SACConfig
 from millrace.protocol.errors import UsageError
-from millrace.protocol.policy.autograd_leaves import trainable
 from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
 
 

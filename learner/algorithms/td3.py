@@ -9,12 +9,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from millrace.learner.algorithms.bodies.networks import ActorAndCritics
 from millrace.learner.algorithms.gradient_descent import UpdateMetrics
 from millrace.learner.algorithms.replay.continuous import Continuous
 from millrace.learner.algorithms.replay.off_policy import CriticLoss
 from millrace.learner.algorithms.replay.transitions import Transitions
 from millrace.learner.config.hyperparameters import TD3Config
-from millrace.protocol.policy.networks import ActorAndCritics
 from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
 
 

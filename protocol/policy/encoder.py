@@ -13,8 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from millrace.protocol.policy.autograd_leaves import named_leaves
-from millrace.protocol.policy.layout import convolutions, encoder_layout
+from millrace.protocol.policy.layout import convolutions
 from millrace.protocol.policy.own_encoder import make_encoder
 from millrace.protocol.specs import PolicySpec
 
@@ -68,20 +67,13 @@ class Encoder:
     """The layers before the MLPs: the convolutions of each image or the user-defined module, then the recurrent core."""
 
     def __init__(self, spec: PolicySpec, parameters: dict[str, Tensor], device: str | torch.device, *, seed: int) -> None:
-        """`parameters` has leaves of autograd's graph, by name. Leaves of a user-defined module are replaced by the module's
-        own parameters, which then use the same memory.
+        """`parameters` has tensors by name; to train the encoder, pass leaves of autograd's graph. Tensors of a user-defined
+        module are replaced by the module's own parameters, which then use the same memory.
         """
         self._spec = spec
         self._parameters = parameters
         self._module = None if spec.encoder is None else self._adopt(make_encoder(spec, seed).to(device))
         self._images = self._convolutions()
-
-    @classmethod
-    def of_flat(
-        cls, spec: PolicySpec, values: Tensor, gradient: Tensor, device: str | torch.device, *, seed: int
-    ) -> Encoder:
-        """An encoder whose parameters and gradients are these flat tensors."""
-        return cls(spec, named_leaves(values, gradient, encoder_layout(spec)[0]), device, seed=seed)
 
     def __call__(self, x: Tensor, images: Sequence[Tensor], recurrent: RecurrentInput | None = None) -> Tensor:
         """Features [B, D] and images [B, *leaf] uint8 -> input of the MLPs [B, D + IMAGE_FEATURES per image].

@@ -2,7 +2,7 @@
 
 All parameters of a policy are in one flat float32 buffer. The parameters that are needed to act come first, so publishing
 weights copies only the first part of the buffer. Loading weights makes views of the received frame. Only `parameter_layout`
-defines the positions. The parameters of the networks in `millrace.protocol.policy.networks` are views with the same layout.
+defines the positions. The parameters of the networks in torch are views with the same layout.
 """
 
 from __future__ import annotations
@@ -198,10 +198,14 @@ def buffer_layout(spec: PolicySpec) -> tuple[Field, ...]:
 EXPLORATION = ("epsilon", "noise_scale", "warm_up")
 
 
-def appended_params(spec: PolicySpec, buffers: Mapping[str, Array]) -> Array | None:
-    """The exploration parameters [K] that follow a network's output in the distribution params; None if there are none."""
-    appended = [buffers[field.name] for field in buffer_layout(spec) if field.name in EXPLORATION]
-    return np.concatenate(appended) if appended else None
+def appended_params(parameters: Mapping[str, Array], buffers: Mapping[str, Array]) -> Array | None:
+    """What follows a network's outputs in the distribution params [K]: log standard deviations, or exploration parameters.
+
+    None if there is neither. The arguments are the arrays of a policy's weights, by name.
+    """
+    appended = [parameters.get("actor.log_std"), *map(buffers.get, EXPLORATION)]
+    found = [array for array in appended if array is not None]
+    return np.concatenate(found) if found else None
 
 
 def buffer_size(spec: PolicySpec) -> int:

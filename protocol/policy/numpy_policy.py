@@ -50,7 +50,7 @@ class NumpyPolicy:
         self._buffers = named_views(buffers, buffer_layout(self.spec))
         self._hidden = [self._linear(name) for name in hidden_names(self.spec)]
         self._out = self._linear("q.out" if self.spec.head == "q" else "actor.out")
-        self._appended_params = self._parameters.get("actor.log_std", appended_params(self.spec, self._buffers))
+        self._appended_params = appended_params(self._parameters, self._buffers)
 
     def _linear(self, name: str) -> tuple[Floats, Floats]:
         return self._parameters[f"{name}.weight"].T, self._parameters[f"{name}.bias"]

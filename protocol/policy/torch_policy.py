@@ -11,11 +11,12 @@ import numpy as np
 import torch
 
 from millrace.protocol.arrays import Array, Floats
+from millrace.protocol.policy.acting_network import ActingNetwork
 from millrace.protocol.policy.features import features
-from millrace.protocol.policy.layout import appended_params, buffer_layout, buffer_size, named_views
-from millrace.protocol.policy.networks import defaults_of_thread, network_of
+from millrace.protocol.policy.layout import appended_params, buffer_layout, buffer_size, named_views, parameter_layout
 from millrace.protocol.policy.normalize import normalize
 from millrace.protocol.policy.recurrent import zero_state
+from millrace.protocol.policy.torch_defaults import defaults_of_thread
 from millrace.protocol.specs import PolicySpec
 from millrace.protocol.wire.weight_dtypes import ActingDtype
 
@@ -37,22 +38,23 @@ class TorchPolicy:
         self._device = device
         self._together = together
         with defaults_of_thread():
-            self._net = network_of(spec, device)
+            self._net = ActingNetwork(spec, device)
         self._buffers: dict[str, Floats] = {}
 
     def load(self, parameters: Floats, buffers: Floats) -> None:
         """Copy these weights, and use them from now on. Raises `ValueError` if their sizes do not fit the spec."""
-        count = self._net.acting_size
+        count = len(self._net.flat)
         if parameters.shape != (count,) or buffers.shape != (buffer_size(self.spec),):
             raise ValueError(
                 f"weights: expected {count} parameters and {buffer_size(self.spec)} buffers, "
                 f"got {parameters.shape} and {buffers.shape}"
             )
         with defaults_of_thread():
-            self._net.flat[:count].copy_(torch.tensor(parameters))
+            self._net.flat.copy_(torch.tensor(parameters))
             if self._images_dtype == "bfloat16":
                 self._net.encode.use_bfloat16()
         self._buffers = named_views(buffers, buffer_layout(self.spec))
+        self._appended_params = appended_params(named_views(parameters, parameter_layout(self.spec)[0]), self._buffers)
 
     def __call__(self, leaves: Sequence[Array], state: Floats | None = None) -> Floats:
         """Distribution params [L, N, P] for these observations [L, N, *leaf]; see `Policy`."""
@@ -69,17 +71,17 @@ class TorchPolicy:
             state[...] = flat_state.reshape(state.shape)
         else:
             out = np.stack([self._lane(x[lane], [image[lane] for image in images], state[lane]) for lane in range(len(x))])
-        appended = appended_params(self.spec, self._buffers)
+        appended = self._appended_params
         if appended is None:
             return out
         return np.concatenate([out, np.broadcast_to(appended, (*out.shape[:-1], len(appended)))], -1)
 
     def _lane(self, x: Floats, images: Sequence[Array], state: Floats) -> Floats:
-        """Distribution params [N, P] of one lane, for x [N, D], images [N, *leaf] and state [N, S], which is updated in
+        """The network's outputs [N, O] for one lane, given x [N, D], images [N, *leaf] and state [N, S], which is updated in
         place.
         """
         inputs = torch.tensor(x, device=self._device), [torch.tensor(image, device=self._device) for image in images]
         with defaults_of_thread(), torch.no_grad():
-            params, after = self._net.act(*inputs, torch.tensor(state, device=self._device))
+            out, after = self._net(*inputs, torch.tensor(state, device=self._device))
         state[:] = after.cpu().numpy()
-        return np.asarray(params.cpu().numpy())
+        return np.asarray(out.cpu().numpy())

@@ -19,11 +19,11 @@ import pytest
 
 import millrace
 from millrace.cli.status import as_table
+from millrace.learner.algorithms.bodies.networks import ActorCriticNetwork
 from millrace.policies import PolicyParameters
 from millrace.protocol.envs.spaces import action_spec, observation_leaves
 from millrace.protocol.errors import CheckpointError, RunError, UsageError
 from millrace.protocol.policy.called_policy import CalledPolicy
-from millrace.protocol.policy.networks import ActorCriticNetwork
 from millrace.protocol.policy.policy import make_policy
 from millrace.protocol.rollout import stack_rollouts
 from millrace.workers.collect.collector import Collector

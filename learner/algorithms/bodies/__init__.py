@@ -1,1 +1,1 @@
-"""Networks for the newer off-policy algorithms: bodies with batch normalization, and heads for quantiles and categories."""
+"""The networks that the learner trains, in torch. Small networks also have a pass in numpy (`kernels/`)."""

@@ -13,13 +13,13 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
+from millrace.learner.algorithms.bodies.autograd_leaves import named_leaves, trainable
+from millrace.learner.algorithms.bodies.networks import initial_fields
 from millrace.learner.algorithms.bodies.stacked_mlps import MLPShape, StackedMLPs, initial, initial_statistics
 from millrace.protocol.arrays import Floats
-from millrace.protocol.policy.autograd_leaves import trainable
 from millrace.protocol.policy.encoder import Encoder
 from millrace.protocol.policy.layout import LOG_STD_BOUNDS, encoder_layout
 from millrace.protocol.policy.malloc import keep_freed_memory
-from millrace.protocol.policy.networks import initial_fields
 from millrace.protocol.policy.torch_distributions import squashed_sample
 from millrace.protocol.random_streams import Purpose, torch_seed
 from millrace.protocol.specs import PolicySpec
@@ -54,7 +54,7 @@ class ActorWithCritics:
         self.critics = self.flat[sizes[0] :]
         """[E + C] in the memory of `flat`: the encoder, then the critics"""
         self.critics.grad = self.flat_grad[sizes[0] :]
-        self.encode = Encoder.of_flat(policy, self._encoder, of_encoder, device, seed=seed)
+        self.encode = Encoder(policy, named_leaves(self._encoder, of_encoder, fields), device, seed=seed)
         statistics = [initial_statistics(shape) for shape in (actor, critics)]
         self.statistics = torch.cat(statistics).to(device)
         """[S] the running statistics, the actor's first; empty without normalization"""

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from millrace.protocol.policy.networks import refuse_second_derivatives
+from millrace.learner.algorithms.bodies.mlp_nodes import refuse_second_derivatives
 
 EPS = 1e-3
 """the ε added to each variance, as in CrossQ and XQC"""

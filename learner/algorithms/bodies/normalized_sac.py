@@ -14,12 +14,12 @@ from torch import Tensor
 
 from millrace.learner.algorithms.algorithm import Start
 from millrace.learner.algorithms.bodies.actor_with_critics import ActorWithCritics
+from millrace.learner.algorithms.bodies.autograd_leaves import trainable
 from millrace.learner.algorithms.gradient_descent import UpdateMetrics
 from millrace.learner.algorithms.replay.transitions import Transitions
 from millrace.learner.algorithms.sac import SAC
 from millrace.learner.config.hyperparameters import NormalizedConfig
 from millrace.protocol.errors import UsageError
-from millrace.protocol.policy.autograd_leaves import trainable
 from millrace.protocol.policy.layout import total_size
 from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
 

@@ -15,13 +15,13 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from millrace.learner.algorithms.bodies.autograd_leaves import named_leaves, trainable
+from millrace.learner.algorithms.bodies.networks import QNetwork, initial_fields
 from millrace.learner.algorithms.bodies.stacked_mlps import MLPShape, Normalized, StackedMLPs, initial, initial_statistics
 from millrace.protocol.arrays import Floats
-from millrace.protocol.policy.autograd_leaves import trainable
 from millrace.protocol.policy.encoder import Encoder
 from millrace.protocol.policy.layout import encoder_layout, named_views
 from millrace.protocol.policy.malloc import keep_freed_memory
-from millrace.protocol.policy.networks import QNetwork, initial_fields
 from millrace.protocol.random_streams import Purpose, torch_seed
 from millrace.protocol.specs import PolicySpec
 
@@ -47,7 +47,7 @@ class QuantileQNetwork:
         self.flat.grad = self.flat_grad
         self._encoder, layers = torch.split(self.flat, sizes)
         of_encoder, of_layers = torch.split(self.flat_grad, sizes)
-        self.encode = Encoder.of_flat(policy, self._encoder, of_encoder, device, seed=seed)
+        self.encode = Encoder(policy, named_leaves(self._encoder, of_encoder, encoder), device, seed=seed)
         self.statistics = initial_statistics(shape).to(device)
         """[S] the running statistics; empty without normalization"""
         self.body = StackedMLPs(shape, trainable(layers, of_layers), self.statistics)

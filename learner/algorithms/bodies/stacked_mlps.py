@@ -19,9 +19,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from millrace.learner.algorithms.bodies.mlp_nodes import StackedMLPNode
+from millrace.learner.algorithms.bodies.networks import DTYPE
 from millrace.learner.algorithms.bodies.normalized_pass import EPS, Layer, NormalizedPass, Plan, RunningStatistics
 from millrace.protocol.policy.layout import Field, named_views, total_size
-from millrace.protocol.policy.networks import DTYPE, StackedMLP
 
 
 class Normalized(Enum):
@@ -175,7 +176,7 @@ class StackedMLPs:
             views = named_views(flat, self._folded_fields)
             return [view.squeeze(-1) if name.endswith("bias") else view for name, view in views.items()]
 
-        out: Tensor = StackedMLP.apply(x, self.shape.relu, flat, layers_of)  # type: ignore[no-untyped-call]
+        out: Tensor = StackedMLPNode.apply(x, self.shape.relu, flat, layers_of)  # type: ignore[no-untyped-call]
         return out
 
 

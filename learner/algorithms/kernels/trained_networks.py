@@ -12,14 +12,14 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from millrace.learner.algorithms.bodies.autograd_leaves import trainable
+from millrace.learner.algorithms.bodies.networks import ActorAndCritics, ActorCriticNetwork, QNetwork
 from millrace.learner.algorithms.kernels.distribution_kernels import EvaluatedActions, SquashedSample, distribution_kernel
 from millrace.learner.algorithms.kernels.mlp import SmallMLP, Trunks, Values
 from millrace.protocol.arrays import Array, Floats
-from millrace.protocol.policy.autograd_leaves import trainable
 from millrace.protocol.policy.encoder import Encoder, RecurrentInput
 from millrace.protocol.policy.features import feature_size
 from millrace.protocol.policy.layout import CRITICS, hidden_names
-from millrace.protocol.policy.networks import ActorAndCritics, ActorCriticNetwork, QNetwork
 from millrace.protocol.specs import PolicySpec
 
 MAX_UNITS = 256  # units per layer; with more units, matrix products take nearly all the time (`benchmarks.update`)

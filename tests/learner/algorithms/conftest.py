@@ -7,9 +7,8 @@ from collections.abc import Iterator
 import pytest
 import torch
 
-from millrace.learner.algorithms.bodies import stacked_mlps
+from millrace.learner.algorithms.bodies import networks, stacked_mlps
 from millrace.learner.torch_setup import one_thread
-from millrace.protocol.policy import networks
 
 
 @pytest.fixture(autouse=True, scope="module")

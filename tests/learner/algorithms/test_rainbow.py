@@ -10,13 +10,13 @@ import pytest
 import torch
 from torch import Tensor
 
+from millrace.learner.algorithms.bodies.networks import QNetwork
 from millrace.learner.algorithms.bodies.stacked_mlps import initial
 from millrace.learner.algorithms.rainbow import Rainbow
 from millrace.learner.algorithms.replay.transitions import Transitions
 from millrace.learner.config.hyperparameters import RainbowConfig
 from millrace.protocol.errors import UsageError
 from millrace.protocol.policy.layout import named_views, parameter_layout, total_size
-from millrace.protocol.policy.networks import QNetwork
 from millrace.protocol.policy.numpy_policy import NumpyPolicy
 from millrace.protocol.policy.torch_policy import TorchPolicy
 from millrace.protocol.random_streams import Purpose, torch_seed

@@ -18,6 +18,7 @@ import torch
 from gymnasium import spaces
 from torch import Tensor, nn
 
+from millrace.learner.algorithms.bodies.networks import ActorCriticNetwork
 from millrace.learner.algorithms.dqn import DQN
 from millrace.learner.algorithms.ppo import PPO
 from millrace.learner.config.hyperparameters import DQNConfig, PPOConfig
@@ -26,7 +27,6 @@ from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.envs.env_actions import make_action_converter
 from millrace.protocol.envs.spaces import action_spec, observation_leaves
 from millrace.protocol.policy.distributions import distribution
-from millrace.protocol.policy.networks import ActorCriticNetwork
 from millrace.protocol.policy.policy import make_policy
 from millrace.protocol.policy.torch_distributions import log_prob_and_entropy
 from millrace.protocol.specs import PolicySpec

@@ -7,9 +7,9 @@ import torch
 from msgspec.structs import replace
 from torch.utils.flop_counter import FlopCounterMode
 
+from millrace.learner.algorithms.bodies.networks import ActorCriticNetwork
 from millrace.protocol.policy.arithmetic import multiply_adds
 from millrace.protocol.policy.features import feature_size
-from millrace.protocol.policy.networks import ActorCriticNetwork
 from millrace.protocol.policy.own_encoder import describe_encoder
 from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import resource
+from typing import Any
 
 import numpy as np
 import pytest
 
+from millrace.learner.algorithms.bodies.networks import ActorCriticNetwork
+from millrace.protocol.policy.acting_network import ActingNetwork
 from millrace.protocol.policy.malloc import keep_freed_memory
-from millrace.protocol.policy.networks import ActorCriticNetwork
 from millrace.protocol.specs import ActionSpec, Leaf, PolicySpec
 
 
@@ -30,11 +32,12 @@ def test_freed_memory_is_used_again() -> None:
     assert faults(8, 20) < pages_a_round
 
 
-def test_networks_that_look_at_images_keep_it_and_others_do_not(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("network", [ActingNetwork, ActorCriticNetwork])
+def test_networks_that_look_at_images_keep_it_and_others_do_not(network: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     kept: list[bool] = []
-    monkeypatch.setattr("millrace.protocol.policy.networks.keep_freed_memory", lambda: kept.append(True))
+    monkeypatch.setattr(f"{network.__module__}.keep_freed_memory", lambda: kept.append(True))
     action = ActionSpec("discrete", (), "int64", (4,), (0,))
-    ActorCriticNetwork(PolicySpec((Leaf("", "box", (4,), "float32"),), action))
+    network(PolicySpec((Leaf("", "box", (4,), "float32"),), action))
     assert kept == []
-    ActorCriticNetwork(PolicySpec((Leaf("", "box", (36, 36, 1), "uint8", divisor=255),), action))
+    network(PolicySpec((Leaf("", "box", (36, 36, 1), "uint8", divisor=255),), action))
     assert kept == [True]

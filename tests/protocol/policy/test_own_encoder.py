@@ -9,9 +9,9 @@ import msgspec
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
 from millrace.learner.algorithms import algorithm_class
+from millrace.learner.algorithms.bodies.networks import ActorCriticNetwork, QNetwork
 from millrace.learner.config.hyperparameters import HYPERPARAMETERS
 from millrace.learner.config.layers import resolve
 from millrace.learner.run_folder.run_folder import RunFolder
@@ -19,7 +19,6 @@ from millrace.protocol.env_spec import AllowedCode, EnvSpec
 from millrace.protocol.errors import UsageError
 from millrace.protocol.policy.encoder import RecurrentInput
 from millrace.protocol.policy.layout import acting_size
-from millrace.protocol.policy.networks import ActorCriticNetwork, QNetwork
 from millrace.protocol.policy.own_encoder import describe_encoder, make_encoder
 from millrace.protocol.policy.policy import make_policy
 from millrace.protocol.policy.torch_policy import TorchPolicy
@@ -82,16 +81,11 @@ def test_acting_with_it_is_learning_with_it(spec: PolicySpec) -> None:
     assert isinstance(policy, TorchPolicy)
     policy.load(net.flat.numpy()[: net.acting_size], np.zeros(int(spec.head == "q"), np.float32))
     obs = np.random.default_rng(0).normal(size=(2, 3, 4)).astype(np.float32)
-    state = torch.zeros(6, spec.state_size)
-
-    def params(net: ActorCriticNetwork | QNetwork, x: Tensor, state: Tensor) -> Tensor:
-        return net.act(x, (), state)[0] if isinstance(net, ActorCriticNetwork) else net.params(x)
-
     x = torch.tensor(obs).flatten(0, 1)
     exact = in_float64(net)
-    (expected,) = sampled(lambda: [params(exact, x.double(), state.double())])
+    (expected,) = sampled(lambda: [exact.params(x.double())])
     with torch.no_grad():
-        expected.assert_is(params(net, x, state).numpy(), policy([obs])[..., :4].reshape(6, 4))
+        expected.assert_is(net.params(x).numpy(), policy([obs])[..., :4].reshape(6, 4))
 
 
 def test_one_that_is_different_here_is_refused() -> None:

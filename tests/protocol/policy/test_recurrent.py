@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from millrace.learner.algorithms import algorithm_class
+from millrace.learner.algorithms.bodies.networks import ActorCriticNetwork
 from millrace.learner.algorithms.minibatches import Minibatch, log_probs
 from millrace.learner.algorithms.ppo import PPO
 from millrace.learner.config.hyperparameters import HYPERPARAMETERS, PPOConfig
@@ -22,7 +23,6 @@ from millrace.protocol.messages import Evaluate, Permit
 from millrace.protocol.policy.distributions import distribution
 from millrace.protocol.policy.encoder import RecurrentInput
 from millrace.protocol.policy.layout import buffer_size
-from millrace.protocol.policy.networks import ActorCriticNetwork
 from millrace.protocol.policy.numpy_policy import NumpyPolicy
 from millrace.protocol.policy.policy import make_policy
 from millrace.protocol.policy.recurrent import advance, zero_state

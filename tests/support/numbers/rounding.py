@@ -27,9 +27,9 @@ import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from millrace.learner.algorithms.bodies.networks import ActorAndCritics, ActorCriticNetwork, FlatNetwork, QNetwork
 from millrace.protocol.arrays import Array
 from millrace.protocol.policy.encoder import RecurrentInput
-from millrace.protocol.policy.networks import FlatNetwork, network_of
 
 UNIT = 2.0**-24
 ELEMENTWISE = 16  # roundings that an activation, a softmax or a log-probability adds
@@ -117,7 +117,7 @@ def assert_within(found: Array, expected: Array, tolerance: Array) -> None:
 
 def in_float64(net: FlatNetwork) -> Any:
     """A copy of a network in plain torch without its flat tensors: the parameters are float64, each by itself."""
-    made = network_of(net.spec)
+    made = next(kind for kind in (ActorCriticNetwork, QNetwork, ActorAndCritics) if isinstance(net, kind))(net.spec)
     for name, parameter in made.parameters.items():
         parameter.grad = None
         parameter.data = net.parameters[name].detach().double()

@@ -16,11 +16,11 @@ import pytest
 import torch
 from gymnasium.wrappers import OrderEnforcing, TimeLimit
 
+from millrace.learner.algorithms.bodies.networks import ActorCriticNetwork
 from millrace.protocol.arrays import Array
 from millrace.protocol.messages import Permit
 from millrace.protocol.policy.distributions import distribution
 from millrace.protocol.policy.features import features
-from millrace.protocol.policy.networks import ActorCriticNetwork
 from millrace.protocol.policy.normalize import normalize
 from millrace.protocol.specs import Leaf, RunSpec
 from millrace.workers.collect.collector import Collector

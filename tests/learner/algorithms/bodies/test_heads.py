@@ -11,10 +11,10 @@ import torch
 from torch import Tensor
 from torch.optim import Optimizer
 
+from millrace.learner.algorithms.bodies.autograd_leaves import trainable
 from millrace.learner.algorithms.bodies.heads import Categories, lowest, quantile_huber
 from millrace.learner.algorithms.kernels.optimizer_step import make_optimizer, take_step
 from millrace.protocol.arrays import Doubles
-from millrace.protocol.policy.autograd_leaves import trainable
 
 ROUNDING: dict[str, Any] = {"rtol": 1e-10, "atol": 1e-12}
 

@@ -10,6 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from millrace.learner.algorithms.bodies.autograd_leaves import trainable
 from millrace.learner.algorithms.bodies.stacked_mlps import (
     MLPShape,
     Normalized,
@@ -17,7 +18,6 @@ from millrace.learner.algorithms.bodies.stacked_mlps import (
     initial,
     initial_statistics,
 )
-from millrace.protocol.policy.autograd_leaves import trainable
 from millrace.protocol.policy.layout import total_size
 from tests.learner.algorithms.bodies import plain_formula as plain
 from tests.support.variants import variants

@@ -15,14 +15,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
+from millrace.learner.algorithms.bodies import networks
+from millrace.learner.algorithms.bodies.networks import ActorAndCritics, ActorCriticNetwork, FlatNetwork, QNetwork
 from millrace.learner.algorithms.kernels import mlp as layers
 from millrace.learner.algorithms.kernels import trained_networks
 from millrace.learner.algorithms.kernels.trained_networks import SmallActorAndCritics, SmallActorCritic, SmallQNetwork
 from millrace.protocol.action_parts import parts_of
-from millrace.protocol.policy import networks
-from millrace.protocol.policy.networks import ActorAndCritics, ActorCriticNetwork, FlatNetwork, QNetwork
 from millrace.protocol.specs import ActionSpec, PolicySpec
-from tests.protocol.policy.test_networks import ACTIONS
+from tests.protocol.policy.test_torch_policy import ACTIONS
 from tests.support.examples import examples
 from tests.support.numbers.batches import BOX, DISCRETE, GAUSSIAN, IMAGE, recurrent, shared
 from tests.support.numbers.finite_differences import is_the_slope

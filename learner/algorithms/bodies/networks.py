@@ -1,4 +1,4 @@
-"""The networks in torch. The learner trains them. Workers act with them if a policy has images or a user-defined encoder.
+"""The networks that the learner trains, in torch. Workers act with the first part of their parameters.
 
 All parameters are in one flat float32 tensor, in the layout of `millrace.protocol.policy.layout`, and all gradients in a
 second one. The named arrays are views of these two tensors, so the gradient norm is the norm of one tensor, an Adam step is
@@ -9,18 +9,16 @@ one kernel, and publishing copies the first part of one tensor. Features come fr
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Sequence
 from functools import partial
-from typing import Any
 
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from millrace.learner.algorithms.bodies.autograd_leaves import named_leaves, trainable
+from millrace.learner.algorithms.bodies.mlp_nodes import MLPNode, StackedMLPNode
 from millrace.protocol.arrays import Floats
-from millrace.protocol.policy.autograd_leaves import named_leaves, trainable
 from millrace.protocol.policy.encoder import Encoder, RecurrentInput
 from millrace.protocol.policy.features import feature_size
 from millrace.protocol.policy.layout import (
@@ -42,108 +40,7 @@ DTYPE = torch.float32
 """dtype of all parameters, whatever PyTorch's default dtype is"""
 
 
-@contextmanager
-def defaults_of_thread() -> Iterator[None]:
-    """A context with PyTorch's original thread-local defaults: gradients are on, autocast is off, tensors are on the CPU."""
-    with ExitStack() as stack:
-        stack.enter_context(torch.inference_mode(False))
-        stack.enter_context(torch.enable_grad())
-        if torch.get_default_device().type != "cpu":
-            stack.enter_context(torch.device("cpu"))  # entered only if needed, because it slows every call to torch
-        for device in ("cpu", "cuda"):
-            if torch.is_autocast_enabled(device):
-                stack.enter_context(torch.autocast(device, enabled=False))
-        yield
-
-
-def refuse_second_derivatives() -> None:
-    """Raise `RuntimeError` in a backward pass with `create_graph`, whose result would lack the terms of hidden layers."""
-    if torch.is_grad_enabled():
-        raise RuntimeError("millrace's networks have no second derivatives; call backward without create_graph")
-
-
-class MLPNode(torch.autograd.Function):
-    """Hidden layers and a linear head as one node of autograd's graph. With one node per operation, small networks are slow.
-
-    Forward: h₀ = x [B, D];  hᵢ = φ(hᵢ₋₁ Wᵢᵀ + bᵢ);  output = h Wᵀ + b [B, O].
-    Backward: with g = ∂L/∂(pre-activation), ∂L/∂W = gᵀ h, ∂L/∂b = Σ g, ∂L/∂h = g W; φ' is 1 − h² (tanh) or h > 0 (ReLU).
-    """
-
-    @staticmethod
-    def forward(ctx: Any, x: Tensor, relu: bool, *layers: Tensor) -> Tensor:
-        """`layers` alternates weight [out, in] and bias [out]; the last pair is the head."""
-        inputs = [x]
-        *hidden, weight, bias = layers
-        for w, b in zip(hidden[::2], hidden[1::2], strict=True):
-            x = torch.addmm(b, x, w.t())
-            inputs.append(x.relu_() if relu else x.tanh_())
-        ctx.relu = relu
-        ctx.save_for_backward(*inputs, *layers[::2])
-        return torch.addmm(bias, x, weight.t())
-
-    @staticmethod
-    def backward(ctx: Any, *outputs: Tensor) -> tuple[Tensor | None, ...]:
-        """Gradients with respect to x (if needed), and to each layer's weight and bias."""
-        refuse_second_derivatives()
-        (g,) = outputs
-        half = len(ctx.saved_tensors) // 2
-        inputs = ctx.saved_tensors[:half]
-        weights = ctx.saved_tensors[half:]
-        gradients: list[Tensor | None] = []
-        for i in range(half - 1, 0, -1):
-            gradients += [g.sum(0), g.t() @ inputs[i]]
-            g = g @ weights[i]
-            if ctx.relu:
-                g = torch.ops.aten.threshold_backward(g, inputs[i], 0)
-            else:
-                g = torch.ops.aten.tanh_backward(g, inputs[i])
-        gradients += [g.sum(0), g.t() @ inputs[0], None, g @ weights[0] if ctx.needs_input_grad[0] else None]
-        return tuple(reversed(gradients))
-
-
-class StackedMLP(torch.autograd.Function):
-    """K networks of the same shape on the same input, as one node: `MLPNode` with batched products. [B, D] -> [K, B, O]."""
-
-    @staticmethod
-    def forward(ctx: Any, x: Tensor, relu: bool, flat: Tensor, layers_of: Callable[[Tensor], list[Tensor]]) -> Tensor:
-        """`layers_of` returns the layers as views of a tensor like `flat`: weight [K, out, in] and bias [K, out] in turn."""
-        *hidden, weight, bias = layers = layers_of(flat)
-        x = x.expand(len(weight), *x.shape)
-        inputs = [x]
-        for w, b in zip(hidden[::2], hidden[1::2], strict=True):
-            x = torch.baddbmm(b.unsqueeze(1), x, w.mT)
-            inputs.append(x.relu_() if relu else x.tanh_())
-        ctx.relu = relu
-        ctx.layers_of = layers_of
-        ctx.size = len(flat)
-        ctx.save_for_backward(*inputs, *layers[::2])
-        return torch.baddbmm(bias.unsqueeze(1), x, weight.mT)
-
-    @staticmethod
-    def backward(ctx: Any, *outputs: Tensor) -> tuple[Tensor | None, ...]:
-        """Gradients with respect to x and to `flat`, each only if it is needed."""
-        refuse_second_derivatives()
-        (g,) = outputs
-        half = len(ctx.saved_tensors) // 2
-        inputs = ctx.saved_tensors[:half]
-        weights = ctx.saved_tensors[half:]
-        _, _, trains, _ = ctx.needs_input_grad
-        by_flat = g.new_zeros(ctx.size) if trains else None
-        by_layers = [] if by_flat is None else ctx.layers_of(by_flat)
-        for i in range(half - 1, -1, -1):
-            if trains:
-                by_layers[2 * i].copy_(g.mT @ inputs[i])
-                by_layers[2 * i + 1].copy_(g.sum(1))
-            if i:
-                g = g @ weights[i]
-                if ctx.relu:
-                    g = torch.ops.aten.threshold_backward(g, inputs[i], 0)
-                else:
-                    g = torch.ops.aten.tanh_backward(g, inputs[i])
-        return (g @ weights[0]).sum(0) if ctx.needs_input_grad[0] else None, None, by_flat, None
-
-
-class FlatNetwork(ABC):
+class FlatNetwork:
     """Base of all networks: named parameters that are views of one flat tensor, and the layers before the heads."""
 
     def __init__(self, spec: PolicySpec, device: str | torch.device = "cpu", *, seed: int = 0) -> None:
@@ -179,15 +76,6 @@ class FlatNetwork(ABC):
             return x
         out = self.mlp(x, layers)
         return torch.relu(out) if self._relu else torch.tanh(out)
-
-    @abstractmethod
-    def head(self, h: Tensor) -> Tensor:
-        """Distribution params [B, P] for the encoder's outputs h [B, H]."""
-
-    def act(self, x: Tensor, images: Sequence[Tensor], state: Tensor) -> tuple[Tensor, Tensor]:
-        """Distribution params [B, P] for one step of B copies, and the core's state [B, S] after it."""
-        h, state = self.encode.act(x, images, state)
-        return self.head(h), state
 
 
 class ActorCriticNetwork(FlatNetwork):
@@ -254,10 +142,6 @@ class ActorCriticNetwork(FlatNetwork):
             others = params.shape[-1] - mask.shape[-1]  # params of bits and numbers, which follow those of choices
             params = params.masked_fill(F.pad(~mask, (0, others)), FORBIDDEN)
         return *log_prob_and_entropy(self.spec.action, params, action), value
-
-    def head(self, h: Tensor) -> Tensor:
-        """Distribution params [B, P] for the encoder's outputs h [B, H]."""
-        return self._params(self.hidden(h, self._trunk))
 
 
 class QNetwork(FlatNetwork):
@@ -329,12 +213,8 @@ class ActorAndCritics(FlatNetwork):
         return views
 
     def params(self, x: Tensor, images: Sequence[Tensor] = ()) -> Tensor:
-        """Like `actor_params`, for features [B, D] float32 and images [B, *leaf] uint8, for acting."""
+        """Like `actor_params`, for features [B, D] float32 and images [B, *leaf] uint8."""
         return self.actor_params(self.encode(x, images))
-
-    def head(self, h: Tensor) -> Tensor:
-        """Like `actor_params`: distribution params without the exploration parameters, which the learner sends."""
-        return self.actor_params(h)
 
     def actor_params(self, h: Tensor) -> Tensor:
         """The actor's output before the hyperbolic tangent: [B, D′] if it is deterministic, else [B, 2 D′].
@@ -358,21 +238,8 @@ class ActorAndCritics(FlatNetwork):
         """
         flat = self._constant_critics if constant else self._critics
         layers = partial(self._stacked, critics)
-        out: Tensor = StackedMLP.apply(torch.cat((h, action), -1), self._relu, flat, layers)  # type: ignore[no-untyped-call]
+        out: Tensor = StackedMLPNode.apply(torch.cat((h, action), -1), self._relu, flat, layers)  # type: ignore[no-untyped-call]
         return out[..., 0]
-
-
-def network_of(
-    spec: PolicySpec, device: str | torch.device = "cpu", *, seed: int = 0
-) -> ActorCriticNetwork | QNetwork | ActorAndCritics:
-    """The network of this policy."""
-    match spec.head:
-        case "actor_critic":
-            return ActorCriticNetwork(spec, device, seed=seed)
-        case "q":
-            return QNetwork(spec, device, seed=seed)
-        case "squashed" | "deterministic":
-            return ActorAndCritics(spec, device, seed=seed)
 
 
 def initial_fields(fields: Sequence[Field], generator: torch.Generator) -> Tensor:
