@@ -11,6 +11,7 @@ import numpy as np
 from millrace.protocol.bounds import MAX_FACTS, MAX_NAME, one_line
 from millrace.protocol.call_timeouts import CallTimeouts
 from millrace.protocol.env_spec import AllowedCode, EnvSpec, PickledCallable, Scalar
+from millrace.protocol.policy.heads import HEADS
 from millrace.protocol.space_spec import Shape
 from millrace.protocol.wire.weight_dtypes import ActingDtype
 
@@ -224,7 +225,7 @@ class PolicySpec(msgspec.Struct, frozen=True):
     @property
     def stores_scaled_actions(self) -> bool:
         """True if stored actions are in [-1, 1], and -1 and 1 stand for the bounds of the Box."""
-        return self.own is None and self.head in ("squashed", "deterministic")
+        return self.own is None and HEADS[self.head].stores_scaled_actions
 
     @property
     def needs_torch(self) -> bool:

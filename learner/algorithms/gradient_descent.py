@@ -12,7 +12,6 @@ from typing import Any, Protocol
 
 import numpy as np
 import torch
-from msgspec.structs import replace
 from torch import Tensor
 from torch.optim import Optimizer
 
@@ -56,9 +55,7 @@ class GradientDescent(Algorithm):
         self.env_steps = 0  # env steps of all batches so far, on which schedules depend
         self.version = 0  # updates made so far
         self._total_steps = total_steps
-        # With some heads, the policy's buffers also hold exploration settings. The normalizer must not count these, so it
-        # gets the policy with a head that has no exploration settings.
-        self.normalizer = ObservationNormalizer(replace(policy, head="actor_critic"))
+        self.normalizer = ObservationNormalizer(policy)
         self.statistics: Floats = self.normalizer.buffers()  # float32 means and standard deviations, as published
         self.rewards = RewardScaler(config.gamma)
         self.pretraining_steps = 0  # gradient steps taken before the first update by other code, such as cloning

@@ -47,9 +47,7 @@ class Normalizer:
 
     def __init__(self, policy: PolicySpec) -> None:
         """Create a normalizer for this policy's observations, even if the policy doesn't normalize them itself."""
-        self._policy = msgspec.structs.replace(
-            policy, normalize_observations=True, own=None, encoder=None, head="actor_critic"
-        )
+        self._policy = msgspec.structs.replace(policy, normalize_observations=True)
         self._observations = ObservationNormalizer(self._policy)
         self._size = feature_size(self._policy)
         self._rewards: tuple[float, RewardScaler] | None = None

@@ -23,7 +23,6 @@ from msgspec.structs import replace
 from millrace.learner.algorithms.returns import EpisodeEnds, discounted_return
 from millrace.protocol.arrays import Array, Bools, Doubles, Floats
 from millrace.protocol.policy.features import feature_size, features, leaf_of_features
-from millrace.protocol.policy.layout import buffer_size
 from millrace.protocol.policy.normalize import CLIP, normalize
 from millrace.protocol.rollout import Batch
 from millrace.protocol.specs import PolicySpec
@@ -89,7 +88,6 @@ class ObservationNormalizer:
         self._is_wide = np.array([leaf.is_wide for leaf in leaves], bool)
         self._moments = self._no_moments()
         self._first: Doubles = np.empty((0, len(leaves)))  # [K, D] the first rows, kept while there are fewer than `FEW`
-        assert not self._enabled or buffer_size(spec) == 2 * len(leaves)
 
     def _no_moments(self) -> RunningMoments:
         return RunningMoments((len(self._is_wide),), np.where(self._is_wide, ROUNDING_64, ROUNDING_32))

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from millrace.protocol.policy.encoder import Encoder
+from millrace.protocol.policy.heads import HEADS
 from millrace.protocol.policy.layout import LOG_STD_BOUNDS, hidden_names, named_views, parameter_layout, total_size
 from millrace.protocol.policy.malloc import keep_freed_memory
 from millrace.protocol.specs import PolicySpec
@@ -22,15 +23,16 @@ class ActingNetwork:
 
     def __init__(self, spec: PolicySpec, device: str | torch.device = "cpu") -> None:
         fields, _ = parameter_layout(spec)
+        head = HEADS[spec.head]
         self.flat = torch.empty(total_size(fields), dtype=torch.float32, device=device)
         """[P] the parameters. They have no values until you copy some to this tensor"""
         self._parameters = named_views(self.flat, fields)
         self.encode = Encoder(spec, self._parameters, device, seed=0)
         self._hidden = [self._linear(name) for name in hidden_names(spec)]
-        self._out = self._linear("q.out" if spec.head == "q" else "actor.out")
+        self._out = self._linear(f"{head.prefix}.out")
         self._state_value = self._linear("q.value") if spec.dueling else None
         self._relu = spec.activation == "relu"
-        self._bounds_log_std = spec.head == "squashed"
+        self._has_log_std_outputs = head.has_log_std_outputs
         if spec.needs_torch:
             keep_freed_memory()
 
@@ -48,7 +50,7 @@ class ActingNetwork:
             h = h.relu_() if self._relu else h.tanh_()
         weight, bias = self._out
         out = torch.addmm(bias, h, weight)
-        if self._bounds_log_std:
+        if self._has_log_std_outputs:
             mean, log_std = out.chunk(2, -1)
             out = torch.cat((mean, log_std.clamp(*LOG_STD_BOUNDS)), -1)
         if self._state_value is not None:

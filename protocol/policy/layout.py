@@ -15,6 +15,7 @@ import numpy as np
 
 from millrace.protocol.arrays import Array
 from millrace.protocol.policy.features import critic_size, feature_size
+from millrace.protocol.policy.heads import HEADS
 from millrace.protocol.policy.recurrent import core_shapes
 from millrace.protocol.specs import Leaf, PolicySpec
 
@@ -86,7 +87,7 @@ def parameter_layout(spec: PolicySpec) -> tuple[tuple[Field, ...], tuple[Field, 
         return tuple(acting + _linear("q.out", last, action.sizes[0], 1.0)), ()
     size = math.prod(action.shape)
     if spec.stores_scaled_actions:
-        acting += _linear("actor.out", last, 2 * size if spec.head == "squashed" else size, 0.01)
+        acting += _linear("actor.out", last, 2 * size if HEADS[spec.head].has_log_std_outputs else size, 0.01)
         acting += encoder
         critics = [
             field
@@ -134,7 +135,7 @@ def encoder_layout(spec: PolicySpec) -> tuple[list[Field], int]:
 
 def _trunk(spec: PolicySpec) -> str:
     """The name prefix of the hidden layers that are needed to act."""
-    return "q" if spec.head == "q" else "shared" if spec.shared_net else "actor"
+    return "shared" if spec.shared_net else HEADS[spec.head].prefix
 
 
 def hidden_names(spec: PolicySpec, name: str = "") -> list[str]:
@@ -186,26 +187,18 @@ def buffer_layout(spec: PolicySpec) -> tuple[Field, ...]:
     fields: list[Field] = []
     if spec.normalize_observations:
         fields += [Field(name, (feature_size(spec),), 0) for name in ("observation_mean", "observation_std")]
-    if spec.head == "q":
-        fields.append(Field("epsilon", (1,), 0))
-    if spec.head == "deterministic":
-        fields.append(Field("noise_scale", (1,), 0))
-    if spec.stores_scaled_actions:
-        fields.append(Field("warm_up", (1,), 0))
-    return tuple(fields)
+    return (*fields, *(Field(name, (1,), 0) for name in HEADS[spec.head].exploration))
 
 
-EXPLORATION = ("epsilon", "noise_scale", "warm_up")
-
-
-def appended_params(parameters: Mapping[str, Array], buffers: Mapping[str, Array]) -> Array | None:
+def appended_params(spec: PolicySpec, parameters: Mapping[str, Array], buffers: Mapping[str, Array]) -> Array | None:
     """What follows a network's outputs in the distribution params [K]: log standard deviations, or exploration parameters.
 
-    None if there is neither. The arguments are the arrays of a policy's weights, by name.
+    None if there is neither. `parameters` and `buffers` are the arrays of the policy's weights, by name.
     """
-    appended = [parameters.get("actor.log_std"), *map(buffers.get, EXPLORATION)]
-    found = [array for array in appended if array is not None]
-    return np.concatenate(found) if found else None
+    log_std = parameters.get("actor.log_std")
+    appended = [] if log_std is None else [log_std]
+    appended += [buffers[name] for name in HEADS[spec.head].exploration]
+    return np.concatenate(appended) if appended else None
 
 
 def buffer_size(spec: PolicySpec) -> int:

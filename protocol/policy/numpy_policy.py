@@ -12,6 +12,7 @@ import numpy as np
 
 from millrace.protocol.arrays import Array, Floats
 from millrace.protocol.policy.features import features
+from millrace.protocol.policy.heads import HEADS
 from millrace.protocol.policy.layout import (
     LOG_STD_BOUNDS,
     appended_params,
@@ -32,6 +33,7 @@ class NumpyPolicy:
 
     def __init__(self, spec: PolicySpec) -> None:
         self.spec = spec
+        self._head = HEADS[spec.head]
         self._fields, _ = parameter_layout(spec)
         self._parameters: dict[str, Floats] = {}
         self._buffers: dict[str, Floats] = {}
@@ -49,8 +51,8 @@ class NumpyPolicy:
         self._parameters = named_views(parameters, self._fields)
         self._buffers = named_views(buffers, buffer_layout(self.spec))
         self._hidden = [self._linear(name) for name in hidden_names(self.spec)]
-        self._out = self._linear("q.out" if self.spec.head == "q" else "actor.out")
-        self._appended_params = appended_params(self._parameters, self._buffers)
+        self._out = self._linear(f"{self._head.prefix}.out")
+        self._appended_params = appended_params(self.spec, self._parameters, self._buffers)
 
     def _linear(self, name: str) -> tuple[Floats, Floats]:
         return self._parameters[f"{name}.weight"].T, self._parameters[f"{name}.bias"]
@@ -76,7 +78,7 @@ class NumpyPolicy:
         weight, bias = self._out
         out = np.asarray(np.matmul(x, weight))
         out += bias
-        if self.spec.head == "squashed":
+        if self._head.has_log_std_outputs:
             half = out.shape[-1] // 2
             np.clip(out[..., half:], *LOG_STD_BOUNDS, out=out[..., half:])
         if self.spec.dueling:

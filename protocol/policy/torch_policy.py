@@ -54,7 +54,8 @@ class TorchPolicy:
             if self._images_dtype == "bfloat16":
                 self._net.encode.use_bfloat16()
         self._buffers = named_views(buffers, buffer_layout(self.spec))
-        self._appended_params = appended_params(named_views(parameters, parameter_layout(self.spec)[0]), self._buffers)
+        named = named_views(parameters, parameter_layout(self.spec)[0])
+        self._appended_params = appended_params(self.spec, named, self._buffers)
 
     def __call__(self, leaves: Sequence[Array], state: Floats | None = None) -> Floats:
         """Distribution params [L, N, P] for these observations [L, N, *leaf]; see `Policy`."""

@@ -206,7 +206,9 @@ def test_torch_policy_gives_the_bits_of_the_network_that_the_learner_trains(
     obs = leaves(spec.observation, (1, 5), generator)
     with torch.no_grad():
         expected = trained.params(torch.tensor(features(spec, obs)[0]), [torch.tensor(obs[1][0])]).numpy()
-    np.testing.assert_array_equal(policy(obs)[0, :, : expected.shape[1]], expected)
+    found = policy(obs)[0]
+    np.testing.assert_array_equal(found[:, : expected.shape[1]], expected)
+    assert found.shape == (5, distribution(spec).params_size)
 
 
 @pytest.mark.parametrize("head", ["actor_critic", "squashed"])
