@@ -47,7 +47,7 @@ class LostLanes:
         self._awaiting_reset -= lanes
 
     def forget(self, lane: int) -> None:
-        """Forget an earlier loss of this lane, if there was one, because all its copies have begun new episodes."""
+        """Forget an earlier loss of this lane, if there was one, because the caller has the reset of all its copies."""
         self._unreported.pop(lane, None)
 
     def report(self, unanswered: Sequence[int]) -> dict[int, str]:

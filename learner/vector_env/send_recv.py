@@ -72,6 +72,7 @@ class SendRecv:
         self._parts = parts
         self._sent = SentLanes(parts.layout)
         self._all_were_reset = False
+        self._reset_lanes: dict[int, int] = {}  # ready lanes of which all copies were reset, and the copies' incarnation
         self._to_raise: dict[int, str] = {}  # lanes whose loss the caller gets as an error, and why they were lost
         self._watched = WatchedTime(parts.hub.now())
 
@@ -173,7 +174,7 @@ class SendRecv:
             self.look(timeout_s)
             self._raise_losses()
             if len(copies := sent.ready_copies) >= min_envs:
-                return sent.take(), copies
+                return self._returned(sent.take()), copies
             hub.wait(timeout_s, together=False)
 
     def recv_all(self, timeout_s: float | None = None) -> Ready:
@@ -182,7 +183,7 @@ class SendRecv:
         timeout_s = self.timeout_s if timeout_s is None else timeout_s
         look_first = bool(self._parts.lost_lanes.unreported)
         self._wait_until(lambda: sent.all_ready, timeout_s, self._parts.layout.lanes, look_first=look_first, together=True)
-        return sent.take()
+        return self._returned(sent.take())
 
     def recv_some(self, lanes: Sequence[int]) -> Ready:
         """Wait until these lanes are ready, and take them. Raises what `recv` raises, after giving up on these lanes only.
@@ -194,7 +195,7 @@ class SendRecv:
             raise NoAsyncCallError(f"lanes {idle} are not under way: expected an order to them first", "send")
         # Look first: a result may have arrived during a wait for other lanes, and then no worker wakes this process again.
         self._wait_until(lambda: sent.are_ready(lanes), self.timeout_s, lanes, look_first=True, together=False)
-        return sent.take_some(lanes)
+        return self._returned(sent.take_some(lanes))
 
     def look(self, timeout_s: float) -> None:
         """Record which of the lanes under way have returned a result or were lost. Never waits.
@@ -211,12 +212,13 @@ class SendRecv:
     def abandon(self, lanes: Sequence[int]) -> None:
         """Stop waiting for these lanes. Those whose step was under way count as reported if they were lost meanwhile.
 
-        If a lane was lost before its reset was answered, the next step reports the loss.
+        If a lane was lost before its reset, the next step reports the loss, because the caller gets no results of the reset.
         """
         sent = self._sent
         steps = [lane for lane in sent.under_way if lane in lanes and sent.sent[lane].asked is Asked.STEP]
         for lane in lanes:
             self._to_raise.pop(lane, None)
+            self._reset_lanes.pop(lane, None)
         self._parts.hub.forget(sent.give_up(lanes))
         lost_lanes = self._parts.lost_lanes
         lost_lanes.add(self._parts.hub.coordinator.take_lost())
@@ -330,13 +332,16 @@ class SendRecv:
         parts.lost_lanes.answered({lane})
         if isinstance(asked, AskedReset):
             parts.ever_reset[[parts.layout.copies(lane)[n] for n in asked.copies]] = True
-            if len(asked.copies) == parts.layout.size(lane) and not self._is_lost_again(lane, answer):
-                parts.lost_lanes.forget(lane)  # nothing is left to report, because all copies were reset
+            if len(asked.copies) == parts.layout.size(lane):
+                self._reset_lanes[lane] = answer.incarnation
         return bytes(answer.infos.data)
 
-    def _is_lost_again(self, lane: int, answer: Stepped) -> bool:
-        """Whether the copies that gave this answer have been lost since."""
-        return answer.incarnation != self._parts.hub.coordinator.lanes[lane].incarnation
+    def _returned(self, ready: Ready) -> Ready:
+        """Forget the losses before a reset of all copies of a lane, because the caller gets the reset's results now."""
+        for lane in self._reset_lanes.keys() & ready.results.keys():
+            if self._reset_lanes.pop(lane) == self._parts.hub.coordinator.lanes[lane].incarnation:  # not lost since
+                self._parts.lost_lanes.forget(lane)
+        return ready
 
     def _give_up_late(self, timeout_s: float) -> None:
         """Treat workers that take too long as lost. Raises `NoWorkers` if a lane had no worker all that time."""

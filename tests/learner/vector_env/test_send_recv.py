@@ -804,6 +804,49 @@ def test_a_loss_is_reported_if_its_reset_was_interrupted_before_or_after_the_lan
         assert reward.tolist() == [0.0, 0.0]
 
 
+@contextmanager
+def one_lost_copy_of_two(**changes: Any) -> Iterator[tuple[ZmqVectorEnv, AnyOrder]]:
+    """Two lanes of one copy. The first copy was lost, and has a new worker; the other's worker does nothing."""
+    with made(copies=2, lanes=2, workers=2, **changes) as (env, link):
+        env.reset(seed=1), env.step(zeros([0, 1]))
+        link.leave("w0")
+        link.join("w2")
+        env.hub.wait_for(2, 1.0)
+        link.frozen = {"w1"}
+        yield env, link
+
+
+@pytest.mark.parametrize("mode", [NEXT, SAME, DISABLED])
+def test_a_loss_is_reported_if_its_reset_was_interrupted_while_it_waited_for_another_lane(mode: str) -> None:
+    with one_lost_copy_of_two(autoreset_mode=mode) as (env, link):
+        with interrupted_after(env, lambda: None, lambda: None):
+            env.reset(seed=2)
+        link.frozen = set()
+        env.call("render_mode")  # its results are not those of the reset
+        _, reward, _, truncated, _ = env.step(zeros([0, 1]))
+        assert (reward.tolist(), truncated.tolist()) == ([0.0, 1.0], [True, False])
+
+
+@pytest.mark.parametrize("why", ["interrupt", "another loss"])
+def test_with_raise_it_is_raised_if_its_reset_was_not_returned(why: str) -> None:
+    with one_lost_copy_of_two(on_worker_loss="raise") as (env, link):
+        if why == "interrupt":
+            with interrupted_after(env, lambda: None, lambda: None):
+                env.reset(seed=2)
+        else:
+            turns = iter(range(2))
+            env.hub.while_waiting = lambda: link.leave("w1") if next(turns, None) == 1 else None
+            with pytest.raises(WorkerLost, match=r"^worker w1 \(host\) left: killed: lane 1 \(copies 1 to 1\) is lost$"):
+                env.reset(seed=2)
+            env.reset_async(env_ids=[1])
+            assert received(env)[1].observation == 1.0
+        link.frozen = set()
+        with pytest.raises(WorkerLost, match=r"^worker w0 \(host\) left: killed: lane 0 \(copies 0 to 0\) is lost$"):
+            env.step(zeros([0, 1]))
+        env.reset(seed=3)
+        assert env.step(zeros([0, 1]))[1].tolist() == [1.0, 1.0]
+
+
 @pytest.mark.parametrize("mode", [NEXT, SAME, DISABLED])
 def test_no_loss_is_reported_if_no_worker_had_the_copies(mode: str) -> None:
     with made(copies=2, lanes=1, workers=1, autoreset_mode=mode) as (env, link):

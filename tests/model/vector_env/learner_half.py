@@ -117,12 +117,15 @@ def _asked(caller: Caller, lane: int, sent: Sent) -> Content:
 
 
 def _caller(caller: Caller) -> Content:
-    sent, lost_lanes = caller.send_recv._sent, caller.parts.lost_lanes
+    sent, reset_lanes, lost_lanes = caller.send_recv._sent, caller.send_recv._reset_lanes, caller.parts.lost_lanes
     return (
         caller.at,
         None if not caller.waits else 0,
         tuple((lane, *_asked(caller, lane, sent.sent[lane])) for lane in sorted(sent.under_way)),
-        tuple((lane, lane in sent._losses) for lane in sorted(sent._results)),
+        tuple(
+            (lane, lane in sent._losses, incarnation(lane, reset_lanes[lane]) if lane in reset_lanes else None)
+            for lane in sorted(sent._results)
+        ),
         tuple(sorted(caller.send_recv._to_raise)),
         tuple(sorted(caller.hub._waiting_orders)),
         tuple((lane, ticket(number)) for lane, number in sorted(caller.hub._newest_tickets.items())),
@@ -168,9 +171,10 @@ def _load_caller(caller: Caller, content: Content) -> None:
         if lane in waiting:
             caller.hub._waiting_orders[lane] = make_order(kind, seed)
             caller.hub._waiting_since_s[lane] = 0.0
-    for lane, lost in ready:
+    for lane, lost, reset in ready:
         sent.sent[lane], sent._results[lane] = Sent(Asked.STEP, 0.0), b""
         sent._losses |= {lane: {}} if lost else {}
+        caller.send_recv._reset_lanes |= {lane: reset.value} if reset is not None else {}
     caller.send_recv._to_raise = dict.fromkeys(to_raise, "lost")
     caller.hub._newest_tickets = {lane: number.value for lane, number in newest}
     caller.copies = {lane: (life.value, state) for lane, life, state in copies}
