@@ -2,7 +2,7 @@
 
 Rule: for the same seeds and actions, the results equal those of `gymnasium.vector.SyncVectorEnv` bit for bit, whether they
 are sent as messages or through shared memory. A lost worker is always reported, as truncated copies or as an error; it is
-never hidden.
+never hidden. If Ctrl-C interrupts a method, call `reset` before any other method except `close`.
 
 With A seats, each row of a batch belongs to a seat, and the rows of a copy are consecutive; `num_envs` counts rows.
 Arguments that address an environment count copies instead: seeds, options, `reset_mask`, `env_ids`, calls and attributes.
@@ -25,6 +25,7 @@ from gymnasium.vector.utils import batch_space
 from millrace.learner.vector_env.batch_arrays import BatchArrays
 from millrace.learner.vector_env.batch_layout import BatchLayout
 from millrace.learner.vector_env.calls import CopyCalls
+from millrace.learner.vector_env.cut_short import CutShort
 from millrace.learner.vector_env.infos import InfoReader, merged
 from millrace.learner.vector_env.lost_lanes import LostLanes
 from millrace.learner.vector_env.send_recv import SendRecv, VectorEnvParts
@@ -34,6 +35,7 @@ from millrace.learner.vector_env.step_arguments import Options, action_arrays, n
 from millrace.learner.vector_env.step_hub import StepHub
 from millrace.protocol.arrays import Array
 from millrace.protocol.envs.spaces import make_flatten
+from millrace.protocol.errors import UsageError
 
 log = logging.getLogger("millrace.learner")
 
@@ -84,6 +86,7 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         memory = None if hub.shared is None else hub.shared.memory
         self._batch = BatchArrays(step, self._layout, self.single_observation_space, memory)
         self._state = AsyncState.DEFAULT
+        self._cut_short = CutShort()
         self._info_reader = InfoReader(self._layout, hub.refuse_owner)
         count = self._layout.count
         seeds = list[int | None]([None] * count)
@@ -98,7 +101,7 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         self._close_once = weakref.finalize(self, _call_in_process, os.getpid(), on_close)
 
     # ---------------------------------------------------------------- reset and step
-    # Rule: after an error or Ctrl-C, these methods await no lane to which they sent an order, so that `reset` is possible.
+    # Rule: after an error, these methods await no lane to which they sent an order, so that `reset` is possible.
 
     def reset(self, *, seed: int | Sequence[int | None] | None = None, options: Options = None) -> tuple[Any, Infos]:
         """Begin episodes in all copies, or in those that `options["reset_mask"]` selects. Returns observations and infos.
@@ -107,13 +110,16 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         `WorkerLost` if every attempt loses a worker. With SameStep, copies that were lost with their worker must be reset
         together; raises `UsageError` if only some of them are.
         """
-        self._check_idle("reset")
-        try:
-            self.reset_async(seed, options)
-            return self.reset_wait()
-        except BaseException:
-            self.abandon()
-            raise
+        copies, seeds, options = reset_arguments(None, seed, options, self._layout.count)
+        self._check_idle("reset", resets=copies)
+        with self._cut_short:
+            try:
+                self._send_recv.reset(copies, seeds, options)
+                observation, _, _, _, infos = self._rows(self._send_recv.recv_all())
+                return observation, infos
+            except Exception:
+                self.abandon()
+                raise
 
     def reset_async(
         self,
@@ -128,16 +134,17 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         returns what `reset` returns, or with `recv`, which returns the copies that are ready, with reward 0. Raises
         `AlreadyPendingCallError` if one of the copies, or another copy of its lane, has not come back from an earlier call.
         """
-        self._check_idle("reset_async", of_sent=True)
         copies, seeds, options = reset_arguments(env_ids, seed, options, self._layout.count)
-        alone = not self.outstanding
-        try:
-            self._send_recv.reset(copies, seeds, options)
-            self._state = AsyncState.WAITING_RESET if alone else AsyncState.DEFAULT
-        except BaseException:
-            if alone:
-                self.abandon()
-            raise
+        self._check_idle("reset_async", of_sent=True, resets=copies)
+        with self._cut_short:
+            alone = not self.outstanding
+            try:
+                self._send_recv.reset(copies, seeds, options)
+                self._state = AsyncState.WAITING_RESET if alone else AsyncState.DEFAULT
+            except Exception:
+                if alone:
+                    self.abandon()
+                raise
 
     def reset_wait(self, timeout: float | None = None) -> tuple[Any, Infos]:
         """Wait for the pending reset. Returns what `reset` returns.
@@ -165,22 +172,24 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         `on_worker_loss="raise"`, `WorkerLost` if a worker is lost.
         """
         self._check_idle("step_async")
-        try:
-            self._step(self._layout.lanes, actions, together=True)
-            return self._rows(self._send_recv.recv_all())
-        except BaseException:
-            self.abandon()
-            raise
+        with self._cut_short:
+            try:
+                self._step(self._layout.lanes, actions, together=True)
+                return self._rows(self._send_recv.recv_all())
+            except Exception:
+                self.abandon()
+                raise
 
     def step_async(self, actions: Any) -> None:
         """Begin a step of every copy; `step_wait` returns the results."""
         self._check_idle("step_async")
-        try:
-            self._step(self._layout.lanes, actions, together=True)
-            self._state = AsyncState.WAITING_STEP
-        except BaseException:
-            self.abandon()
-            raise
+        with self._cut_short:
+            try:
+                self._step(self._layout.lanes, actions, together=True)
+                self._state = AsyncState.WAITING_STEP
+            except Exception:
+                self.abandon()
+                raise
 
     def step_wait(self, timeout: float | None = None) -> GymnasiumStep:
         """Wait for the pending step. Returns what `step` returns.
@@ -238,8 +247,9 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         copies = numbered(env_ids, self._layout.count)
         at = self._layout.positions(copies)
         arrays = action_arrays(actions, self._read_actions, self._action_leaves, len(self._layout.rows_of(copies)))
-        self._send_recv.step(list(at), arrays, at, together=False)
-        self._state = AsyncState.DEFAULT
+        with self._cut_short:
+            self._send_recv.step(list(at), arrays, at, together=False)
+            self._state = AsyncState.DEFAULT
 
     def recv(self, min_envs: int = 1, timeout: float | None = None) -> GymnasiumStep:
         """Wait until at least `min_envs` copies are ready (0 does not wait). Returns the results of all ready copies.
@@ -256,11 +266,12 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         back truncated or are named by `WorkerLost`.
         """
         self._check_idle("recv", of_sent=True)
-        self._state = AsyncState.DEFAULT
-        ready, copies = self._send_recv.recv(min_envs, timeout)
-        rows = self._rows(ready, copies)
-        rows[-1]["env_id"] = np.array(copies, np.int64)
-        return rows
+        with self._cut_short:
+            self._state = AsyncState.DEFAULT
+            ready, copies = self._send_recv.recv(min_envs, timeout)
+            rows = self._rows(ready, copies)
+            rows[-1]["env_id"] = np.array(copies, np.int64)
+            return rows
 
     @property
     def outstanding(self) -> list[int]:
@@ -277,9 +288,11 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
 
         `spec`, `observation_space` and `action_space` can't be sent, so they are made from a worker's description of them.
         """
-        if name not in self.calls.known:
-            self._check_idle("call")
-        return self.calls.call(range(self._layout.count), name, args, kwargs)
+        if name in self.calls.known:  # no worker is asked
+            return self.calls.call(range(self._layout.count), name, args, kwargs)
+        self._check_idle("call")
+        with self._cut_short:
+            return self.calls.call(range(self._layout.count), name, args, kwargs)
 
     get_attr = call
 
@@ -290,7 +303,8 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         if len(values) != self._layout.count:
             raise ValueError(f"values: expected one for each of {self._layout.count} copies, got {len(values)}")
         self._check_idle("call")
-        self.calls.assign(range(self._layout.count), name, values)
+        with self._cut_short:
+            self.calls.assign(range(self._layout.count), name, values)
 
     def render(self) -> tuple[Any, ...]:
         """Render every copy. Returns the results of their `render`."""
@@ -320,10 +334,18 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         arrays = action_arrays(actions, self._read_actions, self._action_leaves, self.num_envs)
         self._send_recv.step(lanes, arrays, self._layout.rows, together=together)
 
-    def _check_idle(self, doing: str, *, of_sent: bool = False) -> None:
-        """Raise if `doing` is not possible now. `of_sent` says that it is possible while copies have not come back."""
+    def _check_idle(self, doing: str, *, of_sent: bool = False, resets: Sequence[int] = ()) -> None:
+        """Raise if `doing` is not possible now. `of_sent` says that it is possible while copies have not come back.
+
+        `resets` are the copies that it resets.
+        """
         if self.closed:
             raise ClosedEnvironmentError(f"{doing} after close()")
+        if self._cut_short:
+            if len(resets) < self._layout.count:
+                raise UsageError(f"{doing} after an interrupted call: reset all copies first, with reset()")
+            self._send_recv.begin_anew()
+            self._state = AsyncState.DEFAULT
         if self._state is AsyncState.WAITING_STEP or (self._state is AsyncState.WAITING_RESET and not of_sent):
             pending = self._state.value
             raise AlreadyPendingCallError(f"{doing} while a {pending} is pending: expected {pending}_wait() first", pending)
@@ -336,13 +358,14 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
             raise ClosedEnvironmentError(f"{awaited.value}_wait after close()")
         if self._state is not awaited:
             raise NoAsyncCallError(f"{awaited.value}_wait without {awaited.value}_async before it", awaited.value)
-        try:
-            ready = self._send_recv.recv_all(timeout_s)
-            self._state = AsyncState.DEFAULT
-        except BaseException:
-            self.abandon()
-            raise
-        return self._rows(ready)
+        with self._cut_short:
+            try:
+                ready = self._send_recv.recv_all(timeout_s)
+                self._state = AsyncState.DEFAULT
+            except Exception:
+                self.abandon()
+                raise
+            return self._rows(ready)
 
     def _rows(self, ready: Ready, copies: list[int] | None = None) -> GymnasiumStep:
         """The results of these copies, or of all copies if None, after they have come back."""

@@ -80,6 +80,13 @@ class SendRecv:
         """The copies that have not come back."""
         return self._sent.copies
 
+    def begin_anew(self) -> None:
+        """Forget everything that was sent, after a call that was cut short. All copies must be reset next."""
+        self._parts.hub.forget(self._parts.layout.lanes)
+        self._sent = SentLanes(self._parts.layout)
+        self._to_raise = {}
+        self._reset_lanes = {}
+
     # ---------------------------------------------------------------- out
 
     def reset(self, copies: Sequence[int], seeds: Sequence[int | None], options: Options) -> None:

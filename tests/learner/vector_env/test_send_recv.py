@@ -19,7 +19,7 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 import millrace
-from millrace.learner.vector_env import calls, send_recv, sent_lanes
+from millrace.learner.vector_env import calls, send_recv, sent_lanes, shared_steps, step_hub
 from millrace.learner.vector_env import env as env_module
 from millrace.learner.vector_env.batch_layout import BatchLayout
 from millrace.learner.vector_env.env import ZmqVectorEnv
@@ -387,13 +387,13 @@ def test_a_step_that_was_abandoned_before_its_worker_saw_it_is_not_made_after_a_
         assert (observation.tolist(), reward.tolist()) == ([[pytest.approx(0.8)]], [1.0]), "of one step"
 
 
-def interrupt_after(env: ZmqVectorEnv, *calls: Callable[[], None]) -> None:
-    """While the environment waits, each of these is called, and then the wait is interrupted."""
+def interrupt_after(env: ZmqVectorEnv, *calls: Callable[[], None], error: type[BaseException] = InterruptedError) -> None:
+    """While the environment waits, each of these is called, and then this error ends the wait."""
     steps = iter(calls)
 
     def stop() -> None:
         if (call := next(steps, None)) is None:
-            raise InterruptedError("stop")
+            raise error("stop")
         call()
 
     env.hub.while_waiting = stop
@@ -1069,36 +1069,84 @@ def interrupted(call: Callable[[], object], at: int) -> bool:
     return False
 
 
-FILES = {module.__file__ for module in (calls, env_module, send_recv, sent_lanes)}
+FILES = {module.__file__ for module in (calls, env_module, send_recv, sent_lanes, step_hub, shared_steps)}
 CALLS: dict[str, Callable[[ZmqVectorEnv], object]] = {
     "step": lambda env: env.step(zeros(range(4))),
-    "step_async": lambda env: env.step_async(zeros(range(4))),
+    "step_async": lambda env: (env.step_async(zeros(range(4))), env.step_wait()),
     "reset": lambda env: env.reset(seed=2),
-    "reset_async": lambda env: env.reset_async(seed=2),
-    "send": lambda env: env.send(zeros(range(4))),
+    "reset_async": lambda env: (env.reset_async(seed=2), env.reset_wait()),
+    "send": lambda env: (env.send(zeros(range(4))), env.recv(4)),
     "call": lambda env: env.call("render_mode"),
+    "set_attr": lambda env: env.set_attr("left", 1.0),
 }
+
+
+def was_cut_short(env: ZmqVectorEnv) -> bool:
+    """Whether the last call was cut short. If not, an interrupt came before it, and what was sent before is received."""
+    try:
+        while env.outstanding:
+            env.recv()
+        env.recv()
+    except UsageError:
+        return True
+    except AlreadyPendingCallError as error:
+        getattr(env, f"{error.name}_wait")()
+    except NoAsyncCallError:
+        pass
+    return False
 
 
 @BOTH_WAYS
 @pytest.mark.parametrize("name", CALLS)
-def test_an_interrupt_at_any_line_leaves_an_environment_that_can_be_reset_and_loses_no_worker(
+def test_after_an_interrupt_at_any_line_only_a_reset_of_all_copies_is_possible_and_no_worker_is_lost(
     name: str, shared: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("millrace.learner.vector_env.step_hub.POLL_S", 0.001)
     with made(copies=4, lanes=2, workers=2, shared=shared) as (env, _):
         env.reset(seed=1)
-        lines = 0
+        lines = cut_short = 0
         while interrupted(lambda: CALLS[name](env), lines):
+            cut_short += was_cut_short(env)
+            if interrupted(lambda: env.reset(seed=1), lines):  # a second Ctrl-C
+                cut_short += was_cut_short(env)
             lines += 1
-            while env.outstanding:  # `send` had returned to the caller's file
-                assert name == "send"
-                env.recv()
             assert env.reset(seed=1)[0][:, 0].tolist() == [1.0] * 4
             observation, reward, _, truncated, infos = env.step(zeros(range(4)))
             assert observation[:, 0].tolist() == [pytest.approx(0.8)] * 4
             assert (reward.tolist(), truncated.tolist(), infos) == ([1.0] * 4, [False] * 4, {})
-        assert lines > 10
+        assert cut_short > 20
+
+
+@pytest.mark.parametrize(
+    "refused", ["step", "step_async", "send", "recv", "call", "set_attr", "reset of some", "reset_async"]
+)
+def test_after_an_interrupt_nothing_but_a_reset_of_all_copies_is_possible(refused: str) -> None:
+    with made(copies=2, lanes=2, workers=2) as (env, link):
+        env.reset(seed=1)
+        link.frozen = {"w0", "w1"}
+        with pytest.raises(KeyboardInterrupt):
+            interrupt_after(env, error=KeyboardInterrupt)
+            env.step(zeros([0, 1]))
+        env.hub.while_waiting = lambda: None
+        link.frozen = set()
+        calls: dict[str, Callable[[], object]] = {
+            "step": lambda: env.step(zeros([0, 1])),
+            "step_async": lambda: env.step_async(zeros([0, 1])),
+            "send": lambda: env.send(zeros([0, 1])),
+            "recv": lambda: env.recv(),
+            "call": lambda: env.call("render_mode"),
+            "set_attr": lambda: env.set_attr("left", 1.0),
+            "reset of some": lambda: env.reset(options={"reset_mask": np.array([True, False])}),
+            "reset_async": lambda: env.reset_async(env_ids=[0]),
+        }
+        with pytest.raises(UsageError, match="after an interrupted call: reset all copies first"):
+            calls[refused]()
+        assert env.get_attr("spec") == (env.spec,) * 2, "no worker is asked"
+        with pytest.raises(UsageError, match="after an interrupted call: reset all copies first"):
+            env.step(zeros([0, 1]))
+        env.reset_async(seed=1)
+        assert sorted(received(env, 2)) == [0, 1]
+        assert env.step(zeros([0, 1]))[1].tolist() == [1.0, 1.0]
 
 
 # ---------------------------------------------------------------- the pure parts
