@@ -180,7 +180,7 @@ class SentLanes:
         rows = self._layout.rows_of(self._layout.copies_of(taken)) if self._losses else ()
         losses = {row: self._losses.pop(row) for row in rows if row in self._losses}
         results = {lane: self._results.pop(lane) for lane in taken}
-        for lane in taken:  # only now, because an interrupt may come before, and `give_up` forgets lanes that were sent
+        for lane in taken:
             del self.sent[lane]
         return Ready(results, losses)
 

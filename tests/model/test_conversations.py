@@ -29,9 +29,7 @@ from tests.model.vector_env.stepping import Stepping
 LISTS = {module.__name__: module.MUTATIONS for module in (mutations, of_describing, of_evaluation, of_vector_env)}
 SMALL: list[Conversation] = [
     Training(workers=2, lanes=2, updates=5, faults=0, opponents=3),
-    Training(workers=1, lanes=1, updates=4, faults=1, max_lag=1, opponents=2),
     Describing(workers=2, lanes=1, updates=1, faults=1),
-    Describing(workers=2, lanes=1, updates=1, faults=1, environments=2),
     Evaluating(workers=1, lanes=1, updates=1, faults=1),
     Evaluating(workers=1, lanes=1, updates=1, faults=1, episodes=1, rows=True),
     Evaluating(workers=1, lanes=1, updates=1, faults=1, evaluated=(0, 1), evaluators=0),
@@ -51,8 +49,10 @@ LARGE: list[Conversation] = [
     Training(workers=2, lanes=2, updates=5, faults=0, max_lag=1, opponents=3),
     Training(workers=1, lanes=1, updates=3, faults=2, opponents=3),
     Training(workers=2, lanes=1, updates=3, faults=1, max_lag=1, opponents=2),
+    Training(workers=1, lanes=1, updates=4, faults=1, max_lag=1, opponents=2),
     Training(workers=1, lanes=2, updates=4, faults=1, max_lag=1, opponents=2),
     Describing(workers=1, lanes=1, updates=1, faults=2),
+    Describing(workers=2, lanes=1, updates=1, faults=1, environments=2),
     Describing(workers=2, lanes=2, updates=1, faults=1),
     Describing(workers=2, lanes=1, updates=1, faults=2),
     Describing(workers=1, lanes=1, updates=1, faults=2, environments=2),
