@@ -129,9 +129,9 @@ class _Packer:
             return self._container(value, where, depth)
         if kind is complex:
             return msgpack.ExtType(_Code.COMPLEX, _pack([value.real, value.imag]))
-        if kind is np.ndarray and value.dtype.kind in DTYPE_KINDS:
+        if kind is np.ndarray and value.dtype.kind in DTYPE_KINDS and _can_be_shown(value):
             return msgpack.ExtType(_Code.ARRAY, _pack([value.dtype.str, list(value.shape), value.tobytes()]))
-        if isinstance(value, np.generic) and value.dtype.kind in DTYPE_KINDS:
+        if isinstance(value, np.generic) and value.dtype.kind in DTYPE_KINDS and _can_be_shown(value):
             return msgpack.ExtType(_Code.SCALAR, _pack([value.dtype.str, value.tobytes()]))
         if self.use_repr:
             numbers = _numbers(value)
@@ -279,7 +279,9 @@ def _from_extension(code: int, data: bytes, limit: KeyLimit, depth: int) -> Any:
             if kind.itemsize and len(raw) != kind.itemsize:  # numpy gives an empty text a byte or more
                 raise BadMessage(f"scalar {dtype}: expected {kind.itemsize} bytes, got {len(raw)}")
             _check_characters(raw, kind)
-            return np.frombuffer(raw, kind)[0] if kind.itemsize else kind.type()
+            scalar = np.frombuffer(raw, kind)[0] if kind.itemsize else kind.type()
+            _check_dates(scalar)
+            return scalar
         case _Code.OBJECTS, [list(shape), list(values)]:
             if len(values) != _elements(shape):
                 raise BadMessage(f"array of objects of shape {shape}: got {len(values)} objects")
@@ -300,7 +302,9 @@ def _array(kind: np.dtype[Any], shape: list[Any], raw: bytes) -> Any:
     if len(raw) != _elements(shape) * kind.itemsize:
         raise BadMessage(f"array {kind.str} of shape {shape}: got {len(raw)} bytes")
     _check_characters(raw, kind)
-    return np.frombuffer(raw, kind).reshape(shape).copy() if raw else np.zeros(shape, kind)
+    array = np.frombuffer(raw, kind).reshape(shape).copy() if raw else np.zeros(shape, kind)
+    _check_dates(array)
+    return array
 
 
 def _elements(shape: list[Any]) -> int:
@@ -324,6 +328,19 @@ def _check_characters(raw: bytes, kind: np.dtype[Any]) -> None:
     """Raise `BadMessage` for invalid characters, because numpy accepts any four bytes, and fails when the text is used."""
     if kind.kind == "U" and raw and (last := int(np.frombuffer(raw, f"{kind.str[0]}u4").max())) > sys.maxunicode:
         raise BadMessage(f"text of {kind.str}: expected characters up to {sys.maxunicode}, got {last}")
+
+
+def _can_be_shown(value: Any) -> bool:
+    """Whether numpy can show this array or scalar. It can't show a date without a unit, except NaT in its own byte order."""
+    if value.dtype.kind != "M" or np.datetime_data(value.dtype)[0] != "generic":
+        return True
+    return value.dtype.isnative and bool(np.isnat(value).all())
+
+
+def _check_dates(value: Any) -> None:
+    """Raise `BadMessage` for dates that can't be shown, because whoever shows a key or an info expects no error."""
+    if not _can_be_shown(value):
+        raise BadMessage("plain value: expected dates with a unit, got a date without a unit")
 
 
 @dataclass(slots=True)

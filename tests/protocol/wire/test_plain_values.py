@@ -554,3 +554,27 @@ def test_text_has_only_characters_that_there_are(order: str) -> None:
         else:
             with pytest.raises(BadMessage, match="expected characters"):
                 unpack(packed_array(f"{order}U1", [1], raw))
+
+
+def test_a_date_without_a_unit_is_refused_because_numpy_cannot_show_it() -> None:
+    """`str` and `repr` of such a date raise, even in code that only warns of an info, or merges infos."""
+    kind, date, none = "<M8", bytes(8), np.array(["NaT"], "<M8").tobytes()
+    for packed in (
+        packed_array(kind, [2], none + date),
+        packed_array(">M8", [1], none),  # numpy takes it for NaT, but doesn't change the byte order of its elements
+        msgpack.packb(extension(SCALAR, [kind, date])),
+        msgpack.packb(extension(PAIRS, [[extension(SCALAR, [kind, date])], [msgpack.ExtType(8, b"x")]])),
+    ):
+        with pytest.raises(BadMessage, match="a date without a unit"):
+            unpack(packed)
+    assert str(unpack(packed_array(kind, [1], none))) == "['NaT']"
+    assert str(unpack(msgpack.packb(extension(SCALAR, [kind, none])))) == "NaT"
+
+
+def test_a_date_without_a_unit_is_not_plain() -> None:
+    dates = np.zeros(2, "M8")
+    for value in (dates, dates[0]):
+        with pytest.raises(TypeError, match=rf"^a: expected plain data .*, got {type(value).__name__}$"):
+            pack({"a": value})
+        shown = f"<{type(value).__name__}, whose repr raised ValueError>"
+        assert unpack(pack({"a": value}, use_repr=True)) == {"a": shown}
