@@ -72,14 +72,14 @@ def pack(value: object, use_repr: bool = False) -> bytes:
     """Convert a plain value to bytes. For any other value, packs numbers or its `repr` if `use_repr`; otherwise, raises
     `TypeError`.
     """
-    return _pack(_Packer(use_repr).convert(value))
+    return _pack(_converted(value, use_repr))
 
 
 def pack_each(values: Iterable[object], use_repr: bool = False) -> bytes:
     """Convert a list of values, such as one for each env copy, to bytes. How a value arrives, and whether it is plain,
     doesn't depend on the other values, because the number of values in a message follows from the number of workers.
     """
-    return _pack([_Packer(use_repr).convert(each, f"[{n}]", 1) for n, each in enumerate(values)])
+    return _pack([_converted(each, use_repr, f"[{n}]", 1) for n, each in enumerate(values)])
 
 
 def unpack(data: bytes | memoryview, values: int = 1) -> Any:
@@ -103,6 +103,25 @@ def _pack(value: object) -> bytes:
     return packed
 
 
+class _NotPlain(TypeError):
+    """A value that isn't plain. Its path is composed only for the error, because the `str` of a key may raise."""
+
+    def __init__(self, why: str) -> None:
+        super().__init__(why)
+        self.why = why
+        self.steps: list[str] = []
+        """the path to the value inside the outermost one, the last step first"""
+
+
+def _converted(value: object, use_repr: bool, where: str = "", depth: int = 0) -> Any:
+    """Convert a value to types that msgpack knows. `where` is its path in errors, and `depth` its level."""
+    try:
+        return _Packer(use_repr).convert(value, depth)
+    except _NotPlain as error:
+        path = "".join((where, *reversed(error.steps))).removeprefix(".")
+        raise TypeError(f"{path or 'value'}: {error.why}") from None
+
+
 @dataclass(frozen=True, slots=True)
 class _Packer:
     """Converts one value to types that msgpack knows. Types are compared exactly, so that no subclass arrives as its base
@@ -114,10 +133,10 @@ class _Packer:
     around: set[int] = field(default_factory=set)
     """`id` of each container that contains the current value"""
 
-    def convert(self, value: Any, where: str = "", depth: int = 0) -> Any:
-        """`where` is the value's path in errors. Raises `TypeError` for a value that isn't plain, unless `use_repr`."""
+    def convert(self, value: Any, depth: int) -> Any:
+        """Raises `_NotPlain` for a value that isn't plain, unless `use_repr`."""
         if depth > MAX_DEPTH:
-            raise TypeError(f"{where or 'value'}: expected at most {MAX_DEPTH} levels, got more")
+            raise _NotPlain(f"expected at most {MAX_DEPTH} levels, got more")
         kind = type(value)
         if value is None or kind in (bool, float, bytes) or (kind is str and _is_encodable(value)):
             return value
@@ -126,7 +145,7 @@ class _Packer:
         if kind is int and (digits := _digits(value)) is not None:
             return msgpack.ExtType(_Code.INT, digits)
         if self._is_container(value):
-            return self._container(value, where, depth)
+            return self._container(value, depth)
         if kind is complex:
             return msgpack.ExtType(_Code.COMPLEX, _pack([value.real, value.imag]))
         if kind is np.ndarray and value.dtype.kind in DTYPE_KINDS and _can_be_shown(value):
@@ -135,13 +154,13 @@ class _Packer:
             return msgpack.ExtType(_Code.SCALAR, _pack([value.dtype.str, value.tobytes()]))
         if self.use_repr:
             numbers = _numbers(value)
-            return _repr(value) if numbers is None else self.convert(numbers, where, depth)
+            return _repr(value) if numbers is None else self.convert(numbers, depth)
         got = {
             str: "text with a lone surrogate",
             int: "an integer with too many digits",
             dict: f"dicts with {TOO_SLOW}",
         }.get(kind, kind.__name__)
-        raise TypeError(f"{where or 'value'}: expected plain data (numbers, strings, lists, dicts, arrays), got {got}")
+        raise _NotPlain(f"expected plain data (numbers, strings, lists, dicts, arrays), got {got}")
 
     def _is_a(self, kind: type, value: object) -> bool:
         return type(value) is kind or (self.use_repr and isinstance(value, kind))
@@ -153,40 +172,53 @@ class _Packer:
             return not _too_slow(value, self.limit)
         return self._is_a(list, value) or self._is_a(tuple, value) or (self.use_repr and isinstance(value, deque))
 
-    def _container(self, value: Any, where: str, depth: int) -> Any:
+    def _container(self, value: Any, depth: int) -> Any:
         """Convert a container. With `use_repr`, it becomes its `repr` on the last level, or if it contains itself."""
         if self.use_repr and (depth == MAX_DEPTH or id(value) in self.around):
             return _repr(value)
         self.around.add(id(value))
         try:
             if isinstance(value, dict):
-                return self._dict(value, where, depth)
+                return self._dict(value, depth)
             if isinstance(value, tuple):
-                return msgpack.ExtType(_Code.TUPLE, _pack(self._items(value, where, depth)))
+                return msgpack.ExtType(_Code.TUPLE, _pack(self._items(value, depth)))
             if isinstance(value, np.ndarray):
-                items = self._items(value.ravel().tolist(), where, depth)
-                return msgpack.ExtType(_Code.OBJECTS, _pack([list(value.shape), items]))
-            return self._items(value, where, depth)
+                return msgpack.ExtType(_Code.OBJECTS, _pack([list(value.shape), self._items(value.ravel().tolist(), depth)]))
+            return self._items(value, depth)
         finally:
             self.around.discard(id(value))
 
-    def _items(self, values: Iterable[Any], where: str, depth: int) -> list[Any]:
-        return [self.convert(each, f"{where}[{i}]", depth + 1) for i, each in enumerate(values)]
+    def _items(self, values: Iterable[Any], depth: int) -> list[Any]:
+        items = []
+        for n, each in enumerate(values):
+            try:
+                items.append(self.convert(each, depth + 1))
+            except _NotPlain as error:
+                error.steps.append(f"[{n}]")
+                raise
+        return items
 
-    def _dict(self, value: dict[Any, Any], where: str, depth: int) -> Any:
-        inside = [self.convert(each, f"{where}.{key}" if where else str(key), depth + 1) for key, each in value.items()]
+    def _dict(self, value: dict[Any, Any], depth: int) -> Any:
+        inside = []
+        for key, each in value.items():
+            try:
+                inside.append(self.convert(each, depth + 1))
+            except _NotPlain as error:
+                error.steps.append(f".{key if type(key) is str else safe_repr(key)}")
+                raise
         if all(type(key) is str and _is_encodable(key) for key in value):
             return dict(zip(value, inside, strict=True))
-        keys = [self._key(key, f"{where} key", depth + 1) for key in value]
+        keys = [self._key(key, depth + 1) for key in value]
         return msgpack.ExtType(_Code.PAIRS, _pack([keys, inside]))
 
-    def _key(self, key: Any, where: str, depth: int) -> Any:
+    def _key(self, key: Any, depth: int) -> Any:
         """Convert a key of a dict. A key that isn't plain becomes its `repr`, because an array or a list can't be a key."""
         try:
-            return replace(self, use_repr=False).convert(key, where, depth)
-        except TypeError:
+            return replace(self, use_repr=False).convert(key, depth)
+        except _NotPlain as error:
             if self.use_repr:
                 return _repr(key)
+            error.steps.append(" key")
             raise
 
 

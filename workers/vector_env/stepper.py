@@ -73,10 +73,11 @@ class Stepper:
                         infos = self._step(lane, order.actions, pulse)
                     case Call():
                         return _call(order, lane, self._allow_private_names)
+                packed = pack_infos(infos)
         except BaseException:
             self.lanes.close([order.lane])
             raise
-        return _stepped(order, lane.rows, pack_infos(infos))
+        return _stepped(order, lane.rows, packed)
 
     def serve_shared_memory(self, timeout_s: float, pulse: Pulse, session: int, send: Callable[[Stepped], None]) -> bool:
         """Execute the orders in shared memory for `timeout_s` seconds. Returns True early if the wake pipe announces a
@@ -168,8 +169,14 @@ class Stepper:
 
 
 def pack_infos(infos: CopyInfos) -> bytes:
-    """Pack the infos as bytes; empty if there are none. Values that aren't plain arrive as numbers or as their `repr`."""
-    return pack_each(infos, use_repr=True) if infos else b""
+    """Pack the infos as bytes; empty if there are none. Values that aren't plain arrive as numbers or as their `repr`.
+
+    Raises `CopyFailed` if an object in them raises.
+    """
+    try:
+        return pack_each(infos, use_repr=True) if infos else b""
+    except Exception as error:  # user-defined keys and dicts raise anything
+        raise CopyFailed(None, "infos") from error
 
 
 def _array(data: bytes) -> npt.NDArray[np.uint8]:

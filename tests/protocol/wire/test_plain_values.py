@@ -159,6 +159,16 @@ def test_what_is_not_plain_is_shown_if_asked_so_and_can_be_found() -> None:
     assert repr_paths(back, 9) == ["a.b"]
 
 
+@pytest.mark.parametrize("key", [10**5000, (10**5000,), np.zeros(1, "M8")[0]], ids=["number", "tuple", "date"])
+def test_a_key_is_only_shown_in_an_error_and_may_refuse_to_be_shown(key: Any) -> None:
+    shown = f"<{type(key).__name__}, whose repr raised ValueError>"
+    assert unpack(pack({"a": {key: 1}}, use_repr=True)) == {"a": {shown: 1}}
+    with pytest.raises(TypeError, match=rf"^a\.{shown}\[0\]: expected plain data .*, got Odd$"):
+        pack({"a": {key: [Odd()]}})
+    with pytest.raises(TypeError, match=r"^a key"):
+        pack({"a": {key: 1}})
+
+
 def test_a_path_is_short_and_safe_to_show() -> None:
     odd = ReprString("odd")
     nest: Any = odd

@@ -153,6 +153,25 @@ def test_an_info_that_contains_itself_is_an_error_of_the_environment() -> None:
         stepped(partial(Encloses, dict), 1)
 
 
+class OddInfo(dict[Any, Any]):
+    """A dict that can't be read."""
+
+    def items(self) -> Any:
+        raise ValueError("no items")
+
+
+class InfoInList(Countdown):
+    """The info of each step contains a dict that can't be read."""
+
+    def step(self, action: Any) -> Any:
+        return *super().step(action)[:4], {"a": [OddInfo(b=1)]}
+
+
+def test_an_info_that_raises_when_it_is_packed_is_an_error_of_the_environment() -> None:
+    with pytest.raises(EnvironmentFailed, match="^lane 0, infos: its environment raised ValueError: no items$"):
+        stepped(partial(InfoInList, 50), 1)
+
+
 class Blind(Countdown):
     """Its observations have no arrays."""
 
