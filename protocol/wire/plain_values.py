@@ -8,19 +8,22 @@ sent as its `repr` and arrives as a `ReprString`, which cannot be confused with 
 dict, list and tuple are plain too: they arrive as dicts, lists and tuples. Other numbers, buffers, and objects with
 numpy's protocol, such as tensors, arrive as numpy scalars or arrays if numpy reads numbers from them. A deque arrives as
 a list. Other sequences don't, because some never end, or contain themselves, as a character of a `UserString` does. A
-container that contains itself isn't plain; of a value with more than `MAX_DEPTH` levels, the innermost containers aren't.
+container that contains itself isn't plain; nor are those below `MAX_DEPTH` levels, or after `MOST_VALUES` other values. A
+container that isn't plain is sent as a line that says why, because its `repr` would show a shared container wherever it
+occurs, which may be in 2^32 places.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 import sys
 from collections import Counter, deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 import msgpack
 import numpy as np
@@ -28,11 +31,13 @@ import numpy as np
 from millrace.protocol.bounds import MAX_LINE, MAX_NAME, MOST_OTHER_KEYS, MOST_WITH_ONE_HASH, one_line
 from millrace.protocol.errors import BadMessage, safe_repr
 from millrace.protocol.key_limit import KeyLimit
+from millrace.protocol.wire.cycles import in_cycles
 
 DTYPE_KINDS = "biufcSUmM"
 NUMBER_KINDS = "biuf"
 NUMPY_PROTOCOL = ("__array__", "__array_interface__", "__array_struct__")
 MAX_DEPTH = 32
+MOST_VALUES = 1 << 20  # inside one value, in which a container may occur again and again
 MAX_REPR = 1000  # characters
 MAX_DIMENSIONS = 64  # numpy's own limit
 MAX_SIZE = 1 << 48  # of one dimension
@@ -57,11 +62,12 @@ _NOT_MSGPACK = (_Code.INT, _Code.REPR)
 
 
 class ReprString(str):
-    """The `repr` of a value that is not plain."""
+    """The `repr` of a value that is not plain, or a line that says why a container is not."""
 
     __slots__ = ()
 
 
+ITSELF = "that contains itself"
 TOO_SLOW = (
     f"more than {MOST_OTHER_KEYS:,} keys that aren't text, more than {MOST_WITH_ONE_HASH} with the same hash, "
     "or too many such dicts"
@@ -113,10 +119,17 @@ class _NotPlain(TypeError):
         """the path to the value inside the outermost one, the last step first"""
 
 
+class _Cycle(Exception):
+    """A container contains itself, and it isn't known yet which other ones do."""
+
+
 def _converted(value: object, use_repr: bool, where: str = "", depth: int = 0) -> Any:
     """Convert a value to types that msgpack knows. `where` is its path in errors, and `depth` its level."""
     try:
-        return _Packer(use_repr).convert(value, depth)
+        try:
+            return _Packer(use_repr).convert(value, depth)
+        except _Cycle:
+            return _Packer(use_repr, endless=_endless_in(value)).convert(value, depth)
     except _NotPlain as error:
         path = "".join((where, *reversed(error.steps))).removeprefix(".")
         raise TypeError(f"{path or 'value'}: {error.why}") from None
@@ -132,11 +145,16 @@ class _Packer:
     limit: KeyLimit = field(default_factory=KeyLimit)
     around: set[int] = field(default_factory=set)
     """`id` of each container that contains the current value"""
+    endless: set[int] | None = None
+    """`id` of each container that contains itself; None if this isn't known"""
+    count: Iterator[int] = field(default_factory=itertools.count)
+    """numbers the values inside the value"""
 
     def convert(self, value: Any, depth: int) -> Any:
         """Raises `_NotPlain` for a value that isn't plain, unless `use_repr`."""
         if depth > MAX_DEPTH:
             raise _NotPlain(f"expected at most {MAX_DEPTH} levels, got more")
+        number = next(self.count)
         kind = type(value)
         if value is None or kind in (bool, float, bytes) or (kind is str and _is_encodable(value)):
             return value
@@ -145,6 +163,8 @@ class _Packer:
         if kind is int and (digits := _digits(value)) is not None:
             return msgpack.ExtType(_Code.INT, digits)
         if self._is_container(value):
+            if why := self._why_not_plain(value, depth, number):
+                return self._instead(value, why)
             return self._container(value, depth)
         if kind is complex:
             return msgpack.ExtType(_Code.COMPLEX, _pack([value.real, value.imag]))
@@ -155,12 +175,8 @@ class _Packer:
         if self.use_repr:
             numbers = _numbers(value)
             return _repr(value) if numbers is None else self.convert(numbers, depth)
-        got = {
-            str: "text with a lone surrogate",
-            int: "an integer with too many digits",
-            dict: f"dicts with {TOO_SLOW}",
-        }.get(kind, kind.__name__)
-        raise _NotPlain(f"expected plain data (numbers, strings, lists, dicts, arrays), got {got}")
+        got = {str: "text with a lone surrogate", int: "an integer with too many digits"}.get(kind, kind.__name__)
+        raise _unexpected(got)
 
     def _is_a(self, kind: type, value: object) -> bool:
         return type(value) is kind or (self.use_repr and isinstance(value, kind))
@@ -168,23 +184,44 @@ class _Packer:
     def _is_container(self, value: Any) -> bool:
         if type(value) is np.ndarray:
             return bool(value.dtype.kind == "O")
-        if self._is_a(dict, value):
-            return not _too_slow(value, self.limit)
-        return self._is_a(list, value) or self._is_a(tuple, value) or (self.use_repr and isinstance(value, deque))
+        if self._is_a(dict, value) or self._is_a(list, value) or self._is_a(tuple, value):
+            return True
+        return self.use_repr and isinstance(value, deque)
+
+    def _why_not_plain(self, container: Any, depth: int, number: int) -> str:
+        """Why a container isn't plain; empty if it is."""
+        if id(container) in self.around:
+            if self.use_repr and self.endless is None:
+                raise _Cycle
+            return ITSELF
+        if self.endless and id(container) in self.endless:
+            return ITSELF
+        if isinstance(container, dict) and _too_slow(container, self.limit):
+            return f"with {TOO_SLOW}"
+        if self.use_repr and depth == MAX_DEPTH:
+            return f"below {MAX_DEPTH} levels"
+        if number >= MOST_VALUES:
+            return f"after {MOST_VALUES:,} other values"
+        return ""
+
+    def _instead(self, container: object, why: str) -> Any:
+        """What is sent instead of a container that isn't plain. Raises `_NotPlain` unless `use_repr`."""
+        got = f"{type(container).__name__} {why}"
+        if self.use_repr:
+            return _line(f"<{got}>")
+        raise _unexpected(got)
 
     def _container(self, value: Any, depth: int) -> Any:
-        """Convert a container. With `use_repr`, it becomes its `repr` on the last level, or if it contains itself."""
-        if self.use_repr and (depth == MAX_DEPTH or id(value) in self.around):
-            return _repr(value)
         self.around.add(id(value))
         try:
             if isinstance(value, dict):
                 return self._dict(value, depth)
+            items = self._items(_inside(value), depth)
             if isinstance(value, tuple):
-                return msgpack.ExtType(_Code.TUPLE, _pack(self._items(value, depth)))
+                return msgpack.ExtType(_Code.TUPLE, _pack(items))
             if isinstance(value, np.ndarray):
-                return msgpack.ExtType(_Code.OBJECTS, _pack([list(value.shape), self._items(value.ravel().tolist(), depth)]))
-            return self._items(value, depth)
+                return msgpack.ExtType(_Code.OBJECTS, _pack([list(value.shape), items]))
+            return items
         finally:
             self.around.discard(id(value))
 
@@ -222,6 +259,27 @@ class _Packer:
             raise
 
 
+def _inside(container: Any) -> Iterable[Any]:
+    """The values that are directly in a container, without the keys of a dict."""
+    match container:
+        case dict():
+            return container.values()
+        case np.ndarray():
+            return cast(list[Any], container.ravel().tolist())
+        case _:
+            return cast(Iterable[Any], container)
+
+
+def _endless_in(value: object) -> set[int]:
+    """The `id` of each container in a value that contains itself."""
+    is_container = _Packer(use_repr=True)._is_container
+    return in_cycles(value, lambda each: [inner for inner in _inside(each) if is_container(inner)], MOST_VALUES)
+
+
+def _unexpected(got: str) -> _NotPlain:
+    return _NotPlain(f"expected plain data (numbers, strings, lists, dicts, arrays), got {got}")
+
+
 def _too_slow(keys: Iterable[object], limit: KeyLimit) -> bool:
     """Whether a dict with these keys would take too long. If not, they count from now on.
 
@@ -250,7 +308,12 @@ def _numbers(value: Any) -> Any:
 
 
 def _repr(value: Any) -> msgpack.ExtType:
-    return msgpack.ExtType(_Code.REPR, safe_repr(value)[:MAX_REPR].encode(errors="backslashreplace"))
+    return _line(safe_repr(value))
+
+
+def _line(text: str) -> msgpack.ExtType:
+    """A text that arrives as a `ReprString`."""
+    return msgpack.ExtType(_Code.REPR, text[:MAX_REPR].encode(errors="backslashreplace"))
 
 
 def _is_encodable(text: str) -> bool:

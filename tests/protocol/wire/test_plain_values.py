@@ -8,7 +8,7 @@ import math
 import tracemalloc
 from array import array as buffer
 from collections import OrderedDict, UserString, defaultdict, deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from enum import IntEnum
 from typing import Any, NamedTuple
@@ -24,7 +24,16 @@ from millrace.protocol.bounds import MAX_LINE, MOST_OTHER_KEYS, MOST_WITH_ONE_HA
 from millrace.protocol.errors import BadMessage
 from millrace.protocol.key_limit import KeyLimit
 from millrace.protocol.wire import plain_values
-from millrace.protocol.wire.plain_values import MAX_DEPTH, MAX_DIMENSIONS, ReprString, pack, pack_each, repr_paths, unpack
+from millrace.protocol.wire.plain_values import (
+    MAX_DEPTH,
+    MAX_DIMENSIONS,
+    TOO_SLOW,
+    ReprString,
+    pack,
+    pack_each,
+    repr_paths,
+    unpack,
+)
 from tests.support.numbers.bit_equality import bit_equal
 
 scalars = hnp.arrays(
@@ -75,9 +84,7 @@ def test_a_dict_with_too_many_keys_that_are_not_text_is_refused(key: Callable[[i
     for keys in ([*many], ["a", *many]):
         with pytest.raises(BadMessage, match="more than 10,000 keys that aren't text"):
             unpack(packed_dict(keys))
-    with pytest.raises(
-        TypeError, match=r"^a: expected plain data .*, got dicts with more than 10,000 keys that aren't text"
-    ):
+    with pytest.raises(TypeError, match=r"^a: expected plain data .*, got dict with more than 10,000 keys that aren't text"):
         pack({"a": many})
     assert type(unpack(pack({"a": many}, use_repr=True))["a"]) is ReprString
 
@@ -99,7 +106,7 @@ def test_a_dict_whose_keys_have_the_same_hash_is_refused(key: Callable[[int], An
     for keys in ([*many], ["a", 1, *many]):
         with pytest.raises(BadMessage, match="more than 64 with the same hash"):
             unpack(packed_dict(keys))
-    with pytest.raises(TypeError, match=r"^a: expected plain data .*, got dicts with .* more than 64 with the same hash"):
+    with pytest.raises(TypeError, match=r"^a: expected plain data .*, got dict with .* more than 64 with the same hash"):
         pack({"a": many})
     assert type(unpack(pack({"a": many}, use_repr=True))["a"]) is ReprString
 
@@ -113,9 +120,9 @@ def test_dicts_that_would_together_take_too_long_are_refused() -> None:
     for packed in (b"\x95" + one * 4 + packed_dict([1]), b"\x92" + one + b"\x94" + one * 4):
         with pytest.raises(BadMessage, match="or too many such dicts"):
             unpack(packed)
-    with pytest.raises(TypeError, match=r"^\[3\]: expected plain data .*, got dicts with .*, or too many such dicts$"):
+    with pytest.raises(TypeError, match=r"^\[3\]: expected plain data .*, got dict with .*, or too many such dicts$"):
         pack([*few, {1: None}])
-    assert unpack(pack([*few, {1: None}, {"a": 1}], use_repr=True)) == [*few, "{1: None}", {"a": 1}]
+    assert unpack(pack([*few, {1: None}, {"a": 1}], use_repr=True)) == [*few, f"<dict with {TOO_SLOW}>", {"a": 1}]
 
 
 def test_each_of_several_values_arrives_as_it_would_alone() -> None:
@@ -123,7 +130,7 @@ def test_each_of_several_values_arrives_as_it_would_alone() -> None:
     values = [{"a": full}, full, {"a": full, "b": {1: 2}}]
     for each in values[:2]:
         assert unpack(pack_each([each]), 1) == [each]
-    assert unpack(pack_each(values, use_repr=True), 3) == [*values[:2], {"a": full, "b": "{1: 2}"}]
+    assert unpack(pack_each(values, use_repr=True), 3) == [*values[:2], {"a": full, "b": f"<dict with {TOO_SLOW}>"}]
     with pytest.raises(TypeError, match=r"^\[2\]\.b: expected plain data"):
         pack_each(values)
     with pytest.raises(BadMessage, match="or too many such dicts"):
@@ -419,18 +426,73 @@ def test_what_can_be_packed_at_any_depth_can_be_read(nest: Callable[[Any], Any],
 
 
 @pytest.mark.parametrize("kind", [list, dict, deque, in_array])
-def test_what_contains_itself_is_shown_if_asked_so(kind: Callable[[Any], Any]) -> None:
+def test_of_a_container_that_contains_itself_a_line_is_sent_if_asked_so(kind: Callable[[Any], Any]) -> None:
     value = kind({} if kind is dict else [0, 0])
     if kind is in_array:
         value = np.empty(2, object)
-    for key in (0, 1):  # twice, so that the number of paths would double with each level
+    for key in (0, 1):
         value[key] = value
-    with pytest.raises(TypeError):
+    with pytest.raises(TypeError, match="got deque" if kind is deque else "that contains itself"):
         pack(value)
-    back = unpack(pack([value, value], use_repr=True))
-    assert type(back[0][0]) is ReprString
-    assert len(pack(value, use_repr=True)) < 1_000
-    assert bit_equal(back[0], back[1])
+    back = unpack(pack([value, {"a": value, "b": 1}], use_repr=True))
+    line = f"<{type(value).__name__} that contains itself>"
+    assert back == [line, {"a": line, "b": 1}]
+    assert type(back[0]) is ReprString
+
+
+class CountedList(list[Any]):
+    """Raises if such lists are read very often."""
+
+    reads = 0
+
+    def __iter__(self) -> Iterator[Any]:
+        CountedList.reads += 1
+        if CountedList.reads > 1_000:
+            raise RuntimeError("read 1,000 times")
+        return super().__iter__()
+
+
+def test_a_graph_is_read_a_few_times_even_if_it_has_many_cycles() -> None:
+    """Otherwise, each path would be read: with 20 nodes that all contain each other, 20! paths."""
+    CountedList.reads = 0
+    shared = [1, 2]
+    nodes = [{"odd": WithoutRepr(), "near": CountedList(), "shared": shared} for _ in range(20)]
+    for node in nodes:
+        node["near"] += [each for each in nodes if each is not node]  # type: ignore[operator]
+    leads_to_a_node = {"node": nodes[0], "shared": [shared, shared]}
+    back = unpack(pack({"graph": nodes, "more": leads_to_a_node}, use_repr=True))
+    line = "<dict that contains itself>"
+    assert back == {"graph": [line] * 20, "more": {"node": line, "shared": [[1, 2], [1, 2]]}}
+    assert repr_paths(back, 9) == ["graph", "more.node"]
+
+
+@pytest.mark.parametrize("use_repr", [False, True])
+def test_a_value_in_which_lists_occur_in_too_many_places_is_not_plain(
+    monkeypatch: pytest.MonkeyPatch, use_repr: bool
+) -> None:
+    monkeypatch.setattr(plain_values, "MOST_VALUES", 200)
+    value: Any = 1
+    for _ in range(10):
+        value = [value, value]
+    if not use_repr:
+        with pytest.raises(TypeError, match=r"^(\[[01]\])+: expected plain data .*, got list after 200 other values$"):
+            pack(value)
+        return
+    (a, b), after = unpack(pack((value, 2), use_repr=True))
+    assert (type(a), b, after) == (list, "<list after 200 other values>", 2)
+
+
+def test_a_container_below_too_many_levels_is_not_shown() -> None:
+    """Its `repr` would show a list wherever it occurs, which may be in 2^32 places."""
+    value: Any = WithoutRepr()
+    for _ in range(32):
+        value = [value, value]
+    for _ in range(MAX_DEPTH):
+        value = [value]
+    back = unpack(pack(value, use_repr=True))
+    for _ in range(MAX_DEPTH):
+        (back,) = back
+    assert back == f"<list below {MAX_DEPTH} levels>"
 
 
 @given(st.binary(max_size=200))
