@@ -299,12 +299,18 @@ class EnvLoop:
             close_copy(env)
 
 
-def _kept(info: Any) -> Any:
+def _kept(info: Any, copies: dict[int, tuple[Any, Any]] | None = None) -> Any:
     """The info with its dicts and arrays copied, just as gymnasium copies them. Other values aren't copied, because some
     can't be.
+
+    `copies` has each dict so far, with its copy, by its `id`, because a dict may occur in many places.
     """
     if isinstance(info, dict):
-        return {key: value if type(value) in _IMMUTABLE else _kept(value) for key, value in info.items()}
+        copies = {} if copies is None else copies
+        if id(info) not in copies:
+            kept = {key: value if type(value) in _IMMUTABLE else _kept(value, copies) for key, value in info.items()}
+            copies[id(info)] = info, kept
+        return copies[id(info)][1]
     return info.copy() if isinstance(info, np.ndarray) else info
 
 

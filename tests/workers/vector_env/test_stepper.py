@@ -273,6 +273,27 @@ def test_copies_may_return_one_dict_as_their_info(mode: Literal["NextStep", "Sam
     loop.close()
 
 
+class RepeatsDict(Countdown):
+    """Its info contains a dict twice, which contains another dict twice, and so on."""
+
+    def step(self, action: Any) -> Any:
+        info: dict[str, Any] = {}
+        for _ in range(8):
+            info = {"a": info, "b": info}
+        return *super().step(action)[:4], info
+
+
+def test_a_dict_that_occurs_in_several_places_of_an_info_is_copied_once() -> None:
+    """Otherwise, one that occurs in 2^32 places would take that many copies."""
+    loop, observations = EnvLoop([partial(RepeatsDict, 50)], lambda: None, "Disabled"), [None]
+    loop.reset([0], [1], observations, lambda: None)
+    ((_, info),) = loop.step([0], observations, lambda: None)
+    while info:
+        assert info["a"] is info["b"]
+        info = info["a"]
+    loop.close()
+
+
 class OnlyWhileOpen(Countdown):
     """Raises in a step after `close`."""
 
