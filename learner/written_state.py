@@ -49,6 +49,8 @@ def check_pickles(archive: zipfile.ZipFile) -> None:
     """Raise `Unfit` if the pickle of an archive contains something that isn't allowed."""
     storage_bytes: dict[str, int] = {}
     for entry in archive.infolist():
+        if not entry.filename.isascii():  # Python and torch would decode it differently
+            raise Unfit("expected names of ASCII characters in the archive")
         folder, _, key = entry.filename.lower().partition("/")[2].partition("/")
         if folder == CONTENTS and storage_bytes.setdefault(key, entry.file_size) != entry.file_size:
             raise Unfit("expected one content of each storage, got two for a storage")

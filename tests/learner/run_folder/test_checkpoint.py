@@ -351,7 +351,7 @@ def test_an_archive_in_which_torch_may_find_another_pickle_than_the_rehearsed_on
 def with_storage(path: Path, kind: str, key: str, numel: int, records: dict[str, bytes]) -> None:
     """Write an archive with these records, and with a storage that its pickle describes thus."""
     content = b"(X\x07\x00\x00\x00storagec%s\nX%c\x00\x00\x00%sX\x03\x00\x00\x00cpuJ%stQ" % (
-        kind.replace(" ", "\n").encode(), len(key), key.encode(), numel.to_bytes(4, "little", signed=True),
+        kind.replace(" ", "\n").encode(), len(key.encode()), key.encode(), numel.to_bytes(4, "little", signed=True),
     )  # fmt: skip
     writer = torch._C.PyTorchFileWriter(str(path))
     for name, record in {"data.pkl": b"\x80\x02" + content + b".", **records}.items():
@@ -382,6 +382,16 @@ def test_a_storage_has_the_size_of_its_content(
         check_pickles(archive)
     with_storage(tmp_path / "model.pt", kind, key, numel, records)
     with zipfile.ZipFile(tmp_path / "model.pt") as archive, pytest.raises(Unfit, match="a storage"):
+        check_pickles(archive)
+
+
+def test_a_storage_whose_name_torch_decodes_otherwise_than_python_is_refused(tmp_path: Path) -> None:
+    """Python takes the bytes of "ä" for "├ñ"; torch compares bytes, so it finds another content, which may be shorter."""
+    path = tmp_path / "model.pt"
+    with_storage(path, "torch FloatStorage", "├ñ", 4, {"data/ä": bytes(16), "data/├ñ": bytes(8)})
+    flags = re.compile(rb"(?<=PK\x01\x02....)..", re.DOTALL)  # one of them says that a name is in UTF-8
+    path.write_bytes(flags.sub(bytes(2), path.read_bytes()))
+    with zipfile.ZipFile(path) as archive, pytest.raises(Unfit, match="ASCII"):
         check_pickles(archive)
 
 
