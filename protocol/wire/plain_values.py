@@ -3,14 +3,14 @@
 A value is plain if it is None, a bool, int, float, complex, str, bytes, list, tuple, dict, or a numpy scalar or array of
 bools, numbers, text, bytes, dates or durations, or a numpy array of plain objects. Strings with a lone surrogate, which
 UTF-8 cannot encode, integers with more decimal digits than Python converts, and dicts whose keys could make them slow
-(`_too_slow`) are not plain. A value that isn't plain raises `TypeError`; if the caller asks for it, the value is instead
-sent as its `repr` and arrives as a `ReprString`, which cannot be confused with a string. For such a caller, subclasses of
-dict, list and tuple are plain too: they arrive as dicts, lists and tuples. Other numbers, buffers, and objects with
-numpy's protocol, such as tensors, arrive as numpy scalars or arrays if numpy reads numbers from them. A deque arrives as
-a list. Other sequences don't, because some never end, or contain themselves, as a character of a `UserString` does. A
-container that contains itself isn't plain; nor are those below `MAX_DEPTH` levels, or after `MOST_VALUES` other values. A
-container that isn't plain is sent as a line that says why, because its `repr` would show a shared container wherever it
-occurs, which may be in 2^32 places.
+(`_too_slow`) are not plain. An array of text of length 0 arrives as one of length 1, which has the same elements. A value
+that isn't plain raises `TypeError`; if the caller asks for it, the value is instead sent as its `repr` and arrives as a
+`ReprString`, which cannot be confused with a string. For such a caller, subclasses of dict, list and tuple are plain too:
+they arrive as dicts, lists and tuples. Other numbers, buffers, and objects with numpy's protocol, such as tensors, arrive
+as numpy scalars or arrays if numpy reads numbers from them. A deque arrives as a list. Other sequences don't, because some
+never end, or contain themselves, as a character of a `UserString` does. A container that contains itself isn't plain; nor
+are those below `MAX_DEPTH` levels, or after `MOST_VALUES` other values. A container that isn't plain is sent as a line that
+says why, because its `repr` would show a shared container wherever it occurs, which may be in 2^32 places.
 """
 
 from __future__ import annotations
@@ -169,6 +169,8 @@ class _Packer:
         if kind is complex:
             return msgpack.ExtType(_Code.COMPLEX, _pack([value.real, value.imag]))
         if kind is np.ndarray and value.dtype.kind in DTYPE_KINDS and _can_be_shown(value):
+            if not value.dtype.itemsize:  # the reader refuses such an array, because its shape could be of any size
+                value = value.astype(f"{value.dtype.kind}1")
             return msgpack.ExtType(_Code.ARRAY, _pack([value.dtype.str, list(value.shape), value.tobytes()]))
         if isinstance(value, np.generic) and value.dtype.kind in DTYPE_KINDS and _can_be_shown(value):
             return msgpack.ExtType(_Code.SCALAR, _pack([value.dtype.str, value.tobytes()]))

@@ -650,3 +650,12 @@ def test_a_date_without_a_unit_is_not_plain() -> None:
             pack({"a": value})
         shown = f"<{type(value).__name__}, whose repr raised ValueError>"
         assert unpack(pack({"a": value}, use_repr=True)) == {"a": shown}
+
+
+@pytest.mark.parametrize("kind", ["S", "U"])
+def test_an_array_of_nothing_but_empty_text_arrives_with_a_character_for_each(kind: str) -> None:
+    """`np.strings.partition` returns such arrays. A reader refuses them, because they could have any number of elements."""
+    array = np.zeros(3, f"{kind}4,{kind}0")["f1"]
+    assert array.dtype.itemsize == 0
+    back = unpack(pack([array, array.reshape(1, 3)[:, :2], array[0]]))
+    assert bit_equal(back, [np.zeros(3, f"{kind}1"), np.zeros((1, 2), f"{kind}1"), array[0]])
