@@ -17,14 +17,14 @@ from millrace.learner.rollouts.ledger import Past
 from millrace.learner.rollouts.past_rollouts import PastRollouts, packed, unpacked
 from millrace.learner.run_folder.atomic_write import write_file
 from millrace.learner.run_folder.regular_files import open_regular, reason
-from millrace.protocol.arrays import Array
+from millrace.protocol.arrays import Array, Bytes
 from millrace.protocol.bounds import LARGEST, one_line
 from millrace.protocol.errors import CheckpointError, UsageError
 from millrace.protocol.specs import PolicySpec
 
 OURS = "millrace"  # name of the entry with the state, packed as bytes; the user's arrays must have other names
 OF_NUMPY = ("file", "allow_pickle")  # parameters of numpy.savez, so the user's arrays can't have these names
-FORMAT = 1
+FORMAT = 2
 
 
 class ServiceState(msgspec.Struct, frozen=True, kw_only=True):
@@ -41,6 +41,12 @@ class ServiceState(msgspec.Struct, frozen=True, kw_only=True):
     normalizer: dict[str, Any] | None = None
     """the state of the normalizer, as plain data; None if it was not used"""
     format: int = FORMAT
+
+
+class _OfAnyFormat(msgspec.Struct):
+    """The only part of a state that each format has."""
+
+    format: int
 
 
 def digest(policy: PolicySpec) -> str:
@@ -81,13 +87,23 @@ def read(path: Path) -> tuple[ServiceState, dict[str, Array]]:
             if any(entry.compress_type != zipfile.ZIP_STORED for entry in file.zip.infolist()):
                 raise ValueError("it is compressed, which millrace never does")  # a few of its bytes could fill the memory
             arrays = {name: file[name] for name in file.files}
-        state = unpacked(ServiceState, arrays.pop(OURS))
+        ours = arrays.pop(OURS)
+        if (got := _format(ours)) != FORMAT:
+            raise CheckpointError(f"{path}: expected format {FORMAT}, got {got}; use the millrace that wrote it")
+        state = unpacked(ServiceState, ours)
         state.rollouts.ledger.end_outstanding()
+    except CheckpointError:
+        raise
     except Exception as error:  # zipfile, numpy and msgspec raise a dozen exception types for damaged files
         raise unreadable(path, error) from error
-    if state.format != FORMAT:
-        raise CheckpointError(f"{path}: expected format {FORMAT}, got {state.format}; use the millrace that wrote it")
     return state, arrays
+
+
+def _format(ours: Bytes) -> int:
+    """The format of a packed state. Format 1 was JSON."""
+    if ours.tobytes().startswith(b"{"):
+        return msgspec.json.decode(ours.tobytes(), type=_OfAnyFormat).format
+    return unpacked(_OfAnyFormat, ours).format
 
 
 def unreadable(path: Path | str, error: Exception) -> CheckpointError:

@@ -22,7 +22,7 @@ from millrace.learner.run_folder.regular_files import open_regular, reason, regu
 from millrace.learner.written_state import check_memory, check_pickles, write_state
 from millrace.protocol.errors import CheckpointError
 
-FORMAT = 1
+FORMAT = 2
 FOLDER = "checkpoints"
 SUFFIX = ".pt"
 ZIP_BEGINS = b"PK\x03\x04"  # if a file begins with anything else, torch reads a pickle before the archive

@@ -282,6 +282,19 @@ def test_a_state_that_no_service_can_have_is_one_line(tmp_path: Path, change: di
     assert "\n" not in str(caught.value)
 
 
+def test_a_file_of_another_format_is_for_the_millrace_that_wrote_it(tmp_path: Path) -> None:
+    file = tmp_path / "state.npz"
+    with service() as made:
+        made.save(file)
+    with np.load(file) as saved:
+        later = msgspec.msgpack.decode(saved["millrace"].tobytes()) | {"format": 3, "rollouts": 0}
+    for number, state in ((3, msgspec.msgpack.encode(later)), (1, b'{"env":"CartPole-v1","lanes":"gA==","format":1}')):
+        np.savez(file, millrace=np.frombuffer(state, np.uint8))
+        with pytest.raises(CheckpointError) as caught, service(restore=file):
+            pass
+        assert str(caught.value) == f"{file}: expected format 2, got {number}; use the millrace that wrote it"
+
+
 def test_a_pipe_in_the_place_of_a_saved_state_is_refused_and_a_link_followed(tmp_path: Path) -> None:
     with service() as made:
         made.save(tmp_path / "state.npz")
