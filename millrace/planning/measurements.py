@@ -79,14 +79,14 @@ class Measurements(msgspec.Struct, frozen=True, kw_only=True):
     copies_worked: int = 1
     """the largest number of copies that were stepped side by side without a problem"""
     copies_failed: int = 0
-    """the smallest number of copies, more than `copies_worked`, that had a problem because of their number; 0 if there is
-    none
+    """the smallest number of copies, more than `copies_worked`, that may have had a problem because of their number; 0 if
+    there is none
     """
     worked_in_one_worker: int = 1
     """the largest number of copies that were stepped in the same worker without a problem"""
     failed_in_one_worker: int = 0
-    """the smallest number of copies, more than one, that had a problem because they were in the same worker; 0 if there is
-    none
+    """the smallest number of copies, more than one, that may have had a problem because they were in the same worker; 0 if
+    there is none
     """
     reset_s: float = 0.0
     """mean wall time of a reset"""

@@ -308,7 +308,8 @@ def _with_all(measured: Measurements, sessions: Sequence[_SteppedCopies]) -> Mea
     worked = max((each.size.copies for each in sessions if each.is_whole), default=1)
     worked_in_one = max((each.size.each for each in sessions if each.is_whole), default=1)
     failed = [each.size for each in sessions if each.wrong and each.size.copies > 1]
-    # If several copies have worked in one worker, a process allows several, so the number of copies may be the problem.
+    # If several copies have worked in one worker, a process allows several. If more then failed there, the reason may be
+    # their number or the number in a process, so both are limited.
     too_many = [size for size in failed if size.copies > worked and (size.workers > 1 or worked_in_one > 1)]
     wrong_masks = next((each.masks.wrong for each in sessions if each.masks.wrong), "")
     return msgspec.structs.replace(
@@ -321,7 +322,7 @@ def _with_all(measured: Measurements, sessions: Sequence[_SteppedCopies]) -> Mea
         copies_worked=worked,
         copies_failed=min((size.copies for size in too_many), default=0),
         worked_in_one_worker=worked_in_one,
-        failed_in_one_worker=min((size.each for size in failed if size.workers == 1 and size not in too_many), default=0),
+        failed_in_one_worker=min((size.each for size in failed if size.workers == 1), default=0),
         episode_steps=steps / sum(map(len, later)) if later else sessions[0].time_limit,
         deterministic=_deterministic([trace for session in sessions for trace in session.traces]),
         findings=tuple(session.finding for session in sessions if not session.is_whole),

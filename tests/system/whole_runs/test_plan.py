@@ -184,8 +184,8 @@ def test_a_limit_on_the_number_of_copies_is_not_taken_for_one_copy_in_each_proce
     env_kwargs: dict[str, Any] = {"licence": str(tmp_path / "licence"), "licences": 3, "step_s": 0.0}
     plan = millrace.plan(Licensed, env_kwargs=env_kwargs, seconds=4 * BRIEF_S)
     measured = plan.measured
-    assert (measured.copies_worked, measured.worked_in_one_worker, measured.failed_in_one_worker) == (2, 2, 0)
-    assert 3 < measured.copies_failed <= COPIES_OF_SHORT
+    assert (measured.copies_worked, measured.worked_in_one_worker) == (2, 2)
+    assert 3 < measured.copies_failed == measured.failed_in_one_worker <= COPIES_OF_SHORT
     assert plan.settings["envs"] + plan.settings["eval_copies"] <= plan.settings["max_env_copies"] <= 3
     assert not any("OwnProcess" in line for line in plan.advice)
 
@@ -300,6 +300,19 @@ def test_more_copies_than_a_process_allows_are_no_limit_on_copies_if_as_many_wor
     assert plan.settings["workers"] == plan.settings["envs"]
     assert plan.settings["eval_copies"] == 1
     assert not any("OwnProcess" in line for line in plan.advice)
+
+
+def test_if_more_copies_failed_in_one_worker_than_work_side_by_side_they_are_limited_in_number_and_kept_apart(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("millrace.planning.probe_sizes.COPIES_OF_SHORT", 4)
+    monkeypatch.setattr("millrace.planning.plan.usable_cores", lambda: 3)
+    plan = millrace.plan(FewInEachProcess, env_kwargs={"step_s": 0.0, "few": 2}, seconds=4 * BRIEF_S)
+    measured = plan.measured
+    assert (measured.copies_worked, measured.copies_failed) == (3, 4)
+    assert (measured.worked_in_one_worker, measured.failed_in_one_worker) == (2, 4)
+    assert plan.settings["workers"] == plan.settings["envs"] == 2
+    assert (plan.settings["eval_copies"], plan.settings["max_env_copies"]) == (1, 3)
 
 
 def test_if_no_step_can_be_made_the_error_says_why() -> None:
