@@ -31,7 +31,6 @@ import numpy as np
 from millrace.protocol.bounds import MAX_LINE, MAX_NAME, MOST_OTHER_KEYS, MOST_WITH_ONE_HASH, one_line
 from millrace.protocol.errors import BadMessage, safe_repr
 from millrace.protocol.key_limit import KeyLimit
-from millrace.protocol.wire.cycles import in_cycles
 
 DTYPE_KINDS = "biufcSUmM"
 NUMBER_KINDS = "biuf"
@@ -120,16 +119,17 @@ class _NotPlain(TypeError):
 
 
 class _Cycle(Exception):
-    """A container contains itself, and it isn't known yet which other ones do."""
+    """A container contains itself. This ends when all that is inside that container has been left."""
+
+    def __init__(self, container: object) -> None:
+        super().__init__()
+        self.container = container
 
 
 def _converted(value: object, use_repr: bool, where: str = "", depth: int = 0) -> Any:
     """Convert a value to types that msgpack knows. `where` is its path in errors, and `depth` its level."""
     try:
-        try:
-            return _Packer(use_repr).convert(value, depth)
-        except _Cycle:
-            return _Packer(use_repr, endless=_endless_in(value)).convert(value, depth)
+        return _Packer(use_repr).convert(value, depth)
     except _NotPlain as error:
         path = "".join((where, *reversed(error.steps))).removeprefix(".")
         raise TypeError(f"{path or 'value'}: {error.why}") from None
@@ -145,8 +145,8 @@ class _Packer:
     limit: KeyLimit = field(default_factory=KeyLimit)
     around: set[int] = field(default_factory=set)
     """`id` of each container that contains the current value"""
-    endless: set[int] | None = None
-    """`id` of each container that contains itself; None if this isn't known"""
+    endless: set[int] = field(default_factory=set)
+    """`id` of each container that was found to contain itself"""
     count: Iterator[int] = field(default_factory=itertools.count)
     """numbers the values inside the value"""
 
@@ -192,12 +192,6 @@ class _Packer:
 
     def _why_not_plain(self, container: Any, depth: int, number: int) -> str:
         """Why a container isn't plain; empty if it is."""
-        if id(container) in self.around:
-            if self.use_repr and self.endless is None:
-                raise _Cycle
-            return ITSELF
-        if self.endless and id(container) in self.endless:
-            return ITSELF
         if isinstance(container, dict) and _too_slow(container, self.limit):
             return f"with {TOO_SLOW}"
         if self.use_repr and depth == MAX_DEPTH:
@@ -214,6 +208,10 @@ class _Packer:
         raise _unexpected(got)
 
     def _container(self, value: Any, depth: int) -> Any:
+        if id(value) in self.endless:
+            return self._instead(value, ITSELF)
+        if id(value) in self.around:
+            raise _Cycle(value)
         self.around.add(id(value))
         try:
             if isinstance(value, dict):
@@ -224,6 +222,11 @@ class _Packer:
             if isinstance(value, np.ndarray):
                 return msgpack.ExtType(_Code.OBJECTS, _pack([list(value.shape), items]))
             return items
+        except _Cycle as cycle:
+            if cycle.container is not value:
+                raise
+            self.endless.add(id(value))
+            return self._instead(value, ITSELF)
         finally:
             self.around.discard(id(value))
 
@@ -270,12 +273,6 @@ def _inside(container: Any) -> Iterable[Any]:
             return cast(list[Any], container.ravel().tolist())
         case _:
             return cast(Iterable[Any], container)
-
-
-def _endless_in(value: object) -> set[int]:
-    """The `id` of each container in a value that contains itself."""
-    is_container = _Packer(use_repr=True)._is_container
-    return in_cycles(value, lambda each: [inner for inner in _inside(each) if is_container(inner)], MOST_VALUES)
 
 
 def _unexpected(got: str) -> _NotPlain:
