@@ -23,7 +23,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from functools import partial
-from typing import Any, cast
+from typing import Any
 
 import msgpack
 import numpy as np
@@ -216,7 +216,7 @@ class _Packer:
         try:
             if isinstance(value, dict):
                 return self._dict(value, depth)
-            items = self._items(_inside(value), depth)
+            items = self._items(value.ravel().tolist() if isinstance(value, np.ndarray) else value, depth)
             if isinstance(value, tuple):
                 return msgpack.ExtType(_Code.TUPLE, _pack(items))
             if isinstance(value, np.ndarray):
@@ -262,17 +262,6 @@ class _Packer:
                 return _repr(key)
             error.steps.append(" key")
             raise
-
-
-def _inside(container: Any) -> Iterable[Any]:
-    """The values that are directly in a container, without the keys of a dict."""
-    match container:
-        case dict():
-            return container.values()
-        case np.ndarray():
-            return cast(list[Any], container.ravel().tolist())
-        case _:
-            return cast(Iterable[Any], container)
 
 
 def _unexpected(got: str) -> _NotPlain:

@@ -1070,12 +1070,29 @@ def interrupted(call: Callable[[], object], at: int) -> bool:
 
 
 FILES = {module.__file__ for module in (calls, env_module, send_recv, sent_lanes, step_hub, shared_steps)}
+
+
+def step_in_two_calls(env: ZmqVectorEnv) -> None:
+    env.step_async(zeros(range(4)))
+    env.step_wait()
+
+
+def reset_in_two_calls(env: ZmqVectorEnv) -> None:
+    env.reset_async(seed=2)
+    env.reset_wait()
+
+
+def send_and_recv(env: ZmqVectorEnv) -> None:
+    env.send(zeros(range(4)))
+    env.recv(4)
+
+
 CALLS: dict[str, Callable[[ZmqVectorEnv], object]] = {
     "step": lambda env: env.step(zeros(range(4))),
-    "step_async": lambda env: (env.step_async(zeros(range(4))), env.step_wait()),
+    "step_async": step_in_two_calls,
     "reset": lambda env: env.reset(seed=2),
-    "reset_async": lambda env: (env.reset_async(seed=2), env.reset_wait()),
-    "send": lambda env: (env.send(zeros(range(4))), env.recv(4)),
+    "reset_async": reset_in_two_calls,
+    "send": send_and_recv,
     "call": lambda env: env.call("render_mode"),
     "set_attr": lambda env: env.set_attr("left", 1.0),
 }
