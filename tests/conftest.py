@@ -48,8 +48,9 @@ LONG_IN_CI = ("clients", "cluster", "model")
 STARTS_A_PROCESS = {"subprocess.Popen", "os.fork", "os.forkpty", "os.posix_spawn"}
 SOAK_TIMEOUT_S = 1200  # of a test of that mark: it takes minutes, and longer on a busy machine
 
-hypothesis.settings.register_profile("few", max_examples=FEW)
-hypothesis.settings.register_profile("all", max_examples=ALL)
+MAY_BE_SLOW = [hypothesis.HealthCheck.too_slow]  # no limit on time, because other tests share the cores
+hypothesis.settings.register_profile("few", max_examples=FEW, deadline=None, suppress_health_check=MAY_BE_SLOW)
+hypothesis.settings.register_profile("all", max_examples=ALL, deadline=None, suppress_health_check=MAY_BE_SLOW)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
