@@ -163,9 +163,7 @@ class _Packer:
         if kind is int and (digits := _digits(value)) is not None:
             return msgpack.ExtType(_Code.INT, digits)
         if self._is_container(value):
-            if why := self._why_not_plain(value, depth, number):
-                return self._instead(value, why)
-            return self._container(value, depth)
+            return self._container(value, depth, number)
         if kind is complex:
             return msgpack.ExtType(_Code.COMPLEX, _pack([value.real, value.imag]))
         if kind is np.ndarray and value.dtype.kind in DTYPE_KINDS and _can_be_shown(value):
@@ -192,6 +190,8 @@ class _Packer:
 
     def _why_not_plain(self, container: Any, depth: int, number: int) -> str:
         """Why a container isn't plain; empty if it is."""
+        if id(container) in self.endless:
+            return ITSELF
         if isinstance(container, dict) and _too_slow(container, self.limit):
             return f"with {TOO_SLOW}"
         if self.use_repr and depth == MAX_DEPTH:
@@ -207,11 +207,11 @@ class _Packer:
             return _line(f"<{got}>")
         raise _unexpected(got)
 
-    def _container(self, value: Any, depth: int) -> Any:
-        if id(value) in self.endless:
-            return self._instead(value, ITSELF)
+    def _container(self, value: Any, depth: int, number: int) -> Any:
         if id(value) in self.around:
             raise _Cycle(value)
+        if why := self._why_not_plain(value, depth, number):
+            return self._instead(value, why)
         self.around.add(id(value))
         try:
             if isinstance(value, dict):

@@ -288,12 +288,17 @@ def test_an_environment_that_allows_one_copy_in_each_process_is_found_out(step_s
     assert all(re.match("[2-8] copies in one worker: .*multiple simulators", line) for line in measured.findings)
 
 
+def plan_of_two_in_each_process(monkeypatch: pytest.MonkeyPatch, tried: int) -> millrace.RunPlan:
+    """A plan on three cores, which tries this many copies in one worker, of which only two work."""
+    monkeypatch.setattr("millrace.planning.probe_sizes.COPIES_OF_SHORT", tried)
+    monkeypatch.setattr("millrace.planning.plan.usable_cores", lambda: 3)
+    return millrace.plan(FewInEachProcess, env_kwargs={"step_s": 0.0, "few": 2}, seconds=4 * BRIEF_S)
+
+
 def test_more_copies_than_a_process_allows_are_no_limit_on_copies_if_as_many_work_side_by_side(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("millrace.planning.probe_sizes.COPIES_OF_SHORT", 3)
-    monkeypatch.setattr("millrace.planning.plan.usable_cores", lambda: 3)
-    plan = millrace.plan(FewInEachProcess, env_kwargs={"step_s": 0.0, "few": 2}, seconds=4 * BRIEF_S)
+    plan = plan_of_two_in_each_process(monkeypatch, tried=3)
     measured = plan.measured
     assert (measured.copies_worked, measured.copies_failed) == (3, 0)
     assert (measured.worked_in_one_worker, measured.failed_in_one_worker) == (2, 3)
@@ -305,9 +310,7 @@ def test_more_copies_than_a_process_allows_are_no_limit_on_copies_if_as_many_wor
 def test_if_more_copies_failed_in_one_worker_than_work_side_by_side_they_are_limited_in_number_and_kept_apart(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("millrace.planning.probe_sizes.COPIES_OF_SHORT", 4)
-    monkeypatch.setattr("millrace.planning.plan.usable_cores", lambda: 3)
-    plan = millrace.plan(FewInEachProcess, env_kwargs={"step_s": 0.0, "few": 2}, seconds=4 * BRIEF_S)
+    plan = plan_of_two_in_each_process(monkeypatch, tried=4)
     measured = plan.measured
     assert (measured.copies_worked, measured.copies_failed) == (3, 4)
     assert (measured.worked_in_one_worker, measured.failed_in_one_worker) == (2, 4)
