@@ -143,7 +143,7 @@ def _read(path: Path) -> Checkpoint:
         raise CheckpointError(f"checkpoint {path}: expected one of millrace, got another program's file")
     if record["format"] != FORMAT:
         raise CheckpointError(
-            f"checkpoint {path}: expected format {FORMAT}, got {record['format']}; resume it with the millrace that wrote it"
+            f"checkpoint {path}: expected format {FORMAT}, got {record['format']}; use the millrace that wrote it"
         )
     match record:
         case {"env_steps": int(env_steps), "state": dict(state)}:

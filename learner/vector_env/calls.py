@@ -7,6 +7,7 @@ from contextlib import suppress
 from typing import Any
 
 from millrace.learner.vector_env.batch_layout import BatchLayout
+from millrace.learner.vector_env.cut_short import CutShort
 from millrace.learner.vector_env.lane_orders import call_order, packed, packed_each
 from millrace.learner.vector_env.lost_lanes import RESET_ATTEMPTS
 from millrace.learner.vector_env.order_coordinator import MakeOrder
@@ -25,9 +26,10 @@ USE_INSTEAD = ("reset", "step", "close")
 class CopyCalls:
     """Calls, reads and sets attributes of a vector environment's env copies, and gets descriptions of the copies."""
 
-    def __init__(self, send_recv: SendRecv, parts: VectorEnvParts, known: Mapping[str, Any]) -> None:
+    def __init__(self, send_recv: SendRecv, parts: VectorEnvParts, cut_short: CutShort, known: Mapping[str, Any]) -> None:
         """`known` has the attributes that are equal in all copies and can't be sent, because they aren't plain data."""
         self.known = known
+        self._cut_short = cut_short
         self._send_recv = send_recv
         self._parts = parts
 
@@ -68,13 +70,15 @@ class CopyCalls:
 
     def _answers(self, orders: Mapping[int, MakeOrder]) -> dict[int, Returned]:
         lanes = list(orders)
+        self._cut_short.check("call")
         self._send_recv.check_back(lanes)
-        try:
-            self._send_recv.call(orders)
-            results = self._send_recv.recv_some(lanes).results  # only these lanes, because others may be stepping
-        except BaseException:  # such as Ctrl-C
-            self._send_recv.abandon(lanes)
-            raise
+        with self._cut_short:
+            try:
+                self._send_recv.call(orders)
+                results = self._send_recv.recv_some(lanes).results  # only these lanes, because others may be stepping
+            except Exception:
+                self._send_recv.abandon(lanes)
+                raise
         return {lane: result for lane, result in results.items() if isinstance(result, Returned)}
 
 

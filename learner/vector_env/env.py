@@ -35,7 +35,6 @@ from millrace.learner.vector_env.step_arguments import Options, action_arrays, n
 from millrace.learner.vector_env.step_hub import StepHub
 from millrace.protocol.arrays import Array
 from millrace.protocol.envs.spaces import make_flatten
-from millrace.protocol.errors import UsageError
 
 log = logging.getLogger("millrace.learner")
 
@@ -96,7 +95,7 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         )
         self._send_recv = SendRecv(parts, timeout_s)
         spaces = {"observation_space": self.single_observation_space, "action_space": self.single_action_space}
-        self.calls = CopyCalls(self._send_recv, parts, {"spec": self.spec, **spaces})
+        self.calls = CopyCalls(self._send_recv, parts, self._cut_short, {"spec": self.spec, **spaces})
         """calls methods of some of the copies, and reads and assigns their attributes"""
         self._close_once = weakref.finalize(self, _call_in_process, os.getpid(), on_close)
 
@@ -209,7 +208,8 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
     def begin_step(self, lanes: Sequence[int], actions: Any) -> None:
         """Start a step of these lanes; others may still be stepping. `actions` has a row for every copy of all lanes."""
         self._check_idle("begin_step", of_sent=True)
-        self._step(lanes, actions, together=False)
+        with self._cut_short:
+            self._step(lanes, actions, together=False)
 
     def end_step(self, lanes: Sequence[int]) -> GymnasiumStep:
         """Wait for the step of these lanes. Returns what `step` returns, but only the rows of these lanes are meaningful.
@@ -218,7 +218,8 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         are no longer awaited, but other lanes still are.
         """
         self._check_idle("end_step", of_sent=True)
-        return self._rows(self._send_recv.recv_some(lanes))
+        with self._cut_short:
+            return self._rows(self._send_recv.recv_some(lanes))
 
     def abandon(self) -> None:
         """Stop waiting for all lanes. The results of the orders that were sent are dropped."""
@@ -288,11 +289,9 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
 
         `spec`, `observation_space` and `action_space` can't be sent, so they are made from a worker's description of them.
         """
-        if name in self.calls.known:  # no worker is asked
-            return self.calls.call(range(self._layout.count), name, args, kwargs)
-        self._check_idle("call")
-        with self._cut_short:
-            return self.calls.call(range(self._layout.count), name, args, kwargs)
+        if name not in self.calls.known:  # else, no worker is asked
+            self._check_idle("call")
+        return self.calls.call(range(self._layout.count), name, args, kwargs)
 
     get_attr = call
 
@@ -303,8 +302,7 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         if len(values) != self._layout.count:
             raise ValueError(f"values: expected one for each of {self._layout.count} copies, got {len(values)}")
         self._check_idle("call")
-        with self._cut_short:
-            self.calls.assign(range(self._layout.count), name, values)
+        self.calls.assign(range(self._layout.count), name, values)
 
     def render(self) -> tuple[Any, ...]:
         """Render every copy. Returns the results of their `render`."""
@@ -341,9 +339,9 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         """
         if self.closed:
             raise ClosedEnvironmentError(f"{doing} after close()")
-        if self._cut_short:
-            if len(resets) < self._layout.count:
-                raise UsageError(f"{doing} after an interrupted call: reset all copies first, with reset()")
+        if len(resets) < self._layout.count:
+            self._cut_short.check(doing)
+        elif self._cut_short:
             self._send_recv.begin_anew()
             self._state = AsyncState.DEFAULT
         if self._state is AsyncState.WAITING_STEP or (self._state is AsyncState.WAITING_RESET and not of_sent):
@@ -356,6 +354,7 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         """Wait for the pending step or reset. Raises `NoAsyncCallError` unless the call `awaited` is pending."""
         if self.closed:
             raise ClosedEnvironmentError(f"{awaited.value}_wait after close()")
+        self._cut_short.check(f"{awaited.value}_wait")
         if self._state is not awaited:
             raise NoAsyncCallError(f"{awaited.value}_wait without {awaited.value}_async before it", awaited.value)
         with self._cut_short:

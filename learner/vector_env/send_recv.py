@@ -113,7 +113,7 @@ class SendRecv:
             for lane, reset in resets.items():
                 self._sent.send([lane], Sent(reset, now))
                 hub.send_order(lane, reset.order())
-        except BaseException:  # such as Ctrl-C
+        except Exception:
             self.abandon(list(resets))
             raise
 
@@ -142,7 +142,7 @@ class SendRecv:
         try:
             self._sent.send(lanes, Sent(Asked.STEP, now))
             self._order_steps(lanes, actions, at, together=together)
-        except BaseException:  # such as Ctrl-C
+        except Exception:
             self.abandon(lanes)
             raise
 
@@ -278,7 +278,7 @@ class SendRecv:
                 self._parts.hub.wait(timeout_s, together=together)
                 self.look(timeout_s)
             self._raise_losses()
-        except BaseException:
+        except Exception:
             self.abandon(lanes)
             raise
 

@@ -127,7 +127,7 @@ def test_a_page_says_that_the_learner_was_killed_and_goes_on_with_the_resumed_ru
     page.open(scene.pages["run"])
     page.value("window.same = true")
     scene.learner.kill()
-    shows(page, ".now", "Dead: .* continue it with: .*millrace train --resume", 2 * SHOWN_WITHIN_S)
+    shows(page, ".now", "Dead: .* continue it with: .*millrace learner --resume", 2 * SHOWN_WITHIN_S)
     before = page.value(POINTS)
     scene.learner = scene.stage.learner(scene.bind, resume=scene.run)
     shows(page, ".now", "Training: ")

@@ -160,7 +160,7 @@ def test_another_format_is_said_and_not_passed_over(tmp_path: Path, monkeypatch:
     with monkeypatch.context() as then:
         then.setattr(checkpoint, "FORMAT", other)
         checkpoint.save(tmp_path, state(2), 200, keep=3)
-    with pytest.raises(CheckpointError, match=f"expected format 2, got {other}; resume it with the millrace that wrote it"):
+    with pytest.raises(CheckpointError, match=f"expected format 2, got {other}; use the millrace that wrote it"):
         checkpoint.newest(tmp_path)
 
 

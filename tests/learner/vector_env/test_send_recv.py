@@ -1135,24 +1135,33 @@ def test_after_an_interrupt_at_any_line_only_a_reset_of_all_copies_is_possible_a
 
 
 @pytest.mark.parametrize(
-    "refused", ["step", "step_async", "send", "recv", "call", "set_attr", "reset of some", "reset_async"]
+    "refused",
+    [
+        *("step", "step_async", "step_wait", "send", "recv", "begin_step", "end_step"),
+        *("call", "set_attr", "call of some", "reset of some", "reset_async"),
+    ],
 )
 def test_after_an_interrupt_nothing_but_a_reset_of_all_copies_is_possible(refused: str) -> None:
     with made(copies=2, lanes=2, workers=2) as (env, link):
         env.reset(seed=1)
         link.frozen = {"w0", "w1"}
+        interrupt_after(env, error=KeyboardInterrupt)
+        env.step_async(zeros([0, 1]))
         with pytest.raises(KeyboardInterrupt):
-            interrupt_after(env, error=KeyboardInterrupt)
-            env.step(zeros([0, 1]))
+            env.step_wait()
         env.hub.while_waiting = lambda: None
         link.frozen = set()
         calls: dict[str, Callable[[], object]] = {
             "step": lambda: env.step(zeros([0, 1])),
             "step_async": lambda: env.step_async(zeros([0, 1])),
+            "step_wait": lambda: env.step_wait(),
+            "begin_step": lambda: env.begin_step([0], zeros([0, 1])),
+            "end_step": lambda: env.end_step([0]),
             "send": lambda: env.send(zeros([0, 1])),
             "recv": lambda: env.recv(),
             "call": lambda: env.call("render_mode"),
             "set_attr": lambda: env.set_attr("left", 1.0),
+            "call of some": lambda: env.calls.call([0], "render_mode", (), {}),
             "reset of some": lambda: env.reset(options={"reset_mask": np.array([True, False])}),
             "reset_async": lambda: env.reset_async(env_ids=[0]),
         }
@@ -1163,6 +1172,37 @@ def test_after_an_interrupt_nothing_but_a_reset_of_all_copies_is_possible(refuse
             env.step(zeros([0, 1]))
         env.reset_async(seed=1)
         assert sorted(received(env, 2)) == [0, 1]
+        assert env.step(zeros([0, 1]))[1].tolist() == [1.0, 1.0]
+
+
+@pytest.mark.parametrize("name", ["begin_step", "end_step", "call of some"])
+def test_a_call_for_some_lanes_can_be_cut_short_too(name: str) -> None:
+    with made(copies=2, lanes=2, workers=2) as (env, link):
+        env.reset(seed=1)
+        calls: dict[str, Callable[[], object]] = {
+            "begin_step": lambda: env.begin_step([0], zeros([0, 1])),
+            "end_step": lambda: env.end_step([0]),
+            "call of some": lambda: env.calls.call([0], "render_mode", (), {}),
+        }
+        if name == "end_step":
+            calls["begin_step"]()
+        link.frozen = {"w0", "w1"}
+        assert interrupted(calls[name], 25)
+        link.frozen = set()
+        with pytest.raises(UsageError, match="after an interrupted call: reset all copies first"):
+            env.step(zeros([0, 1]))
+        assert env.reset(seed=1)[0][:, 0].tolist() == [1.0, 1.0]
+
+
+def test_a_reset_that_failed_before_it_sent_anything_does_not_count() -> None:
+    with made(copies=2, lanes=2, workers=2) as (env, _):
+        env.reset(seed=1)
+        assert interrupted(lambda: env.step(zeros([0, 1])), 10)
+        with pytest.raises(TypeError, match="expected plain data"):
+            env.reset(options={"x": object()})
+        with pytest.raises(UsageError, match="after an interrupted call: reset all copies first"):
+            env.step(zeros([0, 1]))
+        env.reset(seed=1)
         assert env.step(zeros([0, 1]))[1].tolist() == [1.0, 1.0]
 
 
