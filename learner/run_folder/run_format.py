@@ -1,8 +1,9 @@
 """The files that identify a run folder: its settings (config.toml) and its format (run.json), written when it is made.
 
 Rules: a folder in the current format or an older one can be evaluated and reported, and resumed if its checkpoints have the
-current format too (`checkpoint.py`); one in a newer format is rejected with a one-line error. If you change the format such that older code can't read it, increase `RUN_FORMAT`. Modules
-are never imported from a run folder, because it may come from a stranger.
+current format too (`checkpoint.py`); one in a newer format is rejected with a one-line error. If you change the format such
+that older code can't read it, increase `RUN_FORMAT`. Modules are never imported from a run folder, because it may come from
+a stranger.
 """
 
 from __future__ import annotations
