@@ -9,17 +9,17 @@ that isn't plain raises `TypeError`; if the caller asks for it, the value is ins
 they arrive as dicts, lists and tuples. Other numbers, buffers, and objects with numpy's protocol, such as tensors, arrive
 as numpy scalars or arrays if numpy reads numbers from them. A deque arrives as a list. Other sequences don't, because some
 never end, or contain themselves, as a character of a `UserString` does. A container that contains itself isn't plain; nor
-are those below `MAX_DEPTH` levels, or after `MOST_VALUES` other values. A container that isn't plain is sent as a line that
-says why, because its `repr` would show a shared container wherever it occurs, which may be in 2^32 places.
+is one below `MAX_DEPTH` levels. A container that occurs in several places is sent in each of them, so that a small value
+could take 2^32 times its own size; therefore containers aren't plain either after `MOST_REPEATED` values that were sent
+before. A container that isn't plain is sent as a line that says why, because its `repr` would be as long.
 """
 
 from __future__ import annotations
 
-import itertools
 import math
 import sys
 from collections import Counter, deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from functools import partial
@@ -36,7 +36,7 @@ DTYPE_KINDS = "biufcSUmM"
 NUMBER_KINDS = "biuf"
 NUMPY_PROTOCOL = ("__array__", "__array_interface__", "__array_struct__")
 MAX_DEPTH = 32
-MOST_VALUES = 1 << 20  # inside one value, in which a container may occur again and again
+MOST_REPEATED = 1 << 20  # values in containers that occur again inside one value
 MAX_REPR = 1000  # characters
 MAX_DIMENSIONS = 64  # numpy's own limit
 MAX_SIZE = 1 << 48  # of one dimension
@@ -135,6 +135,28 @@ def _converted(value: object, use_repr: bool, where: str = "", depth: int = 0) -
         raise TypeError(f"{path or 'value'}: {error.why}") from None
 
 
+@dataclass(slots=True)
+class _Places:
+    """The containers inside one value, which may occur in several places."""
+
+    met: dict[int, object] = field(default_factory=dict)
+    """by `id`, each container so far, which keeps it from being freed, so that no other one gets its `id`"""
+    around: set[int] = field(default_factory=set)
+    """`id` of each container that contains the current value"""
+    refused: dict[int, str] = field(default_factory=dict)
+    """by `id`, containers that aren't plain in any place, and why"""
+    repeated: int = 0
+    """how many values were in containers that had occurred before"""
+
+    def enter(self, container: Any) -> bool:
+        """Record that a container occurs. Returns False if too many values have occurred before."""
+        if id(container) not in self.met:
+            self.met[id(container)] = container
+        else:
+            self.repeated += 1 + len(container)
+        return self.repeated <= MOST_REPEATED
+
+
 @dataclass(frozen=True, slots=True)
 class _Packer:
     """Converts one value to types that msgpack knows. Types are compared exactly, so that no subclass arrives as its base
@@ -143,18 +165,12 @@ class _Packer:
 
     use_repr: bool
     limit: KeyLimit = field(default_factory=KeyLimit)
-    around: set[int] = field(default_factory=set)
-    """`id` of each container that contains the current value"""
-    endless: set[int] = field(default_factory=set)
-    """`id` of each container that was found to contain itself"""
-    count: Iterator[int] = field(default_factory=itertools.count)
-    """numbers the values inside the value"""
+    places: _Places = field(default_factory=_Places)
 
     def convert(self, value: Any, depth: int) -> Any:
         """Raises `_NotPlain` for a value that isn't plain, unless `use_repr`."""
         if depth > MAX_DEPTH:
             raise _NotPlain(f"expected at most {MAX_DEPTH} levels, got more")
-        number = next(self.count)
         kind = type(value)
         if value is None or kind in (bool, float, bytes) or (kind is str and _is_encodable(value)):
             return value
@@ -163,7 +179,7 @@ class _Packer:
         if kind is int and (digits := _digits(value)) is not None:
             return msgpack.ExtType(_Code.INT, digits)
         if self._is_container(value):
-            return self._container(value, depth, number)
+            return self._container(value, depth)
         if kind is complex:
             return msgpack.ExtType(_Code.COMPLEX, _pack([value.real, value.imag]))
         if kind is np.ndarray and value.dtype.kind in DTYPE_KINDS and _can_be_shown(value):
@@ -188,17 +204,17 @@ class _Packer:
             return True
         return self.use_repr and isinstance(value, deque)
 
-    def _why_not_plain(self, container: Any, depth: int, number: int) -> str:
-        """Why a container isn't plain; empty if it is."""
-        if id(container) in self.endless:
-            return ITSELF
-        if isinstance(container, dict) and _too_slow(container, self.limit):
-            return f"with {TOO_SLOW}"
+    def _why_not_plain(self, container: Any, depth: int) -> str:
+        """Why a container isn't plain in this place; empty if it is. If it is, its keys count."""
+        if why := self.places.refused.get(id(container)):
+            return why
         if self.use_repr and depth == MAX_DEPTH:
             return f"below {MAX_DEPTH} levels"
-        if number >= MOST_VALUES:
-            return f"after {MOST_VALUES:,} other values"
-        return ""
+        if not self.places.enter(container):
+            return f"after {MOST_REPEATED:,} values that were sent before"
+        if isinstance(container, dict) and _too_slow(container, self.limit):
+            self.places.refused[id(container)] = f"with {TOO_SLOW}"
+        return self.places.refused.get(id(container), "")
 
     def _instead(self, container: object, why: str) -> Any:
         """What is sent instead of a container that isn't plain. Raises `_NotPlain` unless `use_repr`."""
@@ -207,12 +223,12 @@ class _Packer:
             return _line(f"<{got}>")
         raise _unexpected(got)
 
-    def _container(self, value: Any, depth: int, number: int) -> Any:
-        if id(value) in self.around:
+    def _container(self, value: Any, depth: int) -> Any:
+        if id(value) in self.places.around:
             raise _Cycle(value)
-        if why := self._why_not_plain(value, depth, number):
+        if why := self._why_not_plain(value, depth):
             return self._instead(value, why)
-        self.around.add(id(value))
+        self.places.around.add(id(value))
         try:
             if isinstance(value, dict):
                 return self._dict(value, depth)
@@ -225,10 +241,10 @@ class _Packer:
         except _Cycle as cycle:
             if cycle.container is not value:
                 raise
-            self.endless.add(id(value))
+            self.places.refused[id(value)] = ITSELF
             return self._instead(value, ITSELF)
         finally:
-            self.around.discard(id(value))
+            self.places.around.discard(id(value))
 
     def _items(self, values: Iterable[Any], depth: int) -> list[Any]:
         items = []

@@ -303,15 +303,19 @@ def _kept(info: Any, copies: dict[int, tuple[Any, Any]] | None = None) -> Any:
     """The info with its dicts and arrays copied, just as gymnasium copies them. Other values aren't copied, because some
     can't be.
 
-    `copies` has each dict so far, with its copy, by its `id`, because a dict may occur in many places.
+    `copies` has each dict so far, with its copy, by its `id`, because a dict may occur in many places, even in itself.
     """
-    if isinstance(info, dict):
-        copies = {} if copies is None else copies
-        if id(info) not in copies:
-            kept = {key: value if type(value) in _IMMUTABLE else _kept(value, copies) for key, value in info.items()}
-            copies[id(info)] = info, kept
+    if not isinstance(info, dict):
+        return info.copy() if isinstance(info, np.ndarray) else info
+    kept: dict[Any, Any] = {}
+    if copies is None:
+        copies = {}  # without the info itself, which must arrive as a dict even if it contains itself
+    elif id(info) in copies:
         return copies[id(info)][1]
-    return info.copy() if isinstance(info, np.ndarray) else info
+    else:
+        copies[id(info)] = info, kept
+    kept |= {key: value if type(value) in _IMMUTABLE else _kept(value, copies) for key, value in info.items()}
+    return kept
 
 
 _IMMUTABLE = frozenset({bool, int, float, str, type(None), np.bool_, np.int64, np.float32, np.float64})

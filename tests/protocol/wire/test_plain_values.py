@@ -471,16 +471,47 @@ def test_a_graph_is_read_a_few_times_even_if_it_has_many_cycles() -> None:
 def test_a_value_in_which_lists_occur_in_too_many_places_is_not_plain(
     monkeypatch: pytest.MonkeyPatch, use_repr: bool
 ) -> None:
-    monkeypatch.setattr(plain_values, "MOST_VALUES", 200)
+    monkeypatch.setattr(plain_values, "MOST_REPEATED", 200)
     value: Any = 1
     for _ in range(10):
         value = [value, value]
     if not use_repr:
-        with pytest.raises(TypeError, match=r"^(\[[01]\])+: expected plain data .*, got list after 200 other values$"):
+        with pytest.raises(TypeError, match=r"^(\[[01]\])+: expected plain data .*, got list after 200 values that .*$"):
             pack(value)
         return
     (a, b), after = unpack(pack((value, 2), use_repr=True))
-    assert (type(a), b, after) == (list, "<list after 200 other values>", 2)
+    assert (type(a), b, after) == (list, "<list after 200 values that were sent before>", 2)
+
+
+@pytest.mark.parametrize("use_repr", [False, True])
+def test_values_that_occur_once_have_no_limit(monkeypatch: pytest.MonkeyPatch, use_repr: bool) -> None:
+    monkeypatch.setattr(plain_values, "MOST_REPEATED", 10)
+    value = [[n, n] for n in range(100)]
+    assert unpack(pack(value, use_repr)) == value
+
+
+def test_a_dict_that_is_not_sent_takes_no_keys_from_others() -> None:
+    many = dict.fromkeys(range(8000), 0)
+    deep: Any = many
+    for _ in range(MAX_DEPTH - 1):
+        deep = [deep]
+    back = unpack(pack({"deep": deep, "many": many}, use_repr=True))
+    assert back["many"] == many
+
+
+def test_the_keys_of_a_dict_that_is_refused_are_read_once() -> None:
+    class Keys(dict[Any, Any]):
+        reads = 0
+
+        def __iter__(self) -> Iterator[Any]:
+            self.reads += 1
+            return super().__iter__()
+
+    refused = Keys(dict.fromkeys(range(MOST_OTHER_KEYS + 1)))
+    back = unpack(pack([refused] * 100, use_repr=True))
+    assert back == [back[0]] * 100
+    assert back[0].startswith("<Keys with more than")
+    assert refused.reads == 1
 
 
 def test_a_container_below_too_many_levels_is_not_shown() -> None:
