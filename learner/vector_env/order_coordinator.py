@@ -1,18 +1,18 @@
 """The learner's half of a vector environment's conversation with its workers. Pure: messages and `now` in, messages out.
 
 Rule: an order goes to one lane, and a lane has one order at a time; lanes do not wait for each other. Either the order is
-answered, or its lane is lost with its worker. A lost lane starts again on new env copies, in its next incarnation. A lane
-leaves its worker only if the worker is lost, because elsewhere it would have new env copies, without the random states and
-attributes of the old ones. If a Heartbeat shows that an order was lost on the way, the order is sent again. Steps through
-shared memory don't count as orders here. If the infos of such a step are too long for the shared memory, they arrive as a
-message.
+answered, or its lane is lost with its worker, or the caller no longer wants the answer, and the lane's next order replaces
+it, as it does at the worker. A lost lane starts again on new env copies, in its next incarnation. A lane leaves its worker
+only if the worker is lost, because elsewhere it would have new env copies, without the random states and attributes of the
+old ones. If a Heartbeat shows that an order was lost on the way, the order is sent again. Steps through shared memory don't
+count as orders here. If the infos of such a step are too long for the shared memory, they arrive as a message.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 
 from millrace.learner.members.coordinator import Coordinator
 from millrace.learner.members.lane_placement import LanePlacement, PlacedLane, is_spare
@@ -40,18 +40,54 @@ MakeOrder = Callable[[int, int, LaneIncarnation], Order]
 """Makes an order for a lane from the session, the ticket, and the lane's number and incarnation."""
 
 
+@dataclass(frozen=True)
+class WaitingOrder:
+    """An order of a lane that has no worker yet."""
+
+    make_order: MakeOrder
+    since_s: float
+    """when it began to wait"""
+
+
+@dataclass(frozen=True)
+class SentOrder:
+    """An order that the lane's worker has not answered."""
+
+    order: Order
+    wanted: bool = True
+    """Whether the caller wants the answer. Even if not, the worker may execute the order until it gets the next one."""
+
+
+@dataclass(frozen=True)
+class AnsweredOrder:
+    """The answer to an order, until the caller takes it."""
+
+    answer: Answer
+
+
 @dataclass
 class OrderedLane(PlacedLane):
     """A lane whose env copies are stepped by orders."""
 
     started: bool = False
     """Whether an order was sent to this incarnation. If so, its env copies exist and can be lost."""
+    order: WaitingOrder | SentOrder | AnsweredOrder | None = None
+    """The lane's newest order, or None if there is nothing to send, to wait for or to take."""
+    long_infos: Stepped | None = None
+    """The newest infos of a step through shared memory that arrived as a message, because they were too long."""
+
+    @property
+    def is_ordered(self) -> bool:
+        """Whether the lane has an order that waits for a worker, or for its answer."""
+        return self.order is not None and not isinstance(self.order, AnsweredOrder)
 
     def restart(self) -> None:
         """Record that the lane left its worker. Its next incarnation has new env copies."""
         super().restart()
         self.started = False
         self.incarnation += 1
+        if isinstance(self.order, SentOrder):
+            self.order = None
 
 
 class OrderCoordinator(Coordinator[Member]):
@@ -62,14 +98,6 @@ class OrderCoordinator(Coordinator[Member]):
         super().__init__(membership, worker_timeout_s)
         self.spec = spec
         self.lanes = [OrderedLane(lane) for lane in range(len(spec.lanes))]
-        self.orders: dict[int, Order] = {}
-        """The orders that were sent and have not been answered, by ticket."""
-        self.answers: dict[int, Answer] = {}
-        """The newest answer of each lane, by lane, until `forget` removes it."""
-        self.shared_orders: dict[int, int] = {}
-        """By lane, the number of the step through shared memory that is under way."""
-        self.infos: dict[int, bytes] = {}
-        """By lane, the packed infos of the step through shared memory, if they arrived as a message."""
         self.lost: dict[int, str] = {}
         """Lanes whose env copies are gone, with the reason, until the vector environment has handled them."""
         self._placement = LanePlacement(self.lanes, _by_name)
@@ -91,39 +119,82 @@ class OrderCoordinator(Coordinator[Member]):
         self.lost = {}
         return lost
 
-    def forget(self, lane: int) -> None:
-        """Forget the answer to a lane's last order, because the caller has taken it."""
-        self.answers.pop(lane, None)
-        self.shared_orders.pop(lane, None)
-        self.infos.pop(lane, None)
+    @property
+    def has_orders(self) -> bool:
+        """Whether a lane has an order that waits for a worker or its answer, or an answer that wasn't taken."""
+        return any([lane.order is not None for lane in self.lanes])
 
-    def place(self, lane: int, patient: bool) -> bool:
-        """Assign the lane to a worker; if `patient`, only to one without a lane. Returns False if there is none."""
-        if self.lanes[lane].owner is not None:
-            return True
-        candidates = [member for member in self.membership.active() if not (patient and member.lanes)]
-        if candidates:
-            self._placement.assign([self.lanes[lane]], candidates)
-        return bool(candidates)
+    @property
+    def waiting(self) -> list[int]:
+        """The lanes whose order waits for a worker."""
+        return [lane.number for lane in self.lanes if isinstance(lane.order, WaitingOrder)]
+
+    def ask(self, lane: int, make_order: MakeOrder, now: float) -> None:
+        """Give a lane an order, for `send_waiting` to send. It replaces an order whose answer nobody wants."""
+        record = self.lanes[lane]
+        if isinstance(record.order, SentOrder) and (member := self.owner(lane)) is not None:
+            del member.tickets[record.order.order.ticket]
+        record.order = WaitingOrder(make_order, now)
+
+    def send_waiting(self, lanes: Iterable[int], now: float, patience_s: float) -> list[Outgoing]:
+        """Send the orders of these lanes, which wait for a worker. Returns the messages.
+
+        A lane that no worker has gets one; if it has waited for less than `patience_s`, only one that has no lane.
+        """
+        out: list[Outgoing] = []
+        for number in lanes:
+            lane = self.lanes[number]
+            match lane.order:
+                case WaitingOrder(make_order, since_s) if self._place(lane, patient=now - since_s < patience_s):
+                    out.append(self._send(lane, make_order))
+                case _:
+                    pass
+        return out
+
+    def take(self) -> dict[int, Answer]:
+        """Take the answers that have arrived, by lane."""
+        answers = dict[int, Answer]()
+        for lane in self.lanes:
+            if isinstance(lane.order, AnsweredOrder):
+                answers[lane.number] = lane.order.answer
+                lane.order = None
+        return answers
+
+    def forget(self, lane: int) -> None:
+        """Forget the lane's order, because the caller no longer wants the answer."""
+        record = self.lanes[lane]
+        match record.order:
+            case SentOrder():
+                record.order = replace(record.order, wanted=False)
+            case _:
+                record.order = None
 
     def owner(self, lane: int) -> Member | None:
         """The worker to which the lane is assigned, or None."""
         peer = self.lanes[lane].owner
         return None if peer is None else self.members[peer]
 
-    def order(self, lane: int, make_order: MakeOrder) -> list[Outgoing]:
-        """Make an order for a lane, which must have a worker, and return the message to send."""
-        member = self.owner(lane)
-        record = self.lanes[lane]
+    # ---------------------------------------------------------------- inside
+
+    def _place(self, lane: OrderedLane, *, patient: bool) -> bool:
+        """Assign the lane to a worker; if `patient`, only to one without a lane. Returns False if there is none."""
+        if lane.owner is not None:
+            return True
+        candidates = [member for member in self.membership.active() if not (patient and member.lanes)]
+        if candidates:
+            self._placement.assign([lane], candidates)
+        return bool(candidates)
+
+    def _send(self, lane: OrderedLane, make_order: MakeOrder) -> Outgoing:
+        """Make the order of a lane, which has a worker. Returns the message."""
+        member = self.owner(lane.number)
         assert member is not None
         self._tickets += 1
-        order = make_order(member.session, self._tickets, LaneIncarnation(lane, record.incarnation))
-        record.started = True
-        self.orders[order.ticket] = order
+        order = make_order(member.session, self._tickets, LaneIncarnation(lane.number, lane.incarnation))
+        lane.started = True
+        lane.order = SentOrder(order)
         member.tickets[order.ticket] = member.replies
-        return [(member.peer, order)]
-
-    # ---------------------------------------------------------------- inside
+        return member.peer, order
 
     def _answer(self, member: Member, message: ToLearner) -> list[Outgoing]:
         match message:
@@ -141,36 +212,37 @@ class OrderCoordinator(Coordinator[Member]):
     def _take_answer(self, member: Member, message: Answer) -> list[Outgoing]:
         if message.ticket < 0:
             return self._long_infos(member, message)
-        order = self.orders.get(message.ticket)
-        if order is None or message.ticket not in member.tickets:
-            return []  # this answer has arrived before
+        if message.ticket not in member.tickets:
+            return []  # this answer has arrived before, or the lane has a newer order
+        sent = self.lanes[message.lane].order if message.lane in member.lanes else None
+        if not isinstance(sent, SentOrder) or sent.order.ticket != message.ticket:
+            return self._unusable(member, f"answer: expected one from another lane, got one from lane {message.lane}")
         try:
-            check(message, order, self.spec)
+            check(message, sent.order, self.spec)
         except BadMessage as error:
             return self._unusable(member, str(error))
-        del self.orders[message.ticket], member.tickets[message.ticket]
-        self.answers[message.lane] = message
+        del member.tickets[message.ticket]
+        self.lanes[message.lane].order = AnsweredOrder(message) if sent.wanted else None
         return []
 
     def _long_infos(self, member: Member, answer: Answer) -> list[Outgoing]:
-        """Store the infos of a step through shared memory, if they belong to the lane's newest step."""
+        """Keep the infos of a step through shared memory, whose number is the negative ticket."""
         if not isinstance(answer, Stepped):
             return self._unusable(member, "answer to an order through shared memory: expected Stepped, got Returned")
-        mine = answer.lane in member.lanes and self.lanes[answer.lane].incarnation == answer.incarnation
-        if mine and self.shared_orders.get(answer.lane) == -answer.ticket:
-            self.infos[answer.lane] = bytes(answer.infos.data)
+        if answer.lane in member.lanes and self.lanes[answer.lane].incarnation == answer.incarnation:
+            self.lanes[answer.lane].long_infos = answer
         return []
 
     def _again(self, member: Member, heartbeat: Heartbeat, lost: Sequence[int]) -> list[Outgoing]:
         member.tickets |= dict.fromkeys(lost, member.replies)
-        return [(member.peer, self.orders[ticket]) for ticket in lost]
+        unanswered = [each for lane in member.lanes if isinstance(each := self.lanes[lane].order, SentOrder)]
+        orders = {sent.order.ticket: sent.order for sent in unanswered}
+        return [(member.peer, orders[ticket]) for ticket in lost]
 
     def _received(self, member: Member) -> tuple[Received, ...]:
         return tuple(Received(lane, self.lanes[lane].incarnation, 0) for lane in sorted(member.lanes))
 
     def _removed(self, member: Member, gone: Gone) -> None:
-        for ticket in member.tickets:
-            del self.orders[ticket]
         for lane in member.lanes:
             if self.lanes[lane].started:
                 self.lost[lane] = f"worker {member.hello.worker} ({member.hello.host}) {gone.why}"
@@ -184,8 +256,8 @@ def _by_name(member: Member) -> tuple[int, str]:
 
 def check(answer: Answer, order: Order, spec: StepSpec) -> None:
     """Raise `BadMessage`, with a one-line message, if the answer does not belong to this order."""
-    if (answer.lane, answer.incarnation) != (order.lane, order.incarnation):
-        raise BadMessage(f"answer: expected one from lane {order.lane}, got one from lane {answer.lane}")
+    if answer.incarnation != order.incarnation:
+        raise BadMessage(f"answer: expected one of incarnation {order.incarnation}, got one of {answer.incarnation}")
     if isinstance(answer, Returned) != isinstance(order, Call):
         kind = "Returned" if isinstance(order, Call) else "Stepped"
         raise BadMessage(f"answer to {type(order).__name__}: expected {kind}, got {type(answer).__name__}")

@@ -16,11 +16,11 @@ from millrace.learner.members.member import Member
 from millrace.learner.members.member_server import MemberServer, ServerSettings
 from millrace.learner.members.membership import Membership
 from millrace.learner.members.worker_processes import WorkerProcesses
-from millrace.learner.vector_env.order_coordinator import MakeOrder, OrderCoordinator
+from millrace.learner.vector_env.order_coordinator import MakeOrder, OrderCoordinator, WaitingOrder
 from millrace.learner.vector_env.shared_steps import SharedSteps
 from millrace.learner.vector_env.vector_env_status import status
 from millrace.protocol.errors import NoWorkers
-from millrace.protocol.messages import Answer, Order, Status
+from millrace.protocol.messages import Answer, Status
 from millrace.protocol.specs import StepSpec
 from millrace.protocol.wire.learner_link import LearnerLink
 
@@ -60,14 +60,8 @@ class StepHub:
         """returns the status of the run that acts on these copies, to which `status` adds the workers of this hub"""
         self._link = link
         self.coordinator = OrderCoordinator(spec, first_session, worker_timeout_s)
-        self._under_way: dict[int, int] = {}  # by lane, the number of its step through shared memory
-        if shared is not None:
-            self._under_way = self.coordinator.shared_orders = shared.under_way
         self._processes = processes
-        self._waiting_orders: dict[int, MakeOrder] = {}  # by lane, an order to send as soon as the lane has a worker
-        self._waiting_since_s: dict[int, float] = {}  # by lane, the time at which that order began to wait
-        self._newest_tickets: dict[int, int] = {}  # by lane, the ticket of its newest order, if the answer is still wanted
-        self._infos_to_come: set[int] = set()  # lanes whose step is done, and whose infos arrive later as a message
+        self._infos_to_come = False  # whether the newest look found a step whose infos arrive later, as a message
         self._patience_s = PATIENCE_S
         self._listen_due_s = 0.0
         self._failure: Failed | None = None  # the first failure since the last `raise_failure`
@@ -92,9 +86,8 @@ class StepHub:
 
     def send_order(self, lane: int, make: MakeOrder) -> None:
         """Send an order to this lane as soon as it has a worker. `take` returns the result."""
-        self._waiting_orders[lane] = make
-        self._waiting_since_s[lane] = self.now()
-        self._send_waiting_orders()
+        self.coordinator.ask(lane, make, self.now())
+        self._send_waiting_orders([lane])
 
     def send_steps(self, lanes: Sequence[int], *, together: bool) -> None:
         """Step these lanes with the actions in shared memory. `together` says that the caller waits for all of them."""
@@ -108,12 +101,12 @@ class StepHub:
         step.
         """
         shared = self.shared
-        coordinator = self.coordinator
-        if shared is None or (coordinator.orders and any(order.lane == lane for order in coordinator.orders.values())):
+        record = self.coordinator.lanes[lane]
+        if shared is None or record.order is not None:
             return False
         if lane not in shared.pipes:
-            member = coordinator.owner(lane)
-            if member is None or not coordinator.lanes[lane].started:
+            member = self.coordinator.owner(lane)
+            if member is None or not record.started:
                 return False
             shared.opened(lane, member.hello.worker)
         return shared.pipes[lane] is not None
@@ -122,45 +115,48 @@ class StepHub:
         """Take the results of the newest orders, by lane: answers that arrived as messages, and packed infos of steps
         through shared memory. Lanes that have no result yet, or are lost, are left out.
         """
-        newest = self._newest_tickets  # an answer with another ticket belongs to an earlier order
-        answers: dict[int, Answer | bytes] = {
-            lane: answer for lane, answer in self.coordinator.answers.items() if answer.ticket == newest.get(lane)
-        }
-        for lane, infos in () if self.shared is None else self.shared.done().items():
-            if (packed := self._long_infos(lane) if infos is None else infos) is not None:
-                answers[lane] = packed
-        self.forget(answers)
-        return answers
+        results: dict[int, Answer | bytes] = {**self.coordinator.take()}
+        self._infos_to_come = False
+        if (shared := self.shared) is not None:
+            for lane, infos in shared.done().items():
+                if (packed := self._long_infos(lane, shared.under_way[lane]) if infos is None else infos) is None:
+                    self._infos_to_come = True
+                    continue
+                results[lane] = packed
+                del shared.under_way[lane]
+        return results
 
-    def _long_infos(self, lane: int) -> bytes | None:
-        """The infos of a lane's step that are too long for the shared memory; None if they have not arrived yet."""
-        infos = self.coordinator.infos.get(lane)
-        if infos is None and not self.coordinator.lanes[lane].started:
-            return b""  # its worker is gone, and `OrderCoordinator.take_lost` returns the lane
-        if infos is None:
-            self._infos_to_come.add(lane)
-        return infos
+    def _long_infos(self, lane: int, number: int) -> bytes | None:
+        """The infos of a lane's step that are too long for the shared memory; None if they have not arrived yet.
+
+        `number` is the number of the step in the shared memory.
+        """
+        record = self.coordinator.lanes[lane]
+        arrived = record.long_infos
+        if arrived is not None and arrived.ticket == -number:
+            record.long_infos = None
+            return bytes(arrived.infos.data)
+        return None if record.started else b""  # if its worker is gone, `OrderCoordinator.take_lost` returns the lane
 
     def is_ordered(self, lane: int) -> bool:
-        """Whether the lane has an order that has not been answered, or that waits for a worker."""
-        waits = lane in self._waiting_orders or lane in self._under_way
-        return waits or self._newest_tickets.get(lane) in self.coordinator.orders
+        """Whether the lane has an order that waits for a worker or for its answer, or a step through shared memory."""
+        shared = self.shared
+        return self.coordinator.lanes[lane].is_ordered or (shared is not None and lane in shared.under_way)
 
     def forget(self, lanes: Iterable[int]) -> None:
-        """Forget the last orders of these lanes, whose results were taken or are no longer wanted."""
+        """Forget the last orders of these lanes, because their results are no longer wanted."""
+        self._infos_to_come = False
         for lane in lanes:
-            if self._under_way.pop(lane, None) is None or self.coordinator.infos or self._infos_to_come:
-                self.coordinator.forget(lane)
-                self._infos_to_come.discard(lane)
-                self._waiting_orders.pop(lane, None)
-                self._newest_tickets.pop(lane, None)
+            self.coordinator.forget(lane)
+            if self.shared is not None:
+                self.shared.under_way.pop(lane, None)
 
     # ---------------------------------------------------------------- waiting
 
     def listen_if_due(self) -> None:
         """Send the orders that can be sent. Read the messages that have arrived, if any of them may matter now."""
         self._send_waiting_orders()
-        if self._waiting_orders or self.coordinator.orders or self.now() > self._listen_due_s:
+        if self.coordinator.has_orders or self.now() > self._listen_due_s:
             self._turn(0.0)
 
     def listen(self) -> None:
@@ -176,10 +172,10 @@ class StepHub:
         self._send_waiting_orders()
         shared = self.shared
         due = self.now() > self._listen_due_s
-        if shared is None or not self._under_way or self._infos_to_come:
+        if shared is None or not shared.under_way or self._infos_to_come:
             self._turn(POLL_S)
             return
-        only_shared = not self._waiting_orders and not self.coordinator.orders
+        only_shared = not self.coordinator.has_orders
         seen = only_shared and shared.spin(together=together)
         arrived = not seen and shared.sleep(self._link, POLL_S, together=together and only_shared)
         if arrived or due or not only_shared:
@@ -190,7 +186,7 @@ class StepHub:
 
         Raises `NoWorkers` if the lane had no worker all that time.
         """
-        if lane in self._waiting_orders:
+        if isinstance(self.coordinator.lanes[lane].order, WaitingOrder):
             raise self.no_workers(timeout_s)
         member = self.coordinator.owner(lane)
         if member is not None:
@@ -222,7 +218,7 @@ class StepHub:
 
     def close(self, timeout_s: float) -> None:
         """Ask every worker to leave, wait up to `timeout_s` for their Goodbyes, and end this program's worker processes."""
-        busy = bool(self.coordinator.orders or (self.shared is not None and self.shared.memory.unanswered_orders()))
+        busy = self.coordinator.has_orders or (self.shared is not None and bool(self.shared.memory.unanswered_orders()))
         deadline_s = self.now() + (min(BUSY_S, timeout_s) if busy else timeout_s)
         self._server.send(self.coordinator.drain("the vector environment was closed"))
         if self.shared is not None:
@@ -266,21 +262,14 @@ class StepHub:
         self._listen_due_s = self.now() + LISTEN_EVERY_S
         self.while_waiting()
         self._server.listen(timeout_s)
-        if self._waiting_orders and not self.coordinator.members:
+        if not self.coordinator.members and self.coordinator.waiting:
             self._server.check_left(1, collecting=True)
         self._send_waiting_orders()
 
-    def _send_waiting_orders(self) -> None:
-        if not self._waiting_orders:
+    def _send_waiting_orders(self, lanes: Sequence[int] | None = None) -> None:
+        """Send the orders of these lanes, or of all lanes that wait for a worker."""
+        if not (waiting := self.coordinator.waiting if lanes is None else lanes):
             return
         ours = min(self._processes.expected, self._processes.left(collecting=False))
         awaited = len(self.coordinator.membership.active()) < ours  # a process that this program started has yet to join
-        now = self.now()
-        for lane, make in list(self._waiting_orders.items()):
-            if self.coordinator.place(lane, awaited and now - self._waiting_since_s[lane] < self._patience_s):
-                del self._waiting_orders[lane]
-                sent = self.coordinator.order(lane, make)
-                for _, order in sent:
-                    assert isinstance(order, Order)
-                    self._newest_tickets[lane] = order.ticket
-                self._server.send(sent)
+        self._server.send(self.coordinator.send_waiting(waiting, self.now(), self._patience_s if awaited else 0.0))

@@ -139,6 +139,9 @@ def test_every_field_of_the_program_is_in_the_state_or_left_out_on_purpose() -> 
     stepping = of_vector_env.Learner(Stepping(workers=1, lanes=1, calls=(), faults=0), 0, 0.0).coordinator
     assert type(stepping) is OrderCoordinator
     assert set(vars(stepping)) == of_vector_env.SAVED | of_vector_env.NOT_SAVED
-    assert set(vars(OrderedLane(0))) == {"number", "incarnation", "owner", "moving", "started"}  # no lane waits to move
+    assert set(vars(OrderedLane(0))) == {
+        *("number", "incarnation", "owner", "started", "order"),
+        *("moving", "long_infos"),  # not saved: no lane waits to move, and no step goes through shared memory
+    }
     assert set(vars(HeldOrders())) == stepping_worker.SAVED
     assert set(vars(OrderLane(0))) == {"incarnation", "newest", "asked", "answered"}

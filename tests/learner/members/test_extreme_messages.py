@@ -230,9 +230,10 @@ def answers(turns: int, say: Say) -> list[bytes]:
         link.inbox.append((name.encode(), example(Hello, worker=name, process_nonce=SECRET_NONCE)))
     hub.wait_for(2, 5.0)
     for turn in range(turns):
+        held = tuple(ticket for member in hub.coordinator.members.values() for ticket in member.tickets)
         for number in (0, 1):
             session = hub.coordinator.members[b"w%d" % number].session
-            link.inbox.append((b"w%d" % number, example(Heartbeat, session=session, tickets=tuple(hub.coordinator.orders))))
+            link.inbox.append((b"w%d" % number, example(Heartbeat, session=session, tickets=held)))
         if turn:
             say(link, turn)
         for lane in (0, 1):

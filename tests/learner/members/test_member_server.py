@@ -28,6 +28,7 @@ from millrace.learner.rollouts.hub import Hub, HubSettings
 from millrace.learner.rollouts.lag_rule import Rounds
 from millrace.learner.rollouts.rollout_dealer import RolloutDealer
 from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
+from millrace.learner.vector_env.lane_orders import packed, reset_order
 from millrace.learner.vector_env.order_coordinator import OrderCoordinator
 from millrace.learner.vector_env.step_hub import StepHub
 from millrace.learner.vector_env.vector_env_status import status
@@ -191,7 +192,7 @@ def test_a_vector_environment_raises_no_failure_of_a_spare_worker() -> None:
     link = FakeLink()
     hub = step_hub(link, "a", "b", "spare")
     for lane in range(len(SPEC.lanes)):
-        assert hub.coordinator.place(lane, patient=True)
+        hub.send_order(lane, reset_order([0], [None], packed(None)))
     session = hub.coordinator.members[b"spare"].session
     link.inbox.append((b"spare", example(Failure, session=session, error="boom", lane=0)))
     hub.listen()

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from millrace.learner.members.events import WorkerLeft, WorkerRefused
-from millrace.learner.vector_env.order_coordinator import MakeOrder, OrderCoordinator
+from millrace.learner.members.membership import Outgoing
+from millrace.learner.vector_env.order_coordinator import MakeOrder, OrderCoordinator, SentOrder
 from millrace.learner.vector_env.vector_env_status import status
 from millrace.protocol.bounds import LARGEST
 from millrace.protocol.env_spec import EnvSpec
@@ -55,12 +56,18 @@ def order_coordinator(*peers: bytes) -> OrderCoordinator:
     for peer in peers:
         made.receive(peer, example(Hello, worker=peer.decode()), 0.0)
     for lane in range(len(peers)):
-        assert made.place(lane, patient=False)
-        ((peer, order),) = made.order(lane, step)
+        peer, order = sent(made, lane)
         assert made.receive(peer, stepped(order), 0.0) == []
-        made.forget(lane)
+        assert list(made.take()) == [lane]
     made.membership.take_events()
     return made
+
+
+def sent(made: OrderCoordinator, lane: int, make: MakeOrder | None = None) -> tuple[bytes, Order]:
+    """The order that this lane gets at once, and its worker."""
+    made.ask(lane, make or step, 0.0)
+    ((peer, order),) = made.send_waiting([lane], 0.0, 0.0)
+    return peer, cast(Order, order)
 
 
 def step(session: int, ticket: int, life: LaneIncarnation) -> Order:
@@ -100,20 +107,53 @@ def in_memory(made: OrderCoordinator, lane: int, number: int) -> Stepped:
 
 def test_an_order_is_answered_once() -> None:
     made = order_coordinator(A)
-    ((_, order),) = made.order(0, step)
-    made.receive(A, stepped(order), 0.0)
-    assert list(made.answers) == [0]
-    assert not made.orders
+    _, order = sent(made, 0)
+    answer = stepped(order)
+    made.receive(A, answer, 0.0)
+    assert made.take() == {0: answer}
+    assert not made.has_orders
+    assert made.receive(A, answer, 0.0) == []
+    assert made.take() == {}
+
+
+def test_an_answer_that_nobody_wants_is_not_kept_but_until_it_comes_its_order_is_sent_again() -> None:
+    made = order_coordinator(A)
+    _, order = sent(made, 0)
     made.forget(0)
-    assert made.receive(A, stepped(order), 0.0) == []
-    assert made.answers == {}
+    assert made.lanes[0].order == SentOrder(order, wanted=False), "its worker may execute it"
+    assert order in [message for _, message in lost_on_the_way(made)]
+    made.receive(A, stepped(order), 0.0)
+    assert not made.has_orders
+    assert made.take() == {}
+
+
+def test_an_order_that_nobody_wants_is_over_when_the_lane_has_the_next_one() -> None:
+    """Its worker has replaced it too, and does not answer it."""
+    made = order_coordinator(A)
+    _, first = sent(made, 0)
+    made.forget(0)
+    _, second = sent(made, 0)
+    assert [message for _, message in lost_on_the_way(made) if isinstance(message, Step)] == [second]
+    assert made.receive(A, stepped(first), 0.0) == []
+    assert made.take() == {}
+    answer = stepped(second)
+    made.receive(A, answer, 0.0)
+    assert made.take() == {0: answer}
+    assert not made.has_orders
+
+
+def lost_on_the_way(made: OrderCoordinator) -> list[Outgoing]:
+    """What is sent to worker A after heartbeats that name no order."""
+    session = made.members[A].session
+    made.receive(A, example(Heartbeat, session=session, replies=made.members[A].replies), 1.0)
+    return made.receive(A, example(Heartbeat, session=session, replies=made.members[A].replies), 1.0)
 
 
 def test_another_workers_order_is_not_answered() -> None:
     made = order_coordinator(A, B)
-    ((_, order),) = made.order(0, step)
+    _, order = sent(made, 0)
     assert made.receive(B, stepped(order, session=made.members[B].session), 0.0) == []
-    assert (list(made.orders), made.answers) == ([order_ticket(order)], {})
+    assert made.lanes[0].order == SentOrder(order)
 
 
 def test_what_was_not_asked_for_gets_its_sender_refused() -> None:
@@ -127,8 +167,7 @@ def test_a_loss_is_told_once_and_its_lane_starts_again_in_its_next_incarnation()
     made.give_up(made.members[A], "did not answer")
     assert made.take_lost() == {0: "worker a (host) did not answer"}
     assert made.take_lost() == {}
-    assert made.place(0, patient=False)
-    ((peer, order),) = made.order(0, step)
+    peer, order = sent(made, 0)
     assert isinstance(order, Step)
     assert (peer, order.incarnation) == (B, 1)
 
@@ -136,10 +175,13 @@ def test_a_loss_is_told_once_and_its_lane_starts_again_in_its_next_incarnation()
 def test_a_lane_stays_where_it_is_although_a_worker_has_none() -> None:
     """While workers may still come, a lane that has none waits for one of its own."""
     made = order_coordinator(A)
-    assert not made.place(1, patient=True)
-    assert made.place(1, patient=False)
+    made.ask(1, step, 3.0)
+    assert made.send_waiting([1], 7.9, 5.0) == []
+    assert made.waiting == [1]
+    assert [peer for peer, _ in made.send_waiting([1], 8.0, 5.0)] == [A]
+    assert made.waiting == []
     made.receive(B, example(Hello, worker="b"), 0.0)
-    assert made.place(1, patient=False)
+    sent(made, 1)
     assert [lane.owner for lane in made.lanes] == [A, A]
 
 
@@ -147,9 +189,7 @@ def test_in_a_tie_the_first_name_gets_the_next_lane_and_numbers_in_names_count()
     made = OrderCoordinator(SPEC, 100, TIMEOUT_S)
     for name in ("w10", "w2"):
         made.receive(name.encode(), example(Hello, worker=name), 0.0)
-    for lane in range(2):
-        assert made.place(lane, patient=False)
-    assert [lane.owner for lane in made.lanes] == [b"w2", b"w10"]
+    assert [sent(made, lane)[0] for lane in range(2)] == [b"w2", b"w10"]
 
 
 @pytest.mark.parametrize(
@@ -167,65 +207,43 @@ def test_in_a_tie_the_first_name_gets_the_next_lane_and_numbers_in_names_count()
 )
 def test_an_answer_that_does_not_fit_is_refused_and_its_lane_is_lost(changes: dict[str, object]) -> None:
     made = order_coordinator(A, B)
-    ((_, order),) = made.order(0, step)
+    _, order = sent(made, 0)
     ((_, said),) = made.receive(A, stepped(order, **changes), 0.0)
     assert isinstance(said, Refuse)
     assert list(made.members) == [B]
     assert list(made.lost) == [0]
-    assert (made.orders, made.answers) == ({}, {})
+    assert not made.has_orders
+    assert made.take() == {}
 
 
 # ---------------------------------------------------------------- what comes beside shared memory
 
 
-def test_infos_too_long_for_shared_memory_are_those_of_the_step_under_way() -> None:
+def test_infos_too_long_for_shared_memory_are_no_answer() -> None:
     made = order_coordinator(A)
-    made.shared_orders[0] = 7
-    assert made.receive(A, in_memory(made, 0, 7), 0.0) == []
-    assert made.infos == {0: b"words"}
-    assert made.answers == {}, "counted as an answer it would stand for that of a lane which has none"
-
-
-@pytest.mark.parametrize("number", [6, 8])
-def test_infos_of_another_step_are_not_used(number: int) -> None:
-    made = order_coordinator(A)
-    made.shared_orders[0] = 7
-    assert made.receive(A, in_memory(made, 0, number), 0.0) == []
-    assert (made.infos, made.answers) == ({}, {})
-
-
-def test_infos_that_nobody_waits_for_are_not_used() -> None:
-    made = order_coordinator(A)
-    made.receive(A, in_memory(made, 0, 1), 0.0)
-    assert (made.infos, made.answers) == ({}, {})
-    made.shared_orders[0] = 1
-    made.forget(0)
-    made.receive(A, in_memory(made, 0, 1), 0.0)
-    assert (made.infos, made.answers) == ({}, {})
-    made.shared_orders[0] = 2
-    made.receive(A, in_memory(made, 0, 2), 0.0)
-    made.forget(0)
-    assert made.infos == {}, "they were taken"
+    said = in_memory(made, 0, 7)
+    assert made.receive(A, said, 0.0) == []
+    assert made.lanes[0].long_infos == said
+    assert made.take() == {}, "counted as an answer it would stand for that of a lane which has none"
 
 
 def test_infos_of_anothers_lane_or_an_earlier_life_are_not_used() -> None:
     made = order_coordinator(A, B)
-    made.shared_orders[0] = made.shared_orders[1] = 7
     theirs = in_memory(made, 1, 7)
     made.receive(A, msgspec.structs.replace(theirs, session=in_memory(made, 0, 7).session), 0.0)
     made.receive(B, msgspec.structs.replace(theirs, incarnation=9), 0.0)
-    assert (made.infos, made.answers) == ({}, {})
+    assert [lane.long_infos for lane in made.lanes] == [None, None]
     made.give_up(made.members[B], "was killed")
     assert [lane.started for lane in made.lanes] == [True, False], "whoever is gone will not say its infos"
 
 
 def test_nothing_but_a_step_is_answered_beside_shared_memory() -> None:
     made = order_coordinator(A)
-    made.shared_orders[0] = 7
     session = in_memory(made, 0, 7).session
     ((_, said),) = made.receive(A, example(Returned, session=session, ticket=-7, results=NOTHING), 0.0)
     assert isinstance(said, Refuse)
-    assert (made.members, made.answers, made.infos) == ({}, {}, {})
+    assert made.members == {}
+    assert made.lanes[0].long_infos is None
 
 
 # ---------------------------------------------------------------- silence
@@ -261,7 +279,7 @@ def test_one_whose_key_was_revoked_is_told_so_and_forgotten() -> None:
 
 def test_what_was_lost_on_the_way_is_said_again() -> None:
     made = order_coordinator(A)
-    ((_, order),) = made.order(0, step)
+    _, order = sent(made, 0)
     session = made.members[A].session
     said: list[list[object]] = []
     for replies, held in ((0, ()), (1, (order_ticket(order),)), (2, ()), (2, ())):
@@ -334,13 +352,12 @@ def test_an_answer_of_the_other_kind_and_results_that_are_not_one_for_each_copy_
 
     def told(make: MakeOrder, answer: Callable[[Order], Answer]) -> str:
         coordinator = order_coordinator(A, B)
-        ((_, sent),) = coordinator.order(0, make)
-        order = cast(Order, sent)
+        _, order = sent(coordinator, 0, make)
         out = coordinator.receive(A, answer(order), 0.0)
         if not out:
-            assert coordinator.answers[0].ticket == order.ticket
+            assert coordinator.take()[0].ticket == order.ticket
             return ""
-        assert 0 not in coordinator.answers
+        assert coordinator.take() == {}
         ((_, refusal),) = out
         assert isinstance(refusal, Refuse)
         return refusal.reason
@@ -372,7 +389,7 @@ def test_whoever_is_waited_for_no_longer_takes_no_other_worker_of_its_name_along
     peers = [b"a\0tag\0" + key * 64 for key in (b"1", b"2")]
     for lane, peer in enumerate(peers):
         made.receive(peer, example(Hello, worker="a", process_nonce=lane + 1), 0.0)
-        assert made.place(lane, patient=False)
+        sent(made, lane)
     slow = made.owner(1)
     assert slow is not None
     made.give_up(slow, "did not answer in time")

@@ -28,9 +28,10 @@ from millrace.learner.vector_env.order_coordinator import MakeOrder
 from millrace.learner.vector_env.sent_lanes import LONGEST_GAP_S, Asked, AskedReset, Sent, SentLanes, WatchedTime
 from millrace.learner.vector_env.settings import VectorEnvSettings
 from millrace.protocol.errors import EnvironmentFailed, NoWorkers, UsageError, WorkerLost
-from millrace.protocol.messages import LaneIncarnation, Reset, Step
+from millrace.protocol.messages import LaneIncarnation, Reset, Step, Stepped
 from millrace.protocol.wire.plain_values import unpack
 from millrace.protocol.wire.wake_up import WakeReason
+from tests.support.conversation.example_messages import example
 from tests.support.examples import examples
 from tests.support.in_process.any_order import AnyOrder, any_order
 from tests.support.in_process.rows_of_copies import Row, info_of, of_copies, received
@@ -202,6 +203,25 @@ def test_a_worker_wakes_the_learner_when_its_lane_is_done_although_others_are_no
         assert link.memory.unanswered_orders() == 2
         assert env.hub.shared is not None
         assert env.hub.shared._to_learner.wait(0.0) is WakeReason.STEP
+
+
+def test_infos_too_long_for_shared_memory_are_those_of_the_step_under_way() -> None:
+    with made(copies=1, lanes=1, workers=1) as (env, link):
+        env.reset(seed=1)
+        link.frozen = {"w0"}
+        env.step_async(zeros([0]))
+        hub = env.hub
+        assert hub.shared is not None
+        assert link.memory is not None
+        number = hub.shared.under_way[0]
+        link.memory.answer(0, number, bytes(link.memory.info_bytes[0] + 1))
+        lane = hub.coordinator.lanes[0]
+        for other in (number - 1, number + 1):
+            lane.long_infos = example(Stepped, ticket=-other)
+            assert hub.take() == {}
+        lane.long_infos = example(Stepped, ticket=-number, infos=np.frombuffer(b"words", np.uint8))
+        assert hub.take() == {0: b"words"}
+        assert hub.take() == {}
 
 
 def test_the_example_of_send_runs() -> None:
@@ -1042,6 +1062,20 @@ def test_a_step_after_an_interrupted_reset_has_its_own_results(shared: bool) -> 
         for left in 0.8, 0.6:
             observation, reward, *_ = env.step([0])
             assert (observation.tolist(), reward.tolist()) == ([[pytest.approx(left)]], [1.0])
+
+
+@BOTH_WAYS
+def test_an_order_whose_answer_nobody_wants_is_over_with_the_next_one(shared: bool) -> None:
+    with made(copies=1, lanes=1, workers=1, shared=shared) as (env, link):
+        env.reset(seed=1)
+        link.frozen = {"w0"}
+        with interrupted_after(env, lambda: None):
+            env.reset(seed=1)
+        link.frozen = set()
+        env.reset(seed=1)
+        assert not env.hub.coordinator.has_orders
+        assert not any(member.tickets for member in env.hub.coordinator.members.values())
+        assert env.hub.can_share(0) == shared
 
 
 def interrupted(call: Callable[[], object], at: int) -> bool:

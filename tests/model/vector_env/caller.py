@@ -21,7 +21,7 @@ from millrace.learner.members.worker_processes import WorkerProcesses
 from millrace.learner.vector_env.batch_arrays import BatchArrays
 from millrace.learner.vector_env.batch_layout import BatchLayout
 from millrace.learner.vector_env.lost_lanes import LostLanes
-from millrace.learner.vector_env.order_coordinator import OrderCoordinator
+from millrace.learner.vector_env.order_coordinator import OrderCoordinator, SentOrder
 from millrace.learner.vector_env.send_recv import SendRecv, VectorEnvParts
 from millrace.learner.vector_env.sent_lanes import Asked, AskedReset, Sent
 from millrace.learner.vector_env.step_hub import StepHub
@@ -110,6 +110,11 @@ class Caller:
         """Make the next call."""
         lanes = range(len(self.coordinator.lanes))
         match self.operations[self.at]:
+            case "interrupted reset":
+                self.send_recv.reset(lanes, [self.at] * len(lanes), None)
+                self.send_recv.begin_anew()
+                self.at += 1
+                return
             case "reset":
                 self.send_recv.reset(lanes, [self.at] * len(lanes), None)
             case "step":
@@ -148,9 +153,12 @@ class Caller:
             return
         self.server.send(self.coordinator.remove_silent(self.now))
         self.hub._send_waiting_orders()
-        for order in self.coordinator.orders.values():
-            age = self.ages[order.ticket] = min(self.ages.get(order.ticket, 0) + 1, self.oldest)
-            member = self.coordinator.owner(order.lane)
+        for lane in self.coordinator.lanes:
+            if not isinstance(lane.order, SentOrder):
+                continue
+            ticket = lane.order.order.ticket
+            age = self.ages[ticket] = min(self.ages.get(ticket, 0) + 1, self.oldest)
+            member = self.coordinator.owner(lane.number)
             heard = member is not None and self.now - member.heard_s <= TICK_S
             assert age < self.oldest or not heard, f"{Rule.ORDER_AGAIN}: a worker that is heard does not answer"
         self.turn()

@@ -1,16 +1,23 @@
 """The learner of a vector environment: a real `OrderCoordinator` and the program that calls, to tuples and back.
 
 Rule: nothing is lost on the way, except for what only a person reads. After every event, the rules that hold in every state
-are checked: a lane has one owner, an order is with the owner of its lane, and a lane has one order at a time.
+are checked: a lane has one owner, the order of a lane is with its owner, and a worker has no other orders.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from millrace.learner.members.member import Member
 from millrace.learner.members.membership import Outgoing
-from millrace.learner.vector_env.order_coordinator import OrderCoordinator
+from millrace.learner.vector_env.order_coordinator import (
+    AnsweredOrder,
+    OrderCoordinator,
+    OrderedLane,
+    SentOrder,
+    WaitingOrder,
+)
 from millrace.learner.vector_env.sent_lanes import Asked, AskedReset, Sent
 from millrace.protocol.messages import ToLearner, WorkerExit
 from tests.model import membership_part
@@ -24,11 +31,10 @@ from tests.model.vector_env.order_content import NOTHING, content_of, make_order
 if TYPE_CHECKING:
     from tests.model.vector_env.stepping import Stepping
 
-SAVED = {"membership", "lanes", "orders", "answers", "lost", "_tickets"}
+SAVED = {"membership", "lanes", "lost", "_tickets"}
 """What of `OrderCoordinator` is saved."""
-NOT_SAVED = {"spec", "worker_timeout_s", "shared_orders", "infos", "_placement"}
-"""What is not: constants, steps through shared memory; and placement, which remembers nothing in the methods that are
-used."""
+NOT_SAVED = {"spec", "worker_timeout_s", "_placement"}
+"""What is not: constants, and placement, which remembers nothing in the methods that are used."""
 
 
 class Learner:
@@ -70,18 +76,17 @@ class Learner:
             assert owners == ([] if lane.owner is None else [lane.owner]), (
                 "a lane has two owners, or its owner does not know"
             )
-        lanes = [order.lane for order in coordinator.orders.values()]
-        assert len(lanes) == len(set(lanes)), "a lane has two orders at a time"
-        for number, order in coordinator.orders.items():
-            member = coordinator.owner(order.lane)
+        sent = [(lane, lane.order.order) for lane in coordinator.lanes if isinstance(lane.order, SentOrder)]
+        for lane, order in sent:
+            member = coordinator.owner(lane.number)
             assert member is not None, "an order is with nobody"
-            assert number in member.tickets, "an order is not with the owner of its lane"
+            assert order.ticket in member.tickets, "an order is not with the owner of its lane"
+            assert order.lane == lane.number, "an order of another lane"
             assert order.session == member.session, "an order of an earlier session"
-            assert order.incarnation == coordinator.lanes[order.lane].incarnation, "an order of an earlier incarnation"
-        assert sum(len(member.tickets) for member in members.values()) == len(lanes), (
-            "a worker holds an order that is not out"
+            assert order.incarnation == lane.incarnation, "an order of an earlier incarnation"
+        assert sum(len(member.tickets) for member in members.values()) == len(sent), (
+            "a worker holds an order that is not its lane's newest"
         )
-        assert not set(lanes) & set(coordinator.answers), "a lane has an answer and an order"
 
 
 # -------------------------------------------------------------------- to tuples and back
@@ -98,18 +103,26 @@ def saved(learner: Learner) -> Content:
                 incarnation(lane.number, lane.incarnation),
                 None if lane.owner is None else name(Kind.WORKER, worker_of(lane.owner)),
                 lane.started,
+                _of_lane(lane, caller),
             )
             for lane in coordinator.lanes
         ),
-        tuple(
-            (session(order.session), order_content(order), caller.ages.get(number, 0))
-            for number, order in sorted(coordinator.orders.items())
-        ),
-        tuple(content_of(answer, 0) for _, answer in sorted(coordinator.answers.items())),
         tuple(sorted(coordinator.lost)),
         ticket(coordinator._tickets),
         _caller(caller),
     )
+
+
+def _of_lane(lane: OrderedLane, caller: Caller) -> Content:
+    match lane.order:
+        case None:
+            return ()
+        case WaitingOrder():
+            return ("waiting",)  # for the order that the caller has sent
+        case SentOrder(order, wanted):
+            return "sent", session(order.session), order_content(order), caller.ages.get(order.ticket, 0), wanted
+        case AnsweredOrder(answer):
+            return "answered", content_of(answer, 0)
 
 
 def _asked(caller: Caller, lane: int, sent: Sent) -> Content:
@@ -127,8 +140,6 @@ def _caller(caller: Caller) -> Content:
             for lane in sorted(sent._results)
         ),
         tuple(sorted(caller.send_recv._to_raise)),
-        tuple(sorted(caller.hub._waiting_orders)),
-        tuple((lane, ticket(number)) for lane, number in sorted(caller.hub._newest_tickets.items())),
         tuple((lane, incarnation(lane, life), state) for lane, (life, state) in sorted(caller.copies.items())),
         tuple(sorted(lost_lanes.unreported)),
         tuple(sorted(lost_lanes.awaiting_reset)),
@@ -139,28 +150,28 @@ def _caller(caller: Caller) -> Content:
 
 def loaded(content: Content, settings: Stepping, now: float) -> Learner:
     """A learner at this time, with the content that it had at the time 0."""
-    members, lanes, orders, answers, lost, tickets, of_caller = content
+    members, lanes, lost, tickets, of_caller = content
     learner = Learner(settings, members[1].value, now)
     coordinator, caller = learner.coordinator, learner.caller
     membership_part.load(coordinator.membership, members, Member)
-    for lane, (life, owner, started) in zip(coordinator.lanes, lanes, strict=True):
+    for lane, (life, owner, started, of_lane) in zip(coordinator.lanes, lanes, strict=True):
         lane.incarnation, lane.started = life.value, started
         lane.owner = None if owner is None else peer_of(owner.value)
-    for number, of_order, age in orders:
-        order = order_of(number.value, of_order)
-        caller.ages[order.ticket] = age
-        coordinator.orders[order.ticket] = order
-    for each in answers:
-        answer = message_of(each, 0, settings.run)
-        coordinator.answers[answer.lane] = answer
+        match of_lane:
+            case "sent", number, of_order, age, wanted:
+                order = order_of(number.value, of_order)
+                caller.ages[order.ticket] = age
+                lane.order = SentOrder(order, wanted)
+            case "answered", answer:
+                lane.order = AnsweredOrder(message_of(answer, 0, settings.run))
     coordinator.lost = dict.fromkeys(lost, "lost")
     coordinator._tickets = tickets.value
-    _load_caller(caller, of_caller)
+    _load_caller(caller, of_caller, waiting=[n for n, (*_, of_lane) in enumerate(lanes) if of_lane[:1] == ("waiting",)])
     return learner
 
 
-def _load_caller(caller: Caller, content: Content) -> None:
-    at, waits, under_way, ready, to_raise, waiting, newest, copies, unreported, awaiting, told, ever_reset = content
+def _load_caller(caller: Caller, content: Content, waiting: Sequence[int]) -> None:
+    at, waits, under_way, ready, to_raise, copies, unreported, awaiting, told, ever_reset = content
     caller.at, caller.waits, caller.told = at, waits is not None, set(told)
     sent, lost_lanes = caller.send_recv._sent, caller.parts.lost_lanes
     lost_lanes.add(dict.fromkeys(unreported, "lost"))
@@ -169,13 +180,11 @@ def _load_caller(caller: Caller, content: Content) -> None:
         asked = Asked.STEP if is_step else Asked.CALL if kind == "call" else AskedReset((0,), (seed,), NOTHING)
         sent.sent[lane] = Sent(asked, since_s, attempts)
         if lane in waiting:
-            caller.hub._waiting_orders[lane] = make_order(kind, seed)
-            caller.hub._waiting_since_s[lane] = 0.0
+            caller.coordinator.lanes[lane].order = WaitingOrder(make_order(kind, seed), 0.0)
     for lane, lost, reset in ready:
         sent.sent[lane], sent._results[lane] = Sent(Asked.STEP, 0.0), b""
         sent._losses |= {lane: {}} if lost else {}
         caller.send_recv._reset_lanes |= {lane: reset.value} if reset is not None else {}
     caller.send_recv._to_raise = dict.fromkeys(to_raise, "lost")
-    caller.hub._newest_tickets = {lane: number.value for lane, number in newest}
     caller.copies = {lane: (life.value, state) for lane, life, state in copies}
     caller.parts.ever_reset[:] = ever_reset

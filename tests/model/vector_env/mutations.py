@@ -19,27 +19,25 @@ if TYPE_CHECKING:
 
 COORDINATOR = "millrace.learner.vector_env.order_coordinator"
 MEMBERS = "millrace.learner.members.coordinator"
-HUB = "millrace.learner.vector_env.step_hub"
 LOST = "millrace.learner.vector_env.lost_lanes"
 SENT = "millrace.learner.vector_env.sent_lanes"
 SEND_RECV = "millrace.learner.vector_env.send_recv"
 
 MUTATIONS = {
     "a lost order is not sent again": Mutation(
-        Rule.ORDER_AGAIN, COORDINATOR, "return [(member.peer, self.orders[ticket]) for ticket in lost]", "return []"
+        Rule.ORDER_AGAIN, COORDINATOR, "return [(member.peer, orders[ticket]) for ticket in lost]", "return []"
     ),
     "heartbeats of a vector environment are answered alike": Mutation(
         Rule.SENT_BEFORE, MEMBERS, "member.replies += 1", "member.replies += 0"
     ),
     "a lost lane is not reported": Mutation(None, COORDINATOR, "if self.lanes[lane].started:", "if False:"),
-    "an order does not start its lane": Mutation(None, COORDINATOR, "record.started = True", "pass"),
-    "the orders of a lost worker are kept": Mutation(
-        None, COORDINATOR, "            del self.orders[ticket]\n", "            pass\n"
+    "an order does not start its lane": Mutation(None, COORDINATOR, "lane.started = True", "pass"),
+    "the order of a lost worker is kept": Mutation(None, COORDINATOR, "if isinstance(self.order, SentOrder):", "if False:"),
+    "an answer leaves its order open": Mutation(None, COORDINATOR, "del member.tickets[message.ticket]", "pass"),
+    "an order that was sent waits on": Mutation(None, COORDINATOR, "lane.order = SentOrder(order)", "pass"),
+    "an order that was replaced stays with its worker": Mutation(
+        None, COORDINATOR, "del member.tickets[record.order.order.ticket]", "pass"
     ),
-    "an answer leaves its order open": Mutation(
-        None, COORDINATOR, "del self.orders[message.ticket], member.tickets[message.ticket]", "pass"
-    ),
-    "an order that was sent waits on": Mutation(None, HUB, "del self._waiting_orders[lane]", "pass"),
     "a lane is stepped before its loss is reported": Mutation(None, SEND_RECV, "if lane in unreported:", "if False:"),
     "new copies are stepped before they are reset": Mutation(None, SEND_RECV, "if lane in awaiting_reset:", "if False:"),
     "a reset that lost its worker is not sent again": Mutation(
@@ -75,6 +73,7 @@ def runs() -> list[Conversation]:
         Stepping(workers=1, lanes=2, calls=("reset", "step"), faults=1),
         Stepping(workers=2, lanes=1, calls=("reset", "step", "step"), faults=1),
         Stepping(workers=1, lanes=1, calls=("reset", "step"), faults=2),
+        Stepping(workers=1, lanes=1, calls=("reset", "interrupted reset", "reset", "step"), faults=1),
     ]
 
 
