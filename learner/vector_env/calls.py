@@ -11,7 +11,8 @@ from millrace.learner.vector_env.cut_short import CutShort
 from millrace.learner.vector_env.lane_orders import call_order, packed, packed_each
 from millrace.learner.vector_env.lost_lanes import RESET_ATTEMPTS
 from millrace.learner.vector_env.order_coordinator import MakeOrder
-from millrace.learner.vector_env.send_recv import SendRecv, VectorEnvParts
+from millrace.learner.vector_env.send_recv import SendRecv
+from millrace.learner.vector_env.step_hub import StepHub
 from millrace.protocol.bounds import MAX_COPIES, MAX_LINE, one_line
 from millrace.protocol.envs.description import DescribedEnv, read_description
 from millrace.protocol.errors import BadMessage, EnvironmentFailed, UsageError, WorkerLost, safe_repr
@@ -26,12 +27,15 @@ USE_INSTEAD = ("reset", "step", "close")
 class CopyCalls:
     """Calls, reads and sets attributes of a vector environment's env copies, and gets descriptions of the copies."""
 
-    def __init__(self, send_recv: SendRecv, parts: VectorEnvParts, cut_short: CutShort, known: Mapping[str, Any]) -> None:
+    def __init__(
+        self, send_recv: SendRecv, hub: StepHub, layout: BatchLayout, cut_short: CutShort, known: Mapping[str, Any]
+    ) -> None:
         """`known` has the attributes that are equal in all copies and can't be sent, because they aren't plain data."""
         self.known = known
         self._cut_short = cut_short
         self._send_recv = send_recv
-        self._parts = parts
+        self._hub = hub
+        self._layout = layout
 
     def call(self, copies: Sequence[int], name: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[Any, ...]:
         """Call a method of these copies, or get an attribute. The results are in ascending order of the copies.
@@ -40,11 +44,11 @@ class CopyCalls:
         """
         if name in self.known:
             return (self.known[name],) * len(copies)
-        return _results(name, self._answers(call_orders(self._parts.layout, copies, name, args, kwargs)))
+        return _results(name, self._answers(call_orders(self._layout, copies, name, args, kwargs)))
 
     def assign(self, copies: Sequence[int], name: str, values: Sequence[Any]) -> None:
         """Set an attribute of these copies, to one value each. `copies` are in ascending order."""
-        _results(name, self._answers(assign_orders(self._parts.layout, copies, name, values)))
+        _results(name, self._answers(assign_orders(self._layout, copies, name, values)))
 
     def describe(self, copies: Sequence[int]) -> list[DescribedEnv | None]:
         """Descriptions of these copies, in ascending order; None where a client cannot give one.
@@ -52,12 +56,12 @@ class CopyCalls:
         Raises the errors that `call` raises.
         """
         described: list[DescribedEnv | None] = []
-        for lane, answer in sorted(self._answers(call_orders(self._parts.layout, copies, DESCRIPTION, (), {})).items()):
-            count = len(self._parts.layout.by_lane(copies)[lane])
+        for lane, answer in sorted(self._answers(call_orders(self._layout, copies, DESCRIPTION, (), {})).items()):
+            count = len(self._layout.by_lane(copies)[lane])
             try:
                 described += _descriptions(answer, count)
             except BadMessage as error:
-                self._parts.hub.refuse_owner(lane, f"lane {lane}: description cannot be read: {error}")
+                self._hub.refuse_owner(lane, f"lane {lane}: description cannot be read: {error}")
                 described += [None] * count
         return described
 
@@ -65,8 +69,8 @@ class CopyCalls:
         """Make all copies, before they are reset, and return their descriptions. Raises the errors that `call` raises."""
         for _ in range(RESET_ATTEMPTS - 1):
             with suppress(WorkerLost):  # another worker may be able to make them
-                return self.describe(range(self._parts.layout.count))
-        return self.describe(range(self._parts.layout.count))
+                return self.describe(range(self._layout.count))
+        return self.describe(range(self._layout.count))
 
     def _answers(self, orders: Mapping[int, MakeOrder]) -> dict[int, Returned]:
         lanes = list(orders)

@@ -27,8 +27,7 @@ from millrace.learner.vector_env.batch_layout import BatchLayout
 from millrace.learner.vector_env.calls import CopyCalls
 from millrace.learner.vector_env.cut_short import CutShort
 from millrace.learner.vector_env.infos import InfoReader, merged
-from millrace.learner.vector_env.lost_lanes import LostLanes
-from millrace.learner.vector_env.send_recv import SendRecv, VectorEnvParts
+from millrace.learner.vector_env.send_recv import SendRecv
 from millrace.learner.vector_env.sent_lanes import Infos, Ready
 from millrace.learner.vector_env.spec import VectorEnvDescription
 from millrace.learner.vector_env.step_arguments import Options, action_arrays, numbered, reset_arguments
@@ -87,15 +86,16 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         self._state = AsyncState.DEFAULT
         self._cut_short = CutShort()
         self._info_reader = InfoReader(self._layout, hub.refuse_owner)
-        count = self._layout.count
-        seeds = list[int | None]([None] * count)
-        ever_reset = np.zeros(count, bool)
-        parts = VectorEnvParts(
-            hub, self._layout, self._batch, LostLanes(), step.autoreset, seeds, ever_reset, on_worker_loss
+        self._send_recv = SendRecv(
+            hub,
+            self._layout,
+            self._batch,
+            autoreset=step.autoreset,
+            on_worker_loss=on_worker_loss,
+            timeout_s=timeout_s,
         )
-        self._send_recv = SendRecv(parts, timeout_s)
         spaces = {"observation_space": self.single_observation_space, "action_space": self.single_action_space}
-        self.calls = CopyCalls(self._send_recv, parts, self._cut_short, {"spec": self.spec, **spaces})
+        self.calls = CopyCalls(self._send_recv, hub, self._layout, self._cut_short, {"spec": self.spec, **spaces})
         """calls methods of some of the copies, and reads and assigns their attributes"""
         self._close_once = weakref.finalize(self, _call_in_process, os.getpid(), on_close)
 

@@ -122,7 +122,7 @@ class OrderCoordinator(Coordinator[Member]):
     @property
     def has_orders(self) -> bool:
         """Whether a lane has an order that waits for a worker or its answer, or an answer that wasn't taken."""
-        return any([lane.order is not None for lane in self.lanes])
+        return any(lane.order is not None for lane in self.lanes)
 
     @property
     def waiting(self) -> list[int]:

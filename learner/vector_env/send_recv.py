@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, Literal
 
+import numpy as np
 from gymnasium.error import AlreadyPendingCallError, NoAsyncCallError
 
 from millrace.learner.vector_env.batch_arrays import BatchArrays
@@ -31,50 +31,41 @@ from millrace.learner.vector_env.sent_lanes import (
 )
 from millrace.learner.vector_env.step_arguments import Options
 from millrace.learner.vector_env.step_hub import StepHub
-from millrace.protocol.arrays import Array, Bools
+from millrace.protocol.arrays import Array
 from millrace.protocol.errors import NoWorkers, UsageError, WorkerLost
 from millrace.protocol.messages import Stepped
 
 log = logging.getLogger("millrace.learner")
 
 
-@dataclass(frozen=True)
-class VectorEnvParts:
-    """The parts of a vector environment that this file uses."""
-
-    hub: StepHub
-    layout: BatchLayout
-    batch: BatchArrays
-    lost_lanes: LostLanes
-    autoreset: Literal["NextStep", "SameStep", "Disabled"]
-    seeds: list[int | None]
-    """the seed of each copy's last reset with a seed"""
-    ever_reset: Bools
-    """[copies] True for copies that have been reset at least once"""
-    on_worker_loss: Literal["truncate", "raise"] = "truncate"
-
-    def replacement_seeds(self, lane: int) -> tuple[int | None, ...]:
-        """Seeds for the copies that replace a lost lane's copies."""
-        seeds = [self.seeds[n] for n in self.layout.copies(lane)]
-        return replacement_seeds(seeds, self.hub.coordinator.lanes[lane].incarnation)
-
-    def reset_of_new_copies(self, lane: int) -> AskedReset:
-        """The reset of the copies that replace a lost lane's copies."""
-        return AskedReset(tuple(range(self.layout.size(lane))), self.replacement_seeds(lane), packed(None))
-
-
 class SendRecv:
     """Sends orders to lanes and receives their results. It keeps track of the lanes that have not come back."""
 
-    def __init__(self, parts: VectorEnvParts, timeout_s: float) -> None:
+    def __init__(
+        self,
+        hub: StepHub,
+        layout: BatchLayout,
+        batch: BatchArrays,
+        *,
+        autoreset: Literal["NextStep", "SameStep", "Disabled"],
+        on_worker_loss: Literal["truncate", "raise"] = "truncate",
+        timeout_s: float,
+    ) -> None:
         """`timeout_s` is how many seconds a worker may take, unless a call gives another time."""
         self.timeout_s = timeout_s
-        self._parts = parts
-        self._sent = SentLanes(parts.layout)
+        self._hub = hub
+        self._layout = layout
+        self._batch = batch
+        self._autoreset = autoreset
+        self._on_worker_loss = on_worker_loss
+        self._sent = SentLanes(layout)
+        self._lost_lanes = LostLanes()
+        self._seeds: list[int | None] = [None] * layout.count  # the seed of each copy's last reset with a seed
+        self._ever_reset = np.zeros(layout.count, bool)  # for each copy, whether it has been reset at least once
         self._all_were_reset = False
         self._reset_lanes: dict[int, int] = {}  # ready lanes of which all copies were reset, and the copies' incarnation
         self._to_raise: dict[int, str] = {}  # lanes whose loss the caller gets as an error, and why they were lost
-        self._watched = WatchedTime(parts.hub.now())
+        self._watched = WatchedTime(hub.now())
 
     def copies(self) -> list[int]:
         """The copies that have not come back."""
@@ -82,8 +73,8 @@ class SendRecv:
 
     def begin_anew(self) -> None:
         """Forget everything that was sent, after a call that was cut short. All copies must be reset next."""
-        self._parts.hub.forget(self._parts.layout.lanes)
-        self._sent = SentLanes(self._parts.layout)
+        self._hub.forget(self._layout.lanes)
+        self._sent = SentLanes(self._layout)
         self._to_raise = {}
         self._reset_lanes = {}
 
@@ -95,24 +86,21 @@ class SendRecv:
         Raises `TypeError` for options that aren't plain data. With SameStep, raises `UsageError` if `copies` has only some
         copies of a lane that was lost, because no step would reset the others.
         """
-        parts = self._parts
-        layout = self._parts.layout
-        hub = self._parts.hub
-        layout.check(copies)
-        by_lane = layout.by_lane(sorted(copies))
+        self._layout.check(copies)
+        by_lane = self._layout.by_lane(sorted(copies))
         self.check_back(by_lane)
         self._check_whole(by_lane)
         resets = {lane: self._asked_reset(lane, chosen, seeds, options) for lane, chosen in by_lane.items()}
         for n in copies:
-            parts.seeds[n] = seeds[n] if seeds[n] is not None else parts.seeds[n]
-        if len(copies) == layout.count:
-            hub.listen()  # a loss that is noticed now needs no report, because the copies are reset
-        parts.lost_lanes.add(hub.coordinator.take_lost())
-        now = self._watched.look(hub.now())
+            self._seeds[n] = seeds[n] if seeds[n] is not None else self._seeds[n]
+        if len(copies) == self._layout.count:
+            self._hub.listen()  # a loss that is noticed now needs no report, because the copies are reset
+        self._lost_lanes.add(self._hub.coordinator.take_lost())
+        now = self._watched.look(self._hub.now())
         try:
             for lane, reset in resets.items():
                 self._sent.send([lane], Sent(reset, now))
-                hub.send_order(lane, reset.order())
+                self._hub.send_order(lane, reset.order())
         except Exception:
             self.abandon(list(resets))
             raise
@@ -133,12 +121,10 @@ class SendRecv:
         Raises `UsageError` for copies that must be reset first, and, with `on_worker_loss="raise"`, `WorkerLost` for copies
         that were lost. If it raises one of these, nothing is sent.
         """
-        hub = self._parts.hub
-        lost_lanes = self._parts.lost_lanes
         self.check_back(lanes)
-        lost_lanes.add(hub.coordinator.take_lost())
+        self._lost_lanes.add(self._hub.coordinator.take_lost())
         self._check_steppable(lanes)
-        now = self._watched.look(hub.now())
+        now = self._watched.look(self._hub.now())
         try:
             self._sent.send(lanes, Sent(Asked.STEP, now))
             self._order_steps(lanes, actions, at, together=together)
@@ -148,15 +134,15 @@ class SendRecv:
 
     def call(self, orders: Mapping[int, MakeOrder]) -> None:
         """Send each of these lanes, which have come back, its own order. The copies continue their episodes."""
-        now = self._watched.look(self._parts.hub.now())
+        now = self._watched.look(self._hub.now())
         self._sent.send(orders, Sent(Asked.CALL, now))
         for lane, make in orders.items():
-            self._parts.hub.send_order(lane, make)
+            self._hub.send_order(lane, make)
 
     def check_back(self, lanes: Iterable[int]) -> None:
         """Raise `AlreadyPendingCallError` if one of these lanes has not come back."""
         if out := self._sent.among(lanes):
-            copies = self._parts.layout.copies_of(out)
+            copies = self._layout.copies_of(out)
             raise AlreadyPendingCallError(
                 f"copies {copies} have not come back: expected recv() to return them first", "send"
             )
@@ -170,26 +156,25 @@ class SendRecv:
         ready.
         """
         sent = self._sent
-        hub = self._parts.hub
         if not (out := sent.copies):
             raise NoAsyncCallError("recv without send before it", "send")
         if not 0 <= min_envs <= len(out):
             raise ValueError(f"min_envs: expected 0 to {len(out)}, the copies that have not come back; got {min_envs}")
         timeout_s = self.timeout_s if timeout_s is None else timeout_s
-        hub.listen_if_due()
+        self._hub.listen_if_due()
         while True:
             self.look(timeout_s)
             self._raise_losses()
             if len(copies := sent.ready_copies) >= min_envs:
                 return self._returned(sent.take()), copies
-            hub.wait(timeout_s, together=False)
+            self._hub.wait(timeout_s, together=False)
 
     def recv_all(self, timeout_s: float | None = None) -> Ready:
         """Wait until every lane is ready, and take them. Raises what `recv` raises, after giving up on all lanes."""
         sent = self._sent
         timeout_s = self.timeout_s if timeout_s is None else timeout_s
-        look_first = bool(self._parts.lost_lanes.unreported)
-        self._wait_until(lambda: sent.all_ready, timeout_s, self._parts.layout.lanes, look_first=look_first, together=True)
+        look_first = bool(self._lost_lanes.unreported)
+        self._wait_until(lambda: sent.all_ready, timeout_s, self._layout.lanes, look_first=look_first, together=True)
         return self._returned(sent.take())
 
     def recv_some(self, lanes: Sequence[int]) -> Ready:
@@ -211,7 +196,7 @@ class SendRecv:
         `timeout_s`.
         """
         self._take_results()
-        self._parts.hub.raise_failure()
+        self._hub.raise_failure()
         if not self._sent.all_ready:
             self._give_up_late(timeout_s)
             self._handle_losses()
@@ -226,10 +211,9 @@ class SendRecv:
         for lane in lanes:
             self._to_raise.pop(lane, None)
             self._reset_lanes.pop(lane, None)
-        self._parts.hub.forget(sent.give_up(lanes))
-        lost_lanes = self._parts.lost_lanes
-        lost_lanes.add(self._parts.hub.coordinator.take_lost())
-        lost_lanes.report([lane for lane in steps if lane in lost_lanes.unreported])
+        self._hub.forget(sent.give_up(lanes))
+        self._lost_lanes.add(self._hub.coordinator.take_lost())
+        self._lost_lanes.report([lane for lane in steps if lane in self._lost_lanes.unreported])
 
     # ---------------------------------------------------------------- inside
 
@@ -242,30 +226,28 @@ class SendRecv:
         together: bool,
     ) -> None:
         """Order these lanes to step; see `step`."""
-        parts = self._parts
-        hub = self._parts.hub
         (arrays, fit) = actions
         shared = []
-        unreported = parts.lost_lanes.unreported
-        awaiting_reset = parts.lost_lanes.awaiting_reset
+        unreported = self._lost_lanes.unreported
+        awaiting_reset = self._lost_lanes.awaiting_reset
         for lane in lanes:
             if lane in unreported:
                 continue  # this step reports the loss in place of a result
             if lane in awaiting_reset:  # as in NextStep mode, the step after a truncation resets
-                hub.send_order(lane, parts.reset_of_new_copies(lane).order())
-            elif fit and hub.can_share(lane):
+                self._hub.send_order(lane, self._reset_of_new_copies(lane).order())
+            elif fit and self._hub.can_share(lane):
                 shared.append(lane)
             else:
-                hub.send_order(lane, step_order([array[at[lane]] for array in arrays]))
+                self._hub.send_order(lane, step_order([array[at[lane]] for array in arrays]))
         if shared:
-            assert hub.shared is not None
-            for memory, values in zip(hub.shared.memory.actions, arrays, strict=True):
-                if at is parts.layout.rows and len(shared) == len(at):
+            assert self._hub.shared is not None
+            for memory, values in zip(self._hub.shared.memory.actions, arrays, strict=True):
+                if at is self._layout.rows and len(shared) == len(at):
                     memory[:] = values
                     continue
                 for lane in shared:
-                    memory[parts.layout.rows[lane]] = values[at[lane]]
-            hub.send_steps(shared, together=together)
+                    memory[self._layout.rows[lane]] = values[at[lane]]
+            self._hub.send_steps(shared, together=together)
 
     def _wait_until(
         self, ready: Callable[[], bool], timeout_s: float, lanes: Sequence[int], *, look_first: bool, together: bool
@@ -275,7 +257,7 @@ class SendRecv:
             if look_first:
                 self.look(timeout_s)
             while not ready():
-                self._parts.hub.wait(timeout_s, together=together)
+                self._hub.wait(timeout_s, together=together)
                 self.look(timeout_s)
             self._raise_losses()
         except Exception:
@@ -283,117 +265,122 @@ class SendRecv:
             raise
 
     def _check_whole(self, copies: Mapping[int, Sequence[int]]) -> None:
-        layout = self._parts.layout
-        for lane in self._parts.lost_lanes.awaiting_reset & copies.keys() if self._parts.autoreset == "SameStep" else ():
-            if len(copies[lane]) < layout.size(lane):
-                of_lane = layout.copies(lane)
+        for lane in self._lost_lanes.awaiting_reset & copies.keys() if self._autoreset == "SameStep" else ():
+            if len(copies[lane]) < self._layout.size(lane):
+                of_lane = self._layout.copies(lane)
                 raise UsageError(
                     f"reset of copies {[of_lane[n] for n in copies[lane]]}: expected all copies of lane {lane} "
                     f"({of_lane[0]} to {of_lane[-1]}), which were lost with their worker; reset them together"
                 )
 
     def _check_steppable(self, lanes: Sequence[int]) -> None:
-        parts = self._parts
-        lost_lanes = self._parts.lost_lanes
+        lost_lanes = self._lost_lanes
         if not self._all_were_reset:
-            if never := [n for n in parts.layout.copies_of(lanes) if not parts.ever_reset[n]]:
+            if never := [n for n in self._layout.copies_of(lanes) if not self._ever_reset[n]]:
                 raise UsageError(f"step before reset of copies {never}: call reset(), or reset_async() and recv(), first")
-            self._all_were_reset = bool(parts.ever_reset.all())
-        if parts.autoreset == "Disabled":
-            over = parts.batch.over
+            self._all_were_reset = bool(self._ever_reset.all())
+        if self._autoreset == "Disabled":
+            over = self._batch.over
             # Lanes with an unreported loss are left out, because the result of this step reports the loss.
             if ended := [
-                n for n in parts.layout.copies_of(lane for lane in lanes if lane not in lost_lanes.unreported) if over[n]
+                n for n in self._layout.copies_of(lane for lane in lanes if lane not in lost_lanes.unreported) if over[n]
             ]:
                 raise UsageError(
                     f"copies {ended} have ended: autoreset_mode is Disabled, expected reset_async(env_ids={ended}) or "
                     "reset(options={'reset_mask': ended}) before the next step"
                 )
-        awaiting = [lane for lane in lanes if lane in lost_lanes.awaiting_reset] if parts.on_worker_loss == "raise" else ()
+        awaiting = [lane for lane in lanes if lane in lost_lanes.awaiting_reset] if self._on_worker_loss == "raise" else ()
         if awaiting:
-            copies = parts.layout.copies_of(awaiting)
+            copies = self._layout.copies_of(awaiting)
             raise WorkerLost(
                 f"lanes {awaiting} were lost with their worker; call reset() or reset_async(env_ids={copies}) first"
             )
 
+    def _replacement_seeds(self, lane: int) -> tuple[int | None, ...]:
+        """Seeds for the copies that replace a lost lane's copies."""
+        seeds = [self._seeds[n] for n in self._layout.copies(lane)]
+        return replacement_seeds(seeds, self._hub.coordinator.lanes[lane].incarnation)
+
+    def _reset_of_new_copies(self, lane: int) -> AskedReset:
+        """The reset of the copies that replace a lost lane's copies."""
+        return AskedReset(tuple(range(self._layout.size(lane))), self._replacement_seeds(lane), packed(None))
+
     def _asked_reset(self, lane: int, chosen: Sequence[int], seeds: Sequence[int | None], options: Options) -> AskedReset:
-        copies = [self._parts.layout.copies(lane)[n] for n in chosen]
+        copies = [self._layout.copies(lane)[n] for n in chosen]
         of_lane = packed_each([options[n] for n in copies]) if isinstance(options, list) else packed(options)
         return AskedReset(tuple(chosen), tuple(seeds[n] for n in copies), of_lane)
 
     def _reset_instead(self, lane: int, reset: AskedReset, last_observations: Mapping[int, Any]) -> None:
         """Reset the new copies of a lost lane before the lane comes back."""
-        self._sent.reset_instead(lane, reset, self._watched.look(self._parts.hub.now()), last_observations)
-        self._parts.hub.send_order(lane, reset.order())
+        self._sent.reset_instead(lane, reset, self._watched.look(self._hub.now()), last_observations)
+        self._hub.send_order(lane, reset.order())
 
     def _take_results(self) -> None:
         """Record which lanes are done."""
-        came = self._parts.hub.take()
+        came = self._hub.take()
         self._sent.ready({lane: self._stored(lane, one) if isinstance(one, Stepped) else one for lane, one in came.items()})
 
     def _stored(self, lane: int, answer: Stepped) -> bytes:
         """Write the results that arrived as a message to the batch. Returns the packed infos."""
-        parts = self._parts
         asked = self._sent.sent[lane].asked
-        parts.batch.store(lane, answer)
-        parts.lost_lanes.answered({lane})
+        self._batch.store(lane, answer)
+        self._lost_lanes.answered({lane})
         if isinstance(asked, AskedReset):
-            parts.ever_reset[[parts.layout.copies(lane)[n] for n in asked.copies]] = True
-            if len(asked.copies) == parts.layout.size(lane):
+            self._ever_reset[[self._layout.copies(lane)[n] for n in asked.copies]] = True
+            if len(asked.copies) == self._layout.size(lane):
                 self._reset_lanes[lane] = answer.incarnation
         return bytes(answer.infos.data)
 
     def _returned(self, ready: Ready) -> Ready:
         """Forget the losses before a reset of all copies of a lane, because the caller gets the reset's results now."""
         for lane in self._reset_lanes.keys() & ready.results.keys():
-            if self._reset_lanes.pop(lane) == self._parts.hub.coordinator.lanes[lane].incarnation:  # not lost since
-                self._parts.lost_lanes.forget(lane)
+            if self._reset_lanes.pop(lane) == self._hub.coordinator.lanes[lane].incarnation:  # not lost since
+                self._lost_lanes.forget(lane)
         return ready
 
     def _give_up_late(self, timeout_s: float) -> None:
         """Treat workers that take too long as lost. Raises `NoWorkers` if a lane had no worker all that time."""
-        now = self._watched.look(self._parts.hub.now())
+        now = self._watched.look(self._hub.now())
         for lane in self._sent.overdue(now, timeout_s):
             try:
-                self._parts.hub.give_up(lane, timeout_s)
+                self._hub.give_up(lane, timeout_s)
             except NoWorkers:
                 self._sent.start_again(now)
                 raise
 
     def _handle_losses(self) -> None:
         """Handle the lanes that were lost while they were under way."""
-        parts = self._parts
         sent = self._sent
-        parts.lost_lanes.add(parts.hub.coordinator.take_lost())
-        unreported = parts.lost_lanes.unreported
-        under_way = sent.under_way if parts.lost_lanes.unreported else ()
-        for lane in [lane for lane in unreported if lane in under_way and not parts.hub.is_ordered(lane)]:
-            copies = parts.layout.copies(lane)
+        self._lost_lanes.add(self._hub.coordinator.take_lost())
+        unreported = self._lost_lanes.unreported
+        under_way = sent.under_way if unreported else ()
+        for lane in [lane for lane in unreported if lane in under_way and not self._hub.is_ordered(lane)]:
+            copies = self._layout.copies(lane)
             asked = sent.sent[lane].asked
-            match after_loss(sent.sent[lane], parts.autoreset, parts.on_worker_loss):
+            match after_loss(sent.sent[lane], self._autoreset, self._on_worker_loss):
                 case AfterLoss.RAISE:
-                    self._to_raise[lane] = parts.lost_lanes.unreported[lane]
-                    if asked is not Asked.CALL or parts.on_worker_loss == "raise":
-                        parts.lost_lanes.report([lane])  # otherwise, the next step reports it
+                    self._to_raise[lane] = unreported[lane]
+                    if asked is not Asked.CALL or self._on_worker_loss == "raise":
+                        self._lost_lanes.report([lane])  # otherwise, the next step reports it
                     sent.drop(lane)
                 case AfterLoss.RESET_AGAIN:
                     assert isinstance(asked, AskedReset)
                     self._reset_instead(lane, asked, {})
                 case AfterLoss.RESET_NEW_COPIES:
-                    self._warn(lane, parts.lost_lanes.report([lane])[lane])
-                    last = {row: parts.batch.observation_of(row) for row in parts.layout.rows_of(copies)}
-                    self._reset_instead(lane, parts.reset_of_new_copies(lane), last)
+                    self._warn(lane, self._lost_lanes.report([lane])[lane])
+                    last = {row: self._batch.observation_of(row) for row in self._layout.rows_of(copies)}
+                    self._reset_instead(lane, self._reset_of_new_copies(lane), last)
                 case AfterLoss.COME_BACK:
-                    self._warn(lane, parts.lost_lanes.report([lane])[lane])
-                    parts.batch.truncate(lane)
+                    self._warn(lane, self._lost_lanes.report([lane])[lane])
+                    self._batch.truncate(lane)
                     sent.ready_as_lost(lane)
 
     def _raise_losses(self) -> None:
         if self._to_raise:
             lost = self._to_raise
             self._to_raise = {}
-            raise worker_lost(lost, self._parts.layout)
+            raise worker_lost(lost, self._layout)
 
     def _warn(self, lane: int, why: str) -> None:
-        copies = self._parts.layout.copies(lane)
+        copies = self._layout.copies(lane)
         log.warning("%s; its lane %d comes back truncated (copies %d to %d)", why, lane, copies[0], copies[-1])

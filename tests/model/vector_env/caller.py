@@ -20,9 +20,8 @@ from millrace.learner.members.membership import Outgoing
 from millrace.learner.members.worker_processes import WorkerProcesses
 from millrace.learner.vector_env.batch_arrays import BatchArrays
 from millrace.learner.vector_env.batch_layout import BatchLayout
-from millrace.learner.vector_env.lost_lanes import LostLanes
 from millrace.learner.vector_env.order_coordinator import OrderCoordinator, SentOrder
-from millrace.learner.vector_env.send_recv import SendRecv, VectorEnvParts
+from millrace.learner.vector_env.send_recv import SendRecv
 from millrace.learner.vector_env.sent_lanes import Asked, AskedReset, Sent
 from millrace.learner.vector_env.step_hub import StepHub
 from millrace.protocol.errors import NoWorkers, WorkerLost
@@ -57,10 +56,10 @@ class Server:
         return NoWorkers(f"waited {timeout_s} s")
 
 
-class Parts(VectorEnvParts):
-    """The parts of the program, with one seed for all copies that replace lost ones."""
+class OneReplacementSeed(SendRecv):
+    """Gives all copies that replace lost ones the same seed."""
 
-    def replacement_seeds(self, lane: int) -> tuple[int | None, ...]:
+    def _replacement_seeds(self, lane: int) -> tuple[int | None, ...]:
         return (REPLACED,)
 
 
@@ -87,11 +86,9 @@ class Caller:
         self.hub._listen_due_s = float("inf")
         self._take = self.hub.take
         self.hub.take = self._taken  # type: ignore[method-assign]
-        layout, space = BatchLayout(coordinator.spec.lanes), gymnasium.spaces.Box(-1, 1000, (1,), np.float32)
-        batch, copies = BatchArrays(coordinator.spec, layout, space, None), layout.count
-        seeds: list[int | None] = [None] * copies
-        self.parts = Parts(self.hub, layout, batch, LostLanes(), "NextStep", seeds, np.zeros(copies, bool))
-        self.send_recv = SendRecv(self.parts, self.timeout_s)
+        self.layout = BatchLayout(coordinator.spec.lanes)
+        batch = BatchArrays(coordinator.spec, self.layout, gymnasium.spaces.Box(-1, 1000, (1,), np.float32), None)
+        self.send_recv = OneReplacementSeed(self.hub, self.layout, batch, autoreset="NextStep", timeout_s=self.timeout_s)
         self.send_recv._watched = EveryTick()  # type: ignore[assignment]
         self.at = 0
         """index of the call that is made, or made next"""
@@ -118,9 +115,11 @@ class Caller:
             case "reset":
                 self.send_recv.reset(lanes, [self.at] * len(lanes), None)
             case "step":
-                assert self.parts.lost_lanes.awaiting_reset <= self.told, "a step resets a lane whose loss was not reported"
+                assert self.send_recv._lost_lanes.awaiting_reset <= self.told, (
+                    "a step resets a lane whose loss was not reported"
+                )
                 actions = [np.zeros(len(lanes), np.int64)], True
-                self.send_recv.step(lanes, actions, self.parts.layout.rows, together=True)
+                self.send_recv.step(lanes, actions, self.layout.rows, together=True)
             case "call":
                 self.send_recv.call(dict.fromkeys(lanes, make_order("call", 0)))
         self.waits = True
@@ -137,13 +136,13 @@ class Caller:
             if self.send_recv._sent.under_way:
                 return
             ready = self.send_recv.recv_all()
-            self.told |= {self.parts.layout.lane_of(n) for n in ready.losses}
+            self.told |= {self.layout.lane_of(n) for n in ready.losses}
             self.at += 1
         except (NoWorkers, WorkerLost) as error:
             gave_up_reset = isinstance(error, WorkerLost) and self.operations[self.at] == "reset"
             assert not gave_up_reset or self.faults > 1, "a reset is given up after one fault"
-            self.send_recv.abandon(self.parts.layout.lanes)
-            self.told |= self.parts.lost_lanes.awaiting_reset  # by the error
+            self.send_recv.abandon(self.layout.lanes)
+            self.told |= self.send_recv._lost_lanes.awaiting_reset  # by the error
             self.at += isinstance(error, WorkerLost) and self.operations[self.at] == "call"  # others are tried again
         self.waits = False
 
@@ -196,4 +195,4 @@ class Caller:
             return "reset", sent.asked.seeds[0] or 0
         if sent.asked is Asked.CALL:
             return "call", 0
-        return ("reset", REPLACED) if lane in self.parts.lost_lanes.awaiting_reset else ("step", 0)
+        return ("reset", REPLACED) if lane in self.send_recv._lost_lanes.awaiting_reset else ("step", 0)

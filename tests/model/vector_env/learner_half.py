@@ -130,7 +130,7 @@ def _asked(caller: Caller, lane: int, sent: Sent) -> Content:
 
 
 def _caller(caller: Caller) -> Content:
-    sent, reset_lanes, lost_lanes = caller.send_recv._sent, caller.send_recv._reset_lanes, caller.parts.lost_lanes
+    sent, reset_lanes, lost_lanes = caller.send_recv._sent, caller.send_recv._reset_lanes, caller.send_recv._lost_lanes
     return (
         caller.at,
         None if not caller.waits else 0,
@@ -144,7 +144,7 @@ def _caller(caller: Caller) -> Content:
         tuple(sorted(lost_lanes.unreported)),
         tuple(sorted(lost_lanes.awaiting_reset)),
         tuple(sorted(caller.told)),
-        tuple(caller.parts.ever_reset.tolist()),
+        tuple(caller.send_recv._ever_reset.tolist()),
     )
 
 
@@ -173,7 +173,7 @@ def loaded(content: Content, settings: Stepping, now: float) -> Learner:
 def _load_caller(caller: Caller, content: Content, waiting: Sequence[int]) -> None:
     at, waits, under_way, ready, to_raise, copies, unreported, awaiting, told, ever_reset = content
     caller.at, caller.waits, caller.told = at, waits is not None, set(told)
-    sent, lost_lanes = caller.send_recv._sent, caller.parts.lost_lanes
+    sent, lost_lanes = caller.send_recv._sent, caller.send_recv._lost_lanes
     lost_lanes.add(dict.fromkeys(unreported, "lost"))
     lost_lanes.expect_reset(awaiting)
     for lane, kind, seed, is_step, attempts, since_s in under_way:
@@ -187,4 +187,4 @@ def _load_caller(caller: Caller, content: Content, waiting: Sequence[int]) -> No
         caller.send_recv._reset_lanes |= {lane: reset.value} if reset is not None else {}
     caller.send_recv._to_raise = dict.fromkeys(to_raise, "lost")
     caller.copies = {lane: (life.value, state) for lane, life, state in copies}
-    caller.parts.ever_reset[:] = ever_reset
+    caller.send_recv._ever_reset[:] = ever_reset

@@ -41,7 +41,7 @@ MUTATIONS = {
     "a lane is stepped before its loss is reported": Mutation(None, SEND_RECV, "if lane in unreported:", "if False:"),
     "new copies are stepped before they are reset": Mutation(None, SEND_RECV, "if lane in awaiting_reset:", "if False:"),
     "a reset that lost its worker is not sent again": Mutation(
-        None, SEND_RECV, "self._parts.hub.send_order(lane, reset.order())", "pass"
+        None, SEND_RECV, "last_observations)\n        self._hub.send_order(lane, reset.order())", "last_observations)"
     ),
     "a lane comes back before its answer": Mutation(
         None, SENT, "dict.fromkeys(lanes, sent)", 'dict.fromkeys(lanes, sent); self._results |= dict.fromkeys(lanes, b"")'
