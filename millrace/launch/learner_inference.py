@@ -12,6 +12,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from time import monotonic
+from typing import TypeVar
 
 from millrace.launch.crew import Crew
 from millrace.launch.vector import VectorEnvPool, open_vector_env_pool
@@ -30,6 +31,7 @@ from millrace.learner.vector_env.settings import VectorEnvSettings
 from millrace.protocol.alive import StartFailed, WorkerActivity, WorkerExit
 from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.envs.description import DescribedEnv
+from millrace.protocol.errors import NoWorkers
 from millrace.protocol.messages import Status
 from millrace.protocol.policy.policy import Policy, make_policy
 from millrace.protocol.specs import PolicySpec, RunSpec
@@ -43,6 +45,7 @@ from millrace.workers.supervise.supervisor import Supervisor
 from millrace.workers.worker_thread import WorkerThread
 
 NEVER_S = 1e9  # timeout of an order that may take any length of time
+Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
@@ -50,12 +53,6 @@ class ActingSettings:
     """Settings for acting in this process, and for the env copies."""
 
     copies: VectorEnvSettings
-    lanes: int
-    """number of lanes that collect rollouts; their copies come first"""
-    evaluation_copies: int
-    """number of evaluation copies; these come last"""
-    facts: Sequence[str]
-    """names of the facts that are read"""
     workers: int
     """number of workers to wait for before the first step"""
     no_workers_timeout_s: float
@@ -83,9 +80,6 @@ def settings_of_run(config: Config, env: EnvSpec, where: BindSettings, workers: 
     )
     return ActingSettings(
         copies,
-        lanes=config.lanes,
-        evaluation_copies=config.eval_copies,
-        facts=config.info_keys,
         workers=workers,
         no_workers_timeout_s=config.no_workers_timeout_s,
         device=lambda: torch_device(config),
@@ -126,15 +120,14 @@ class SteppingPool:
             finally:
                 self.stop(STOP_BEFORE_RUN_S)
 
-    def begin(self, described: DescribedEnv, *, masked: bool) -> Lobby:
+    def begin(self, described: DescribedEnv) -> Lobby:
         """The lobby in which the thread joins."""
         assert self._before is not None, "start comes first"
         settings = self._settings
         env = self._env = self._stepping.vector_env(described)
-        before_wait = _BeforeWaits(env, settings.workers, settings.no_workers_timeout_s)
-        copies = SplitVectorEnv(env, settings.lanes, before_wait, settings.facts, masked=masked)
-        self._thread = self._acting_thread(copies)
-        processes = _ActingProcesses(self._thread, copies, env, self._stepping.expected)
+        waits = WorkerWaits(env, settings.workers, settings.no_workers_timeout_s)
+        self._thread = self._acting_thread(env, waits)
+        processes = _ActingProcesses(self._thread, waits, env, self._stepping.expected)
         return Lobby(self._own.bound.link, processes, self._before)
 
     def report(self, status: Callable[[float], Status]) -> None:
@@ -150,12 +143,11 @@ class SteppingPool:
         if self._env is not None:
             self._env.close()
 
-    def _acting_thread(self, copies: SplitVectorEnv) -> Supervisor:
-        evaluation_copies = copies.evaluation_lane(self._settings.evaluation_copies)
-
+    def _acting_thread(self, env: ZmqVectorEnv, waits: WorkerWaits) -> Supervisor:
         def actors(run: RunSpec) -> Actors:
+            copies = SplitVectorEnv(env, run, self._stepping.requested.evaluation_copies, waits)
             policy = acting_policy(run.policy, self._settings.device(), run.images_dtype)
-            evaluator = Evaluator(run, policy, lambda run, count, render_mode, pulse: evaluation_copies)
+            evaluator = Evaluator(run, policy, lambda run, count, render_mode, pulse: copies.evaluation_lane())
             return Actors(Collector(run, policy, copies.open_lane, copies), evaluator)
 
         def start(name: str) -> WorkerThread:
@@ -174,17 +166,18 @@ def open_stepping_pool(settings: ActingSettings) -> Iterator[SteppingPool]:
 class _ActingProcesses(WorkerProcesses):
     """The thread that acts, and the workers that step for it."""
 
-    def __init__(self, thread: Supervisor, copies: SplitVectorEnv, env: ZmqVectorEnv, expected: int) -> None:
+    def __init__(self, thread: Supervisor, waits: WorkerWaits, env: ZmqVectorEnv, expected: int) -> None:
         """`expected`: number of workers that were started here to step."""
         self.expected = expected
         self._thread = thread
-        self._copies = copies
+        self._waits = waits
         self._hub = env.hub
         self._failures: list[Failed] = []
         env.hub.on_death = self._failures.append
 
     def ended(self) -> Sequence[WorkerExit | StartFailed]:
-        self._copies.raise_if_no_workers()
+        if (error := self._waits.take_no_workers()) is not None:
+            raise error
         return self._thread.poll()
 
     def activities(self) -> Sequence[WorkerActivity]:
@@ -211,26 +204,40 @@ def acting_policy(spec: PolicySpec, device: str, images: ActingDtype) -> Policy:
     return TorchPolicy(spec, device, together=True, images=images)
 
 
-class _BeforeWaits:
-    """Call this before each wait for `env`, so that the pulse is called during the wait.
+class WorkerWaits:
+    """Makes the calls that may wait for the workers of `env`. It is a `millrace.workers.copies.split_vector_env.PulsedWait`.
 
-    The first wait is for workers to join. Rule: a wait raises `NoWorkers` once there has been no worker for `timeout_s`,
+    The first call waits for workers to join. Rule: a call raises `NoWorkers` once there has been no worker for `timeout_s`,
     however long an order may take.
     """
 
     def __init__(self, env: ZmqVectorEnv, workers: int, timeout_s: float) -> None:
+        """`workers`: number of workers to wait for."""
         self._env = env
         self._workers = workers
         self._timeout_s = timeout_s
-        self._there_s = 0.0  # the last time when there was a worker, or the beginning of the wait
+        self._there_s = 0.0  # the last time when there was a worker, or the beginning of the call
+        self._no_workers: NoWorkers | None = None
 
-    def __call__(self, pulse: Pulse) -> None:
-        """Begin a wait."""
+    def __call__(self, call: Callable[[], Result], pulse: Pulse) -> Result:
+        """Make the call."""
         self._there_s = monotonic()
-        self._env.hub.while_waiting = partial(self._during, pulse)
-        if self._workers:
-            self._env.hub.wait_for(self._workers, self._timeout_s)
-            self._workers = 0
+        hub = self._env.hub
+        hub.while_waiting = partial(self._during, pulse)
+        try:
+            if self._workers:
+                hub.wait_for(self._workers, self._timeout_s)
+                self._workers = 0
+            return call()
+        except NoWorkers as error:
+            self._no_workers = error
+            raise
+
+    def take_no_workers(self) -> NoWorkers | None:
+        """The error if a call ended because no worker was left. Returns it once, to the learner, which ends the run."""
+        error = self._no_workers
+        self._no_workers = None
+        return error
 
     def _during(self, pulse: Pulse) -> None:
         pulse()

@@ -62,7 +62,7 @@ def policy_player(policy: SavedPolicy, which: PlayingWorkers, watch: Callable[[s
         described = None
         if which.inference == "learner":
             described = lobby.describe(Unknown(policy.env.for_evaluation()), check_interrupt)
-            lobby = pool.begin(described, masked=policy.masked)
+            lobby = pool.begin(described)
         stack.callback(pool.stop, STOP_WITHIN_S)
         player = PolicyPlayer(policy, lobby, check_interrupt, watch, which.settings, described)
         reason = "all episodes played"
@@ -96,9 +96,6 @@ def _pool(policy: SavedPolicy, which: PlayingWorkers) -> AbstractContextManager[
     )
     acting = ActingSettings(
         copies,
-        lanes=0,
-        evaluation_copies=which.copies,
-        facts=policy.facts,
         workers=workers or 1,
         no_workers_timeout_s=settings.no_workers_timeout_s,
         device=lambda: "cpu",

@@ -107,7 +107,7 @@ def _train(
         progress = progress_before(None if resume is None else resume.run, config.steps)
         lobby = stack.enter_context(pool.start(crew, lobby_settings(config, progress)))
         known = known_environment(config, env, resume, lobby)
-        lobby = pool.begin(known.described, masked=known.spaces.masked)
+        lobby = pool.begin(known.described)
         interrupts = Interrupts(config.grace_s)
         stack.callback(lambda: pool.stop(interrupts.at_most(STOP_WITHIN_S)))
         folder = folder or stack.enter_context(run_folder(config, None))  # if workers are elsewhere: once one has joined

@@ -60,11 +60,11 @@ class WorkerPool(Protocol):
         """
         ...
 
-    def begin(self, described: DescribedEnv, *, masked: bool) -> Lobby:
+    def begin(self, described: DescribedEnv) -> Lobby:
         """Begin the run. Call it once.
 
         Returns the lobby of the workers that collect rollouts for the run. `described`: the environment, as a worker in the
-        lobby of `start` described it. `masked`: whether action masks are used.
+        lobby of `start` described it.
         """
         ...
 
@@ -104,7 +104,7 @@ class ActingPool:
         finally:
             self.stop(STOP_BEFORE_RUN_S)
 
-    def begin(self, described: DescribedEnv, *, masked: bool) -> Lobby:
+    def begin(self, described: DescribedEnv) -> Lobby:
         """Returns the lobby of `start`, because its workers also collect."""
         assert self.lobby is not None, "start comes first"
         return self.lobby

@@ -18,7 +18,7 @@ import numpy as np
 from millrace.protocol.arrays import Array, Bools
 from millrace.protocol.envs.action_masks import without_mask
 from millrace.protocol.envs.spaces import make_batched, make_flatten
-from millrace.protocol.errors import NoWorkers, WorkerLost
+from millrace.protocol.errors import WorkerLost
 from millrace.protocol.policy.masks import MASK
 from millrace.protocol.specs import RunSpec
 from millrace.workers.copies.env_copies import EnvCopies, Leaves, StepResult
@@ -30,6 +30,17 @@ from millrace.workers.copies.set_attributes import CallsCopies, SetAttributes
 
 RESETS = 3  # how often copies are reset if each reset loses a worker, and with it the attributes that were set
 Result = TypeVar("Result")
+
+
+class PulsedWait(Protocol):
+    """Makes a call that may wait for workers, and calls the pulse meanwhile."""
+
+    def __call__(self, call: Callable[[], Result], pulse: Pulse) -> Result:
+        """Returns what `call` returns."""
+
+
+def _without_pulse(call: Callable[[], Result], pulse: Pulse) -> Result:
+    return call()
 
 
 class StepsLanes(CallsCopies, Protocol):
@@ -60,51 +71,40 @@ class StepsLanes(CallsCopies, Protocol):
 
 
 class SplitVectorEnv:
-    """Lanes with the same number of copies each. Lane 0 has the first copies of the vector environment."""
+    """The lanes of a run, with the same number of copies each. Lane 0 has the first copies of the vector environment."""
 
-    def __init__(
-        self,
-        env: StepsLanes,
-        lanes: int,
-        before_wait: Callable[[Pulse], None] = lambda pulse: None,
-        facts: Sequence[str] = (),
-        *,
-        masked: bool = False,
-    ) -> None:
-        """`env` may have more lanes than `lanes`, for evaluation.
+    def __init__(self, env: StepsLanes, run: RunSpec, evaluation_copies: int = 0, wait: PulsedWait = _without_pulse) -> None:
+        """`evaluation_copies` is how many of the copies are for evaluation; these come last, and may be all.
 
-        `before_wait` is called before each wait for the vector environment, with the `pulse` to call during the wait.
-        `facts` are the names of the numbers in `info` that describe an episode. If `masked`, read masks of the allowed
-        actions.
+        `wait` makes each call that may wait for the vector environment.
         """
         env.merge_infos = False  # in merged infos, all copies would have the same dtype and shape
         self.env = env
-        self.in_parts = min(lanes, 2)
+        self._count = run.copies  # number of copies per lane
+        self._evaluation_copies = evaluation_copies
+        self._lanes = (env.num_envs - evaluation_copies) // run.copies  # lanes that collect rollouts
+        self.in_parts = min(self._lanes, 2)
         """number of parts in which the lanes are stepped"""
-        self.facts = facts
+        self._facts = run.info_keys
         observation = env.single_observation_space
         action = env.single_action_space
-        self._masks = MaskReader(observation, action) if masked else None
-        self.observation_space = without_mask(observation, action) if masked else observation
+        self._masks = MaskReader(observation, action) if run.masked else None
+        self.observation_space = without_mask(observation, action) if run.masked else observation
         """observation space of one copy"""
-        self._lanes = lanes
-        self._count = 0  # number of copies per lane, set when the first lane is opened
-        self._before_wait = before_wait
+        self._wait = wait
         self._actions: Array | None = None  # [num_envs, *action]
         self._read = make_flatten(self.observation_space)
         self._batched = make_batched(action)
         self._result: StepResult | None = None
-        self._no_workers: NoWorkers | None = None
         self._attributes = SetAttributes(env)
 
     def open_lane(self, run: RunSpec, lane: int, pulse: Pulse) -> EnvCopies:
         """The copies of this lane. Pass this method to a `Collector` as its `open_copies`."""
-        self._count = run.copies
-        return SplitLane(self, lane * run.copies, run.copies)
+        return SplitLane(self, lane * self._count, self._count)
 
-    def evaluation_lane(self, count: int) -> SplitLane:
-        """The last copies, for evaluation. Each of them is a lane of one copy, after the other lanes."""
-        return SplitLane(self, self.env.num_envs - count, count)
+    def evaluation_lane(self) -> SplitLane:
+        """The evaluation copies. Each of them is a lane of one copy, after the other lanes."""
+        return SplitLane(self, self.env.num_envs - self._evaluation_copies, self._evaluation_copies)
 
     def parts(self, lanes: int) -> Sequence[slice]:
         """Divide the lanes into parts of consecutive lanes, as equal as possible. No part is empty."""
@@ -171,10 +171,10 @@ class SplitVectorEnv:
             lost = np.zeros(count, bool)
             lost[lost_rows] = True
         facts: Facts = {}
-        if self.facts:
+        if self._facts:
             ended = np.zeros(count, bool)
             ended[copies] = terminated[copies] | truncated[copies]
-            facts = {n: facts_of_info(self.facts, infos.get(n, {}), n) for n in np.flatnonzero(ended).tolist()}
+            facts = {n: facts_of_info(self._facts, infos.get(n, {}), n) for n in np.flatnonzero(ended).tolist()}
         leaves: Leaves = self._read(observation)
         if self._masks is not None:
             waits = np.ones(count, bool)  # copies that were not stepped have no new mask
@@ -247,21 +247,6 @@ class SplitVectorEnv:
         for key in self._attributes.lacking(chosen):
             with suppress(WorkerLost):
                 self._wait(partial(self._attributes.set, key), pulse)
-
-    def raise_if_no_workers(self) -> None:
-        """Raise `NoWorkers` once, if a wait ended because no worker was left."""
-        if (error := self._no_workers) is not None:
-            self._no_workers = None
-            raise error
-
-    def _wait(self, call: Callable[[], Result], pulse: Pulse) -> Result:
-        """Make a call that may wait for workers."""
-        try:
-            self._before_wait(pulse)
-            return call()
-        except NoWorkers as error:
-            self._no_workers = error
-            raise
 
 
 class SplitLane:

@@ -9,6 +9,7 @@ from typing import Any
 
 from gymnasium.vector import SyncVectorEnv
 
+from millrace.protocol.specs import RunSpec
 from millrace.workers.copies.split_vector_env import SplitVectorEnv
 
 
@@ -48,8 +49,8 @@ class InfosByRow(SyncVectorEnv[Any, Any]):
         pass
 
 
-def split_in_one_part(env: InfosByRow, lanes: int, facts: Sequence[str] = (), *, masked: bool = False) -> SplitVectorEnv:
-    """Lanes of this vector environment, which can step them only together."""
-    split = SplitVectorEnv(env, lanes, facts=facts, masked=masked)
+def split_in_one_part(env: InfosByRow, run: RunSpec) -> SplitVectorEnv:
+    """The run's lanes in this vector environment, which can step them only together."""
+    split = SplitVectorEnv(env, run)
     split.in_parts = 1
     return split

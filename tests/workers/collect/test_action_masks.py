@@ -49,7 +49,7 @@ def vectorized(run: RunSpec, lane: int, pulse: Any) -> VectorCopies:
 def split(run: RunSpec, lanes: int) -> tuple[SplitVectorEnv, Collector]:
     vector = InfosByRow([run.env.make] * run.copies * lanes)
     vector.reset()  # it cannot reset some copies before all of them
-    env = split_in_one_part(vector, lanes, masked=True)
+    env = split_in_one_part(vector, run)
     return env, Collector(run, random_policy(run.policy), env.open_lane, env)
 
 
@@ -165,7 +165,7 @@ def test_a_wrong_mask_of_a_split_vector_environment_is_of_a_copy_of_its_lane() -
     run = masked_run("InInfo", N=2)
     vector = InfosByRow([InInfo, InInfo, InInfo, NoChoice])
     vector.reset()
-    env = split_in_one_part(vector, 2, masked=True)
+    env = split_in_one_part(vector, run)
     with pytest.raises(EnvironmentFailed, match="lane 1, copy 1, first reset: action_mask: expected"):
         collect(Collector(run, random_policy(run.policy), env.open_lane, env), run, lanes=range(2))
 
@@ -173,9 +173,9 @@ def test_a_wrong_mask_of_a_split_vector_environment_is_of_a_copy_of_its_lane() -
 def test_a_wrong_mask_of_the_evaluation_copies_of_a_vector_environment_is_of_a_copy_of_these() -> None:
     vector = InfosByRow([NoChoice] * 4)
     vector.reset()
-    split = SplitVectorEnv(vector, 2, masked=True)
+    split = SplitVectorEnv(vector, masked_run("InInfo", N=1), evaluation_copies=2)
     with pytest.raises(CopyFailed) as caught:
-        split.evaluation_lane(2).step(np.array([0]), no_pulse, [1])
+        split.evaluation_lane().step(np.array([0]), no_pulse, [1])
     assert caught.value.copy == 1
 
 

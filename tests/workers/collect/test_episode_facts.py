@@ -87,7 +87,7 @@ def test_a_vector_environment_gives_the_facts_of_the_loop() -> None:
 def test_a_split_vector_environment_gives_the_facts_of_the_loop() -> None:
     env = InfosByRow([RUN.env.make] * 6)
     env.reset()
-    split = split_in_one_part(env, 2, NAMES)
+    split = split_in_one_part(env, RUN)
     collector = Collector(RUN, random_policy(RUN.policy), split.open_lane, split)
     for one, other in zip(
         collect(collector, RUN, lanes=range(2)), collect(random_collector(RUN), RUN, lanes=range(2)), strict=True
@@ -101,7 +101,7 @@ def test_facts_of_a_vector_environment_do_not_depend_on_the_infos_of_other_copie
     run = msgspec.structs.replace(run_of(name, T=20), facts=("score",))
     expected = [facts(rollout) for rollout in collect(random_collector(run), run, lanes=range(2))]
     with any_order(VectorEnvSettings(name, 4, lanes=2), 2, shared=True) as (env, _):
-        split = SplitVectorEnv(env, 2, facts=run.facts)
+        split = SplitVectorEnv(env, run)
         collector = Collector(run, random_policy(run.policy), split.open_lane, split)
         assert [facts(rollout) for rollout in collect(collector, run, lanes=range(2))] == expected
     assert expected[0][0] == (3.75,), "not rounded to the dtype of the 0 in other infos"

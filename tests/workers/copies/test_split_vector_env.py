@@ -43,7 +43,7 @@ RUNS = {
 def split_collector(run: RunSpec) -> Iterator[Collector]:
     env = InfosByRow([run.env.make] * (LANES * run.copies))
     env.reset()  # SyncVectorEnv, unlike ZmqVectorEnv, takes a mask only after a first reset
-    split = split_in_one_part(env, LANES)
+    split = split_in_one_part(env, run)
     yield Collector(run, random_policy(run.policy), split.open_lane, split)
     env.close()
 
@@ -81,24 +81,6 @@ def test_lanes_are_collected_in_any_order_but_only_all_together() -> None:
             collect(split, run, 1, lanes=(0, 2))
 
 
-class WithoutWorkers(InfosByRow):
-    def step(self, actions: Any) -> Any:
-        raise NoWorkers("waited 1 s for 1 worker")
-
-
-def test_that_no_worker_is_left_is_raised_once_to_whoever_asks() -> None:
-    run = RUNS["discrete"]
-    env = WithoutWorkers([run.env.make] * (LANES * run.copies))
-    env.reset()
-    split = split_in_one_part(env, LANES)
-    with pytest.raises(NoWorkers):
-        collect(Collector(run, random_policy(run.policy), split.open_lane, split), run, lanes=range(LANES))
-    with pytest.raises(NoWorkers, match=r"^waited 1 s for 1 worker$"):
-        split.raise_if_no_workers()
-    split.raise_if_no_workers()
-    env.close()
-
-
 class LosesTwoCopies(InfosByRow):
     """Loses the first two copies in its step number `at`, as a vector environment over worker processes would."""
 
@@ -125,7 +107,7 @@ def test_a_lost_step_is_in_no_valid_row(at: int) -> None:
     run = run_of(f"{TOY}Countdown-v0", T=3)
     env = LosesTwoCopies([run.env.make] * (LANES * run.copies), at)
     env.reset()
-    split = split_in_one_part(env, LANES)
+    split = split_in_one_part(env, run)
     collector = Collector(run, random_policy(run.policy), split.open_lane, split)
     by_lane = zip(*(collect(collector, run, k, lanes=range(LANES)) for k in range(4)), strict=True)
     assembler = EpisodeAssembler(lambda actions: (actions,))
@@ -233,7 +215,7 @@ def test_a_dropped_rollout_abandons_the_steps_under_way() -> None:
 
     env = Abandons([run.env.make] * (LANES * run.copies))
     env.reset()
-    split = SplitVectorEnv(env, LANES)
+    split = SplitVectorEnv(env, run)
     with pytest.raises(NoWorkers):
         collect(Collector(run, random_policy(run.policy), split.open_lane, split), run, lanes=range(LANES))
     assert abandoned
@@ -245,7 +227,7 @@ def test_replacements_of_lost_copies_get_the_attributes_when_their_part_is_stepp
     """A part may still step when copies of another part are lost."""
     run = run_of(f"{TOY}Informs-v0", N=1)
     with any_order(VectorEnvSettings(f"{TOY}Informs-v0", LANES, lanes=LANES), LANES, shared=shared) as (env, link):
-        split = SplitVectorEnv(env, LANES)
+        split = SplitVectorEnv(env, run)
         for n in range(LANES):
             lane = split.open_lane(run, n, no_pulse)
             lane.reset([n], no_pulse)
@@ -291,7 +273,7 @@ def test_copies_that_replace_lost_ones_in_a_reset_get_the_attributes_before_it(l
     name = f"{__name__}:LeveledLane-v0"
     run = run_of(name, N=2)
     with any_order(VectorEnvSettings(name, 2 * LANES, lanes=LANES), LANES, shared=shared) as (env, link):
-        split = SplitVectorEnv(env, LANES)
+        split = SplitVectorEnv(env, run)
         lanes = [split.open_lane(run, n, no_pulse) for n in range(LANES)]
         for lane in lanes:
             lane.assign("level", pack(5), no_pulse)
@@ -318,8 +300,9 @@ def test_copies_that_replace_lost_ones_in_a_reset_get_the_attributes_before_it(l
 def test_no_episode_begins_in_copies_without_their_attributes(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each of the three resets loses a worker, after the attributes were set."""
     name = f"{__name__}:LeveledLane-v0"
+    run = run_of(name, N=2)
     with any_order(VectorEnvSettings(name, 2, lanes=1), 4, shared=False) as (env, link):
-        lane = SplitVectorEnv(env, 1).open_lane(run_of(name, N=2), 0, no_pulse)
+        lane = SplitVectorEnv(env, run).open_lane(run, 0, no_pulse)
         lane.assign("level", pack(5), no_pulse)
         reset = env.reset
 
