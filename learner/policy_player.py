@@ -115,7 +115,7 @@ class PolicyPlayer:
     @property
     def workers(self) -> int:
         """The number of workers that are connected, once `play` has been called."""
-        return 0 if self._hub is None else len(self._hub.snapshot().roles)
+        return 0 if self._hub is None else len(self._hub.coordinator.members)
 
     def describe(self, render_mode: str | None = None) -> DescribedEnv:
         """Have a worker describe the environment that evaluations use. Call this before the first `play`.

@@ -377,7 +377,7 @@ class RolloutService:
         16
         """
         with self._lock:
-            return self._hub.snapshot().ledger.counts()
+            return self._hub.coordinator.rollouts.ledger.counts()
 
     def lags(self) -> dict[str, int]:
         """Number of rollouts in the batches so far, by their lag: the age of their weights, in versions.
@@ -401,7 +401,7 @@ class RolloutService:
         ['w0']
         """
         with self._lock:
-            return sorted(self._hub.snapshot().roles)
+            return sorted({member.hello.worker for member in self._hub.coordinator.members.values()})
 
     def close(self, reason: str = "the learner has ended") -> None:
         """Ask the workers to leave, and release all resources. A second call does nothing. `reason`: sent to the workers.

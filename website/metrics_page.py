@@ -10,7 +10,6 @@ from benchmarks.markdown_tables import table
 from millrace.extras.monitoring.metric_names import METRICS, label
 from millrace.extras.monitoring.prometheus import MetricsCollector, Observed
 from millrace.learner.config.config import Config
-from millrace.learner.rollouts.hub import HubSnapshot
 from millrace.learner.rollouts.ledger import Ledger
 from millrace.learner.run_folder.progress import Progress
 from millrace.learner.run_folder.results import FactMean
@@ -27,7 +26,7 @@ In a name, NAME stands for a name that you chose.
 
 """
 EVERY_NUMBER = Progress(return_mean=1.0, length_mean=1.0, facts={"NAME": FactMean(mean=1.0, missing=0)})
-SAMPLE = Observed(1.0, HubSnapshot(Ledger(), incarnations=[], lags=[], progress=EVERY_NUMBER))
+SAMPLE = Observed(1.0, EVERY_NUMBER, Ledger().counts())
 """A hub in which every metric has a value."""
 PROMETHEUS = """## Prometheus
 

@@ -17,7 +17,6 @@ import msgspec
 from millrace.learner.between_updates.run_files import RunFiles
 from millrace.learner.between_updates.run_parts import RunParts
 from millrace.learner.callbacks.callbacks import Callbacks
-from millrace.learner.rollouts.hub import HubSnapshot
 from millrace.learner.rollouts.rollout_dealer import AcceptedRollout
 from millrace.learner.run_folder.callback_requests import Requests
 from millrace.learner.run_folder.progress import Progress, Row, named, steps_per_second
@@ -68,8 +67,7 @@ class Audience:
         if now - self._shown_s >= SHOW_EVERY_S:
             self._shown_s = now
             self._workers_alive = self._hub.workers_alive()
-            snapshot = self._hub.snapshot()
-            progress = self._progress(snapshot, snapshot.collected)
+            progress = self.progress(self._hub.coordinator.collected())
             self._hub.report_progress(progress)
             self._callbacks.meanwhile(progress)
 
@@ -92,9 +90,8 @@ class Audience:
         """Report the last update that was counted and published."""
         self._say_missing_facts()
         self._workers_alive = self._hub.workers_alive()
-        snapshot = self._hub.snapshot()
-        self._update = {"metrics": named(metrics), "lags": tuple(snapshot.lags)}
-        progress = self._progress(snapshot)
+        self._update = {"metrics": named(metrics), "lags": tuple(self._hub.lags)}
+        progress = self.progress()
         self._write_row(progress, metrics)
         try:
             self._callbacks.on_update(progress)
@@ -140,18 +137,14 @@ class Audience:
         """The attributes that callbacks have set on env copies, to be sent with the newest weights."""
         return self._requests.attributes.table(self._state.version)
 
-    def progress(self) -> Progress:
-        """The run's progress."""
-        return self._progress(self._hub.snapshot())
-
-    # ---------------------------------------------------------------- inside
-
-    def _progress(self, snapshot: HubSnapshot, collected: int = 0) -> Progress:
-        """The progress at this snapshot. `collected` is the number of env steps already collected for the next update."""
+    def progress(self, collected: int = 0) -> Progress:
+        """The run's progress now. `collected` is the number of env steps already collected for the next update."""
         state = self._state
         tally = self._tally
-        wall_s = self._tally.wall_s(snapshot)
-        lags = snapshot.lags or [0]
+        hub = self._hub
+        times = hub.stage_times()
+        wall_s = tally.wall_s(times)
+        lags = hub.lags or [0]
         return Progress(
             at_s=time.time(),
             run=self._files.path,
@@ -167,11 +160,11 @@ class Audience:
             lag_mean=sum(lags) / len(lags),
             lag_max=max(lags),
             workers_alive=self._workers_alive,
-            workers_expected=self._hub.workers_expected,
-            ledger=snapshot.ledger.counts(),
-            stages=tally.stages(snapshot),
+            workers_expected=hub.workers_expected,
+            ledger=hub.coordinator.rollouts.ledger.counts(),
+            stages=tally.stages(times),
             note=tally.note,
-            waiting=snapshot.waiting,
+            waiting=hub.waiting(times.at_s),
             settings=self._settings,
             episodes=tally.new_episodes,
             evaluation=state.newest_evaluation,
@@ -181,6 +174,8 @@ class Audience:
             requests=self._requests,
             **self._update,
         )
+
+    # ---------------------------------------------------------------- inside
 
     def _write_row(self, progress: Progress, metrics: Row) -> None:
         self._files.write_row(progress, metrics)

@@ -188,12 +188,12 @@ class RunFiles:
         self._folder.writes.write("metrics", self._metrics.sync)  # a resumed run doesn't write these rows again
         spec = self._spec
         env_steps = self._state.env_steps
-        snapshot = self._hub.snapshot()
+        times = self._hub.stage_times()
         content = SavedRun(
             state=self._state,
             rollouts=self._hub.past(),
-            wall_s=self._tally.wall_s(snapshot),
-            stages=self._tally.stages(snapshot),
+            wall_s=self._tally.wall_s(times),
+            stages=self._tally.stages(times),
             episodes=self._tally.window.state(),
             facts=list(spec.facts),
             env_attributes=self._attributes.state(self._state.version),
@@ -217,8 +217,8 @@ class RunFiles:
         config = self._config
         state = self._state
         tally = self._tally
-        snapshot = self._hub.snapshot()
-        wall_s = tally.wall_s(snapshot)
+        times = self._hub.stage_times()
+        wall_s = tally.wall_s(times)
         return Summary(
             env=config.env,
             algo=config.algo,
@@ -234,9 +234,9 @@ class RunFiles:
             evaluation=self._evaluations.to_report(),
             ended_by=self._evaluations.ended_by,
             best=self._evaluations.confirmed,
-            ledger=snapshot.ledger.counts(),
+            ledger=self._hub.coordinator.rollouts.ledger.counts(),
             lags=self._hub.lag_statistics.histogram(),
             first_use_s=self._hub.lag_statistics.first_use_s(),
-            stages=tally.stages(snapshot),
+            stages=tally.stages(times),
             versions=versions(),
         )

@@ -12,7 +12,7 @@ from collections.abc import Callable
 
 from millrace.learner.between_updates.stop_rules import reason_to_stop, target_reached
 from millrace.learner.config.config import Config
-from millrace.learner.rollouts.hub import HubSnapshot
+from millrace.learner.rollouts.hub import StageTimes
 from millrace.learner.rollouts.opponent_pool import OpponentPool
 from millrace.learner.run_folder.episode_window import EpisodeWindow
 from millrace.learner.run_folder.results import DecidingReturns
@@ -116,21 +116,21 @@ class Tally:
         """
         self._update_s += seconds - self.gathered_s
 
-    def stages(self, snapshot: HubSnapshot) -> dict[str, float]:
+    def stages(self, times: StageTimes) -> dict[str, float]:
         """Seconds in each stage of the learner, and in each stage of all workers together, as of their last heartbeats.
 
         These seconds include the time before the run was resumed.
         """
-        other_s = snapshot.learn_s - self._update_s
-        since = {"learner_wait": snapshot.wait_s, "learner_update": self._update_s, "learner_other": other_s}
-        since |= {"learner_evaluate": snapshot.evaluate_s} if snapshot.evaluate_s else {}
-        since |= {f"worker_{name}": seconds for name, seconds in snapshot.worker_stages.items()}
+        other_s = times.learn_s - self._update_s
+        since = {"learner_wait": times.wait_s, "learner_update": self._update_s, "learner_other": other_s}
+        since |= {"learner_evaluate": times.evaluate_s} if times.evaluate_s else {}
+        since |= {f"worker_{name}": seconds for name, seconds in times.worker_stages.items()}
         before = self._stages_before
         return {name: before.get(name, 0.0) + since.get(name, 0.0) for name in since | before}
 
-    def wall_s(self, snapshot: HubSnapshot) -> float:
+    def wall_s(self, times: StageTimes) -> float:
         """Seconds of training so far, without evaluations but including the time before the run was resumed."""
-        return self.wall_before_s + snapshot.taken_s - self._started_s - snapshot.evaluate_s
+        return self.wall_before_s + times.at_s - self._started_s - times.evaluate_s
 
     # ---------------------------------------------------------------- inside
 

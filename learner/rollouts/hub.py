@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple, TypeVar
 
@@ -24,7 +24,6 @@ from millrace.learner.members.membership import Membership
 from millrace.learner.members.worker_processes import WorkerProcesses
 from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan, OnRows, PlayedEpisode
 from millrace.learner.rollouts.lag_statistics import LagStatistics
-from millrace.learner.rollouts.ledger import Ledger
 from millrace.learner.rollouts.past_rollouts import PastRollouts
 from millrace.learner.rollouts.rollout_dealer import AcceptedRollout
 from millrace.learner.rollouts.run_status import progress_now, status
@@ -65,45 +64,19 @@ class HubSettings:
     """The dtype in which parameters are sent."""
 
 
-class HubSnapshot(NamedTuple):
-    """The state of the hub at one moment, for metrics and checkpoints. It is cheap to make, and never changes afterwards."""
+class StageTimes(NamedTuple):
+    """How the learner and its workers have spent their time since this learner started, at one moment."""
 
-    ledger: Ledger
-    """A copy of the hub's ledger."""
-    incarnations: list[int]
-    """The next incarnation of each lane."""
-    lags: list[int]
-    """The lag of each rollout that the last `gather` returned."""
-    taken_s: float = 0.0
-    """Time of the snapshot, by the hub's clock."""
-    progress: Progress = Progress()
-    """The progress that was last reported."""
-    version: int = -1
-    """Version of the newest weights; -1 before the first."""
-    collected: int = 0
-    """Env steps already made for the next update, as workers report them."""
-    lag_counts: Mapping[int, int] = {}
-    """Number of rollouts used since this learner started, by lag."""
+    at_s: float = 0.0
+    """The moment, by the hub's clock."""
     wait_s: float = 0.0
-    """Seconds spent waiting for rollouts since this learner started."""
+    """Seconds spent waiting for rollouts."""
     evaluate_s: float = 0.0
-    """Seconds spent in evaluations since this learner started."""
+    """Seconds spent in evaluations."""
     learn_s: float = 0.0
     """Seconds spent on anything but these waits and evaluations, since the learner first waited for rollouts."""
-    waiting: str = ""
-    """A human-readable line that says who waits for whom; empty if nobody has waited for long."""
-    roles: Mapping[str, str] = {}
-    """The `Member.role` of each worker, by its name."""
     worker_stages: Stages = {}
-    """Total seconds of all workers in each stage since this learner started, including workers that have left."""
-    received: tuple[int, int] = (0, 0)
-    """Number of messages received, and their total bytes."""
-    sent: tuple[int, int] = (0, 0)
-    """Number of messages sent, and their total bytes."""
-    refused_messages: int = 0
-    """Number of messages that were refused because their sender's key was revoked."""
-    refused_handshakes: int = 0
-    """Number of handshakes that failed."""
+    """Total seconds of all workers in each stage, including workers that have left."""
 
 
 HubObserver = Callable[["Hub"], None]
@@ -132,9 +105,11 @@ class Hub:
         self._check_interrupt = check_interrupt
         self._observer = observer
         self._clock = clock
-        self._lags: list[int] = []  # the lag of each rollout of the last `gather`
+        self.lags: list[int] = []
+        """the lag of each rollout that the last `gather` returned"""
         self.lag_statistics = LagStatistics()
-        self._progress = Progress()
+        self.reported = Progress()
+        """the progress that was last reported"""
         run = coordinator.run
         self._failures = FailureCount(settings.max_env_failures, run.lanes * run.copies, clock())
         self._stall_watch = StallWatch(coordinator, settings.stall_timeout_s, run.call_timeouts)
@@ -226,14 +201,14 @@ class Hub:
         self._time.turn("gathering", began_s)
         self._server.send(self.coordinator.begin_update())
         taken = self._wait(rollouts.take, rollouts.waiting, watch_and_log, "no rollout came")
-        self._lags = [self.coordinator.version - arrived.rollout.version for arrived in taken]
-        self.lag_statistics.used(self._lags)
+        self.lags = [self.coordinator.version - arrived.rollout.version for arrived in taken]
+        self.lag_statistics.used(self.lags)
         return taken
 
     def not_used(self, taken: list[AcceptedRollout]) -> None:
         """Put back the rollouts that `gather` returned last, because their update was undone."""
         self.coordinator.rollouts.not_used(taken)
-        self.lag_statistics.not_used(self._lags)
+        self.lag_statistics.not_used(self.lags)
 
     def begin_evaluation(self, plan: EvaluationPlan, on_rows: OnRows | None = None, *, beside: bool = False) -> None:
         """Let the workers play these episodes with the newest weights.
@@ -307,11 +282,11 @@ class Hub:
 
     def report_progress(self, progress: Progress) -> None:
         """Store the run's progress, for answers to status requests."""
-        self._progress = progress
+        self.reported = progress
 
     def progress(self) -> RunProgress:
         """How far the run has got: the progress that was last reported, updated with what the hub knows now."""
-        return progress_now(self.coordinator, self._progress, self.waiting(self._clock()), self._time.phase)
+        return progress_now(self.coordinator, self.reported, self.waiting(self._clock()), self._time.phase)
 
     def status(self, now: float) -> Status:
         """The answer to `millrace status`."""
@@ -327,31 +302,16 @@ class Hub:
         stepping = self._processes.stepping()
         return len(self.coordinator.members if stepping is None else stepping)
 
-    def snapshot(self) -> HubSnapshot:
-        """A snapshot of the current state."""
-        link = self.link
-        coordinator = self.coordinator
+    def stage_times(self) -> StageTimes:
+        """How the learner and its workers have spent their time until now."""
         now = self._clock()
         spent_s = self._time.until(now)
-        return HubSnapshot(
-            ledger=coordinator.rollouts.ledger.copy(),
-            incarnations=coordinator.rollouts.incarnations(),
-            lags=self._lags,
-            taken_s=now,
-            progress=self._progress,
-            version=coordinator.version,
-            collected=coordinator.collected(),
-            lag_counts=dict(self.lag_statistics.lags),
+        return StageTimes(
+            at_s=now,
             wait_s=spent_s["gathering"],
             evaluate_s=spent_s["evaluating"],
             learn_s=spent_s["learning"],
-            waiting=self.waiting(now),
-            roles={member.hello.worker: member.role for member in coordinator.members.values()},
-            worker_stages=coordinator.membership.stages(),
-            received=(link.received.messages, link.received.bytes),
-            sent=(link.sent.messages, link.sent.bytes),
-            refused_messages=link.refused_messages,
-            refused_handshakes=link.refused,
+            worker_stages=self.coordinator.membership.stages(),
         )
 
     # ---------------------------------------------------------------- called by the server

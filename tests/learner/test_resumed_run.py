@@ -18,7 +18,7 @@ from millrace.learner.config.config import Config
 from millrace.learner.config.hyperparameters import PPOConfig
 from millrace.learner.config.layers import resolve
 from millrace.learner.resume_checks import unless_finished
-from millrace.learner.rollouts.hub import HubSnapshot
+from millrace.learner.rollouts.hub import StageTimes
 from millrace.learner.rollouts.ledger import Ledger
 from millrace.learner.rollouts.opponent_pool import PoolState, Snapshot
 from millrace.learner.rollouts.past_rollouts import PastRollouts
@@ -46,10 +46,8 @@ def test_the_seconds_of_stages_go_on_after_a_resume() -> None:
     saved = SavedRun(stages={"learner_wait": 10.0, "learner_evaluate": 4.0, "worker_step": 7.0})
     tally = Tally(resolve("CartPole-v1"), fake_run_spec(), saved)
     tally.updated(1.5)
-    snapshot = HubSnapshot(
-        Ledger(), incarnations=[], lags=[], wait_s=2.0, learn_s=3.5, worker_stages={"step": 1.0, "act": 0.5}
-    )
-    assert tally.stages(snapshot) == {
+    times = StageTimes(wait_s=2.0, learn_s=3.5, worker_stages={"step": 1.0, "act": 0.5})
+    assert tally.stages(times) == {
         "learner_wait": 12.0,
         "learner_update": 1.5,
         "learner_other": 2.0,

@@ -35,7 +35,7 @@ from prometheus_client.registry import Collector
 
 from millrace import Progress
 from millrace.learner.config.config import Config
-from millrace.learner.rollouts.hub import Hub, HubSnapshot
+from millrace.learner.rollouts.hub import Hub
 from millrace.learner.run_folder.results import FactMean
 from millrace.learner.run_folder.run_format import versions
 from millrace.protocol.address import WILDCARDS, is_local
@@ -55,11 +55,46 @@ STATES = ("active", "spare", "evaluating", "draining")
 
 
 class Observed(NamedTuple):
-    """A snapshot of the hub, and its time."""
+    """A snapshot of the hub. It never changes afterwards."""
 
     at_s: float
-    """seconds since 1970"""
-    hub: HubSnapshot
+    """its time, in seconds since 1970"""
+    progress: Progress
+    """the progress that was last reported"""
+    ledger: Mapping[str, int]
+    """all counts of the hub's ledger"""
+    version: int = -1
+    """version of the newest weights; -1 before the first"""
+    roles: Mapping[str, int] = {}
+    """number of workers by their `Member.role`"""
+    lags: Mapping[int, int] = {}
+    """number of rollouts used since this learner started, by lag"""
+    received: tuple[int, int] = (0, 0)
+    """number of messages received, and their total bytes"""
+    sent: tuple[int, int] = (0, 0)
+    """number of messages sent, and their total bytes"""
+    refused_messages: int = 0
+    """number of messages that were refused because their sender's key was revoked"""
+    refused_handshakes: int = 0
+    """number of handshakes that failed"""
+
+    @classmethod
+    def of(cls, hub: Hub, at_s: float) -> Observed:
+        """A snapshot taken now."""
+        link = hub.link
+        coordinator = hub.coordinator
+        return cls(
+            at_s=at_s,
+            progress=hub.reported,
+            ledger=coordinator.rollouts.ledger.counts(),
+            version=coordinator.version,
+            roles=Counter(member.role for member in coordinator.members.values()),
+            lags=dict(hub.lag_statistics.lags),
+            received=(link.received.messages, link.received.bytes),
+            sent=(link.sent.messages, link.sent.bytes),
+            refused_messages=link.refused_messages,
+            refused_handshakes=link.refused,
+        )
 
 
 class MetricsCollector(Collector):
@@ -69,9 +104,7 @@ class MetricsCollector(Collector):
         """`clock`: seconds since 1970. `observed`: the snapshot to show before the first call to `observe`."""
         self._clock = clock
         self._observed = observed
-        self._before: HubSnapshot | None = (
-            None  # the first snapshot: what the run had counted before this learner resumed it
-        )
+        self._before: Observed | None = None  # the first snapshot: what the run had counted before this learner resumed it
         self._about = {"env": config.env, "algo": config.algo, "seed": str(config.seed)}
         self._wanted = config.lanes
 
@@ -80,10 +113,10 @@ class MetricsCollector(Collector):
         now = self._clock()
         if self._observed is not None and 0.0 <= now - self._observed.at_s < EVERY_S:
             return
-        snapshot = hub.snapshot()
+        observed = Observed.of(hub, now)
         if self._before is None:
-            self._before = snapshot
-        self._observed = Observed(now, snapshot)
+            self._before = observed
+        self._observed = observed
 
     def describe(self) -> Iterator[Metric]:
         """Describe nothing in advance, because otherwise the registry would collect metrics at registration."""
@@ -96,16 +129,14 @@ class MetricsCollector(Collector):
         # Reported even before the first worker has joined, because an autoscaler may need this number to start one.
         wanted = "Workers with which each lane has its own: the number to scale to."
         yield GaugeMetricFamily("millrace_workers_wanted", wanted, self._wanted)
-        if (observed := self._observed) is not None:
-            at_s, hub = observed
-            yield GaugeMetricFamily("millrace_loop_timestamp_seconds", "When the learner's loop last listened.", at_s)
-            before = self._before or hub
-            counts = hub.ledger.counts()
-            counted = _since(before.ledger.counts(), counts)
-            yield from _of_progress(hub, before.progress)
-            yield from _of_ledger(counts, counted)
-            yield from _of_workers(hub)
-            yield from _of_link(hub, counted)
+        if (now := self._observed) is not None:
+            yield GaugeMetricFamily("millrace_loop_timestamp_seconds", "When the learner's loop last listened.", now.at_s)
+            before = self._before or now
+            counted = _since(before.ledger, now.ledger)
+            yield from _of_progress(now, before.progress)
+            yield from _of_ledger(now.ledger, counted)
+            yield from _of_workers(now)
+            yield from _of_link(now, counted)
 
 
 def _since(before: Mapping[str, float], now: Mapping[str, float]) -> dict[str, float]:
@@ -113,8 +144,8 @@ def _since(before: Mapping[str, float], now: Mapping[str, float]) -> dict[str, f
     return {name: max(0.0, number - before.get(name, 0.0)) for name, number in now.items()}
 
 
-def _of_progress(hub: HubSnapshot, before: Progress) -> Iterator[Metric]:
-    done = hub.progress
+def _of_progress(now: Observed, before: Progress) -> Iterator[Metric]:
+    done = now.progress
     stage_s = _since(before.stages, done.stages)
     steps = done.env_steps - before.env_steps
     yield CounterMetricFamily("millrace_env_steps", "Env steps that updates of this learner have used.", steps)
@@ -123,7 +154,7 @@ def _of_progress(hub: HubSnapshot, before: Progress) -> Iterator[Metric]:
     )
     yield GaugeMetricFamily("millrace_target_env_steps", "Env steps to train for.", done.total_steps)
     yield GaugeMetricFamily("millrace_env_steps_per_second", "Mean since this learner began.", done.steps_per_s)
-    yield GaugeMetricFamily("millrace_weights_version", "Updates that made the newest weights; -1 before any.", hub.version)
+    yield GaugeMetricFamily("millrace_weights_version", "Updates that made the newest weights; -1 before any.", now.version)
     if done.return_mean is not None and done.length_mean is not None:
         yield GaugeMetricFamily(
             "millrace_episode_return_mean", "Of the last 100 training episodes, raw rewards.", done.return_mean
@@ -179,13 +210,12 @@ def _of_ledger(ledger: Mapping[str, int], counted: Mapping[str, float]) -> Itera
     yield GaugeMetricFamily("millrace_transitions_waiting", "Transitions not yet used.", ledger["transitions_waiting"])
 
 
-def _of_workers(hub: HubSnapshot) -> Iterator[Metric]:
+def _of_workers(now: Observed) -> Iterator[Metric]:
     workers = GaugeMetricFamily("millrace_workers", "Workers by state; a spare one has no lane.", labels=("state",))
-    counts = Counter(hub.roles.values())
     for state in STATES:
-        workers.add_metric((state,), counts[state])
+        workers.add_metric((state,), now.roles.get(state, 0))
     yield workers
-    lags = hub.lag_counts
+    lags = now.lags
     upto = [sum(count for lag, count in lags.items() if lag <= bound) for bound in LAGS]
     buckets = [*((str(bound), count) for bound, count in zip(LAGS, upto, strict=True)), ("+Inf", sum(lags.values()))]
     yield HistogramMetricFamily(
@@ -196,15 +226,15 @@ def _of_workers(hub: HubSnapshot) -> Iterator[Metric]:
     )
 
 
-def _of_link(hub: HubSnapshot, counted: Mapping[str, float]) -> Iterator[Metric]:
-    for name, (messages, size) in (("received", hub.received), ("sent", hub.sent)):
+def _of_link(now: Observed, counted: Mapping[str, float]) -> Iterator[Metric]:
+    for name, (messages, size) in (("received", now.received), ("sent", now.sent)):
         yield CounterMetricFamily(f"millrace_{name}_messages", f"Messages {name} by this learner.", messages)
         yield CounterMetricFamily(f"millrace_{name}_bytes", f"Bytes of the messages {name}.", size)
-    refused = {"unreadable": counted["messages_bad"], "key": hub.refused_messages}
+    refused = {"unreadable": counted["messages_bad"], "key": now.refused_messages}
     yield _by_reason("millrace_refused_messages", "Messages that were not used, by reason.", refused)
     late = "Actions that arrived too late for a program that owns its loop."
     yield CounterMetricFamily("millrace_late_actions", late, counted["late_actions"])
-    yield CounterMetricFamily("millrace_refused_handshakes", "Connections that were not let in.", hub.refused_handshakes)
+    yield CounterMetricFamily("millrace_refused_handshakes", "Connections that were not let in.", now.refused_handshakes)
 
 
 def _by_reason(name: str, text: str, counts: Mapping[str, float]) -> CounterMetricFamily:

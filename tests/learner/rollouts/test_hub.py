@@ -13,14 +13,14 @@ from millrace.learner.members.held_up import LONG_S
 from millrace.learner.members.member import Member
 from millrace.learner.members.worker_processes import WorkerProcesses
 from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan
-from millrace.learner.rollouts.hub import PULSE_S, Hub, HubSettings
+from millrace.learner.rollouts.hub import PULSE_S, Hub, HubSettings, StageTimes
 from millrace.learner.rollouts.lag_rule import Rounds
 from millrace.learner.rollouts.opponent_pool import OpponentPool, PoolSettings, PoolState, Snapshot
 from millrace.learner.rollouts.rollout_dealer import RolloutDealer
 from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
 from millrace.protocol.errors import RunError
 from millrace.protocol.logs.long_wait import AGAIN_S, FIRST_S
-from millrace.protocol.messages import Evaluated, Heartbeat, Hello, Weights
+from millrace.protocol.messages import Evaluated, Heartbeat, Hello, ToLearner, Weights
 from millrace.protocol.rollout import Episode, rollout_bytes
 from millrace.protocol.wire.codec import decode_to_worker
 from millrace.protocol.wire.learner_link import LearnerLink
@@ -200,6 +200,31 @@ def test_a_long_wait_is_shown_while_it_lasts_and_told_to_who_asks() -> None:
     link.now += 7.0
     hub.publish(1, np.zeros(1, np.float32), np.zeros(0, np.float32))
     assert hub.waiting(link.now) == "learning for 7 s, 1 of 1 workers waiting for weights"
+
+
+def test_the_time_of_each_stage_begins_and_ends_with_it() -> None:
+    link, hub, heartbeat = hub_with_a_worker()
+    began_s = link.now
+    hub.publish(0, np.zeros(1, np.float32), np.zeros(0, np.float32))
+    arrives: tuple[float, ToLearner] = 4.0, fake_rollout(1, 0, 0, 0, 0)
+
+    def poll(timeout_s: float) -> bool:
+        seconds, message = arrives
+        link.now += seconds
+        link.inbox += [(b"w0", message), (b"w0", msgspec.structs.replace(heartbeat, stages={"step": 3.0}))]
+        return True
+
+    link.poll = poll  # type: ignore[method-assign]
+    hub.gather()
+    link.now += 7.0
+    hub.begin_evaluation(EvaluationPlan((1,), copies=1, most_steps=9))
+    (ticket,) = hub.coordinator.evaluation.playing
+    arrives = 2.0, example(Evaluated, session=1, ticket=ticket, episodes=(Episode(0.0, 1, 0.0),), cut=(False,))
+    hub.end_evaluation(lambda played, env_steps: None)
+    link.now += 1.0
+    assert hub.stage_times() == StageTimes(
+        at_s=began_s + 14.0, wait_s=4.0, evaluate_s=2.0, learn_s=8.0, worker_stages={"step": 3.0}
+    )
 
 
 def test_between_short_minibatches_it_listens_now_and_then() -> None:

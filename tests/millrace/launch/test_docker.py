@@ -25,7 +25,6 @@ from millrace.extras.monitoring.prometheus import MetricsCollector, Observed
 from millrace.learner.config.command_line import read_config
 from millrace.learner.config.config import Config
 from millrace.learner.extras import NEEDED_BY
-from millrace.learner.rollouts.hub import HubSnapshot
 from millrace.learner.rollouts.ledger import Ledger
 from millrace.learner.run_folder.progress import Progress
 from millrace.protocol.keys.key_folder import KeyFolder
@@ -205,8 +204,8 @@ def test_every_service_comes_back_and_those_of_ours_are_confined(compose: dict[s
 
 
 def exposed_names() -> set[str]:
-    hub = HubSnapshot(Ledger(), incarnations=[], lags=[], progress=Progress(return_mean=1.0, length_mean=1.0))
-    exposition = MetricsCollector(Config(env="CartPole-v1"), observed=Observed(1.0, hub))
+    observed = Observed(1.0, Progress(return_mean=1.0, length_mean=1.0), Ledger().counts())
+    exposition = MetricsCollector(Config(env="CartPole-v1"), observed=observed)
     samples: list[Sample] = [sample for metric in exposition.collect() for sample in metric.samples]
     return {sample.name for sample in samples}
 
