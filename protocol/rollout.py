@@ -101,6 +101,13 @@ class Rollout(msgspec.Struct, frozen=True, tag=True, array_like=True, forbid_unk
         """Number of steps of env copies, not counting those that only reset a copy."""
         return _env_steps(self.valid, self.resets)
 
+    @property
+    def steps_that_reset(self) -> Bools:
+        """[T+1, N] True where step t only resets the copy; the last row belongs to the first step of the next rollout."""
+        if self.resets is not None:
+            return self.resets
+        return np.concatenate([~self.valid, self.terminated[-1:] | self.truncated[-1:]])
+
 
 def _env_steps(valid: Array, resets: Array | None) -> int:
     if resets is None:
@@ -177,6 +184,16 @@ class Batch(msgspec.Struct, frozen=True):
     def env_steps(self) -> int:
         """Number of steps of env copies, not counting those that only reset a copy."""
         return _env_steps(self.valid, self.resets)
+
+    @property
+    def columns_per_copy(self) -> int:
+        """The number of adjacent columns of an env copy: one for each of its seats, or 1 without seats."""
+        return 1 if self.resets is None else self.valid.shape[1] // self.resets.shape[1]
+
+    @property
+    def begins(self) -> Bools:
+        """[T, ΣN] True where row t only resets its copy, so obs[t+1] begins an episode."""
+        return ~self.valid if self.resets is None else np.repeat(self.resets[:-1], self.columns_per_copy, axis=1)
 
 
 def _by_column(flags: bool | Bools, columns: int) -> Bools:

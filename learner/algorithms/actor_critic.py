@@ -278,13 +278,9 @@ def _recurrent_input(batch: Batch, tensor: Callable[[Array], Tensor]) -> Recurre
 
     The state is reset after a step that resets the env copy. A row in which a seat waits leaves that seat's state unchanged.
     """
-    begins = ~batch.valid
     first = np.zeros_like(batch.valid[:1])
-    advances = None
-    if batch.resets is not None:
-        begins = np.repeat(batch.resets[:-1], batch.valid.shape[1] // batch.resets.shape[1], axis=1)
-        advances = tensor(np.concatenate([batch.valid, first]))
-    keep_state = ~np.concatenate([first, begins])
+    advances = None if batch.resets is None else tensor(np.concatenate([batch.valid, first]))
+    keep_state = ~np.concatenate([first, batch.begins])
     return RecurrentInput(tensor(batch.state), tensor(keep_state.astype(np.float32)), advances=advances)
 
 

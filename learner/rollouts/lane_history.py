@@ -62,7 +62,7 @@ class LaneHistory:
         """
         T = len(rollout.action)
         began = {each.copy: each for each in rollout.begun}
-        resets = _resets(rollout)
+        resets = rollout.steps_that_reset
         before = self.copies
         self.copies = [self._after(last, began.get(n), resets[:, n], T) for n, last in enumerate(before)]
         action = np.array(rollout.action)
@@ -175,14 +175,6 @@ class LaneHistory:
 def _needed_from(last: LastEpisode) -> int:
     """The first row needed to replay an episode. It is the row of the reset, because the attributes at that time matter."""
     return last.first - 1 if last.random and last.is_repeated else last.first
-
-
-def _resets(rollout: Rollout) -> Bools:
-    """[T+1, N] True for rows that only reset a copy. The last row stands for the first step of the next rollout."""
-    if rollout.resets is not None:
-        return np.asarray(rollout.resets, bool)
-    over = rollout.terminated[-1:] | rollout.truncated[-1:]
-    return np.concatenate([~rollout.valid, over])
 
 
 def _changes(kept: Iterable[_OfRound], start: int) -> dict[int, bytes]:

@@ -61,10 +61,7 @@ class Division(NamedTuple):
 
 def part_of(batch: Batch, columns: Columns) -> Batch:
     """Some columns of a batch, without the list of its episodes. With seats, `columns` must cover whole env copies."""
-    resets = batch.resets
-    if resets is not None:
-        seats = batch.valid.shape[1] // resets.shape[1]
-        resets = resets[:, columns[::seats] // seats]
+    of_copy = batch.columns_per_copy
     return msgspec.structs.replace(
         batch,
         obs=tuple(leaf.take(columns, axis=1) for leaf in batch.obs),  # contiguous, so torch needs no further copy
@@ -80,7 +77,7 @@ def part_of(batch: Batch, columns: Columns) -> Batch:
         episodes=(),
         extras=tuple(array[:, columns] for array in batch.extras),
         mask=None if batch.mask is None else batch.mask[:, columns],
-        resets=resets,
+        resets=None if batch.resets is None else batch.resets[:, columns[::of_copy] // of_copy],
     )
 
 

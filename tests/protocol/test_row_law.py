@@ -149,12 +149,15 @@ class EndsInResetSteps(VectorEnv[Any, Any, Any]):
 def test_a_vector_environment_that_ends_on_the_reset_step() -> None:
     run = run_of(f"{TOY}Countdown-v0", T=5, N=2)  # it has the same spaces
     collector = random_collector(run, lambda run, lane, pulse: VectorCopies(EndsInResetSteps(2)))
-    (rollout,) = collect(collector, run)
+    rollout, following = (collect(collector, run, k)[0] for k in range(2))
     assert rollout.terminated.T.tolist() == [[True] * 5, [False, True, False, True, False]]
     assert rollout.valid.T.tolist() == [[True, False, False, False, False], [True, True, False, True, False]]
     assert rollout.reward.T.tolist() == [[5, 0, 0, 0, 0], [5, 5, 0, 5, 0]]
+    assert rollout.steps_that_reset.T.tolist() == [[False] + [True] * 5, [False, False, True, False, True, False]]
+    assert following.steps_that_reset[0].tolist() == rollout.steps_that_reset[-1].tolist()
     assert [(episode.reward, episode.length) for episode in rollout.episodes] == [(5, 1), (10, 2), (5, 1)]
-    assert collector.steps == 4
+    assert rollout.env_steps == 4
+    assert collector.steps == 4 + following.env_steps
 
 
 def test_a_loop_and_sync_vector_env_collect_the_same_bits() -> None:

@@ -15,12 +15,13 @@ import msgspec
 import numpy as np
 import pytest
 
+from millrace.learner.shards.division import part_of
 from millrace.protocol.arrays import Array
 from millrace.protocol.bounds import MAX_NAME
 from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.errors import BadRollout
 from millrace.protocol.messages import Permit, Weights
-from millrace.protocol.rollout import Episode, Rollout
+from millrace.protocol.rollout import Episode, Rollout, stack_rollouts
 from millrace.protocol.rows.rollout_checks import LARGEST_REWARD, validate, wrong_facts
 from millrace.protocol.specs import ActionSpec, ExtraArray, Leaf, PolicySpec, RunSpec, seat_returns
 from tests.support.conversation.example_messages import example
@@ -304,3 +305,17 @@ def test_the_name_of_a_return_is_as_short_as_a_name_and_hides_nothing() -> None:
     assert len(name) == MAX_NAME
     assert name.startswith("return_\\u202eaaa")
     assert run_of("turns", 1, 1, seats=("\u202e" + "a" * (MAX_NAME - 1),), facts=found).has_seat_returns
+
+
+def test_a_batch_says_which_rows_of_each_column_only_reset_its_copy_and_a_part_keeps_them() -> None:
+    columns = "eRv.", "eRv.", "v...", "v..."
+    begins = [[letter == "R" for letter in column[:-1]] for column in columns]
+    batch = stack_rollouts([rollout_of("turns", columns)[0]])
+    assert (batch.columns_per_copy, batch.begins.T.tolist()) == (2, begins)
+    for whole_copies in ([0, 1], [2, 3], [2, 3, 0, 1]):
+        part = part_of(batch, np.array(whole_copies))
+        assert (part.columns_per_copy, part.begins.T.tolist()) == (2, [begins[column] for column in whole_copies])
+    alone = msgspec.structs.replace(batch, resets=None)
+    assert alone.columns_per_copy == 1
+    assert np.array_equal(alone.begins, ~batch.valid)
+    assert part_of(alone, np.array([3])).resets is None

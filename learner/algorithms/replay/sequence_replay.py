@@ -147,7 +147,7 @@ class SequenceReplay(Rewinding[ReplacedSequences]):
             )
         if batch.mask is not None and "mask" not in self.arrays:
             self._make_mask(batch.mask.shape[-1])
-        begins = _begins(batch)
+        begins = batch.begins
         for at in range(0, len(batch.lane), N):  # a lane's rollouts are in order of collection
             self._add(batch, begins, slice(at, at + N), int(batch.lane[at]))
 
@@ -313,13 +313,6 @@ class SequenceReplay(Rewinding[ReplacedSequences]):
         self._rows = int(np.count_nonzero(self.arrays["valid"]))
         self._newest = {int(lane): numbers.numpy().copy() for lane, numbers in state["newest"].items()}
         self.generator.bit_generator.state = state["generator"]
-
-
-def _begins(batch: Batch) -> Bools:
-    """[T, ΣN] True where row t only resets its copy, so obs[t+1] begins an episode."""
-    if batch.resets is None:
-        return ~batch.valid
-    return np.repeat(batch.resets[:-1], batch.valid.shape[1] // batch.resets.shape[1], axis=1)
 
 
 def _flat(array: Array) -> Array:

@@ -24,7 +24,6 @@ from millrace.extras.conformance.join_checks import (
     over_a_new_connection,
     time_limit,
 )
-from millrace.extras.conformance.lane_rows import resets_of
 from millrace.extras.conformance.learner import QUIET_S, Learner
 from millrace.extras.conformance.script import Broken, Ended, Heard, Script, Skipped, Wait, brief
 from millrace.extras.conformance.watch import resets_too_early
@@ -274,7 +273,7 @@ def keeps_rows(learner: Learner) -> Script[None]:
         if ends >= 8 and len(around) >= 3 and between:
             break
         ends += len(rollout.episodes)
-        resets = np.repeat(resets_of(rollout), session.run.seats_of_copy, axis=1)
+        resets = np.repeat(rollout.steps_that_reset, session.run.seats_of_copy, axis=1)
         between = between or bool(resets[-1].any())
         for t, n in np.argwhere(rollout.terminated[:-1] & resets[1:-1]):
             last, first = (b"".join(leaf[row, n].tobytes() for leaf in rollout.obs) for row in (t + 1, t + 2))
@@ -517,7 +516,7 @@ def _did(rollouts: Sequence[Rollout], n: int, seats: int) -> tuple[list[bytes], 
     first = n * seats
     firsts = [b"".join(leaf[0, first].tobytes() for leaf in rollouts[0].obs)]
     for rollout in rollouts:
-        for t, resets in enumerate(resets_of(rollout)[:-1, n]):
+        for t, resets in enumerate(rollout.steps_that_reset[:-1, n]):
             actions.append(rollout.action[t, first].tobytes() if rollout.valid[t, first] else b"")
             if resets:
                 firsts.append(b"".join(leaf[t + 1, first].tobytes() for leaf in rollout.obs))
@@ -545,7 +544,7 @@ def starts_a_lane_again(learner: Learner) -> Script[None]:
 def _past_of(rollouts: Sequence[Rollout]) -> LanePast:
     """The history of lane 0 after these rollouts, which must be all of the lane's rollouts."""
     last = rollouts[-1]
-    resets = np.concatenate([*(resets_of(each)[:-1] for each in rollouts), resets_of(last)[-1:]])
+    resets = np.concatenate([*(each.steps_that_reset[:-1] for each in rollouts), last.steps_that_reset[-1:]])
     K = len(resets) - 1
     copies = []
     for begun in {each.copy: each for rollout in rollouts for each in rollout.begun}.values():

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from millrace.extras.conformance.script import Broken
-from millrace.protocol.arrays import Array, Bools, Floats
+from millrace.protocol.arrays import Array, Floats
 from millrace.protocol.messages import Rollout, Weights
 from millrace.protocol.policy.distributions import distribution
 from millrace.protocol.policy.policy import make_policy
@@ -43,7 +43,7 @@ class LaneRows:
 
     def _check_begin(self, rollout: Rollout) -> None:
         last = self._last
-        ended = np.zeros(self._run.copies, bool) if last is None else resets_of(last)[-1]
+        ended = np.zeros(self._run.copies, bool) if last is None else last.steps_that_reset[-1]
         if last is not None:
             for one, other in zip(last.obs, rollout.obs, strict=True):
                 if one[-1].tobytes() != other[0].tobytes():
@@ -52,7 +52,7 @@ class LaneRows:
                         f"obs[0] of sequence {rollout.sequence} to be obs[T] of sequence {last.sequence}",
                         "another observation",
                     )
-        if (wrong := resets_of(rollout)[0] != ended).any():
+        if (wrong := rollout.steps_that_reset[0] != ended).any():
             n = int(np.argmax(wrong))
             flag = "resets" if self._run.seats else "valid"
             raise Broken(
@@ -68,10 +68,11 @@ class LaneRows:
         run = self._run
         expected = list[tuple[float, int]]()
         reward = np.where(rollout.valid, rollout.reward.astype(np.float64), 0.0).reshape(-1, run.copies, run.seats_of_copy)
-        for of_step, resets, over in zip(reward, resets_of(rollout), resets_of(rollout)[1:], strict=False):
+        steps = rollout.steps_that_reset
+        for of_step, resets, over in zip(reward, steps, steps[1:], strict=False):
             self._return += of_step.sum(1)
             self._length += ~resets
-            for n in np.flatnonzero(over).tolist():
+            for n in np.flatnonzero(over & ~resets).tolist():
                 expected.append((float(self._return[n]), int(self._length[n])))
                 self._return[n] = 0.0
                 self._length[n] = 0
@@ -114,13 +115,6 @@ class LaneRows:
                 f"under version {rollout.version}",
                 f"{got[k]:.5f}",
             )
-
-
-def resets_of(rollout: Rollout) -> Bools:
-    """Which steps only reset a copy, [T+1, N] bool; the last row is about the step after the rollout."""
-    if rollout.resets is not None:
-        return rollout.resets
-    return np.concatenate([~rollout.valid, rollout.valid[-1:] & (rollout.terminated | rollout.truncated)[-1:]])
 
 
 def can_be_recomputed(run: RunSpec) -> bool:
