@@ -74,6 +74,10 @@ class EvaluationPlan:
         of_best = purpose is Purpose.CONFIRMATION
         return EvaluationPlan(episode_seeds(seed, episodes, purpose), copies, most_steps, of_best=of_best)
 
+    def seeds_of_tickets(self) -> list[tuple[int, ...]]:
+        """The seeds of each ticket."""
+        return [self.seeds[i : i + self.copies] for i in range(0, len(self.seeds), self.copies)]
+
     def how_far(self, played: int, env_steps: int, bound: str = "at most", before: tuple[int, int] = (0, 0)) -> str:
         """The evaluation's progress in words. `env_steps` includes the steps of running episodes.
 
@@ -121,88 +125,68 @@ class TakenAnswer(NamedTuple):
     """What is wrong with the answer; empty if nothing is."""
 
 
-class EvaluationDealer:
-    """The tickets of the evaluation that is pending, if there is one."""
+class PendingEvaluation:
+    """The tickets of an evaluation that has begun and not ended, and the answers so far."""
 
-    def __init__(self, run: RunSpec) -> None:
-        """`run` describes the form of rows and episodes."""
+    def __init__(
+        self,
+        plan: EvaluationPlan,
+        version: int,
+        run: RunSpec,
+        *,
+        first: int,
+        most_copies: int | None,
+        late: set[int],
+        on_rows: OnRows | None = None,
+        beside: bool = False,
+    ) -> None:
+        """`run` describes the form of rows and episodes, and `first` is the number of the first ticket.
+
+        See `EvaluationDealer` for `most_copies` and for `late`, to which this evaluation adds.
+        """
+        self.plan = plan
+        self.version = version
+        """the version of the weights that are evaluated"""
+        self.beside = beside
+        """whether the evaluation runs alongside training"""
+        self.seeds = plan.seeds_of_tickets()
         self.playing: dict[int, list[Member]] = {}
         """by the number of each ticket that is being played, its worker, then the second worker if `share` added one"""
-        self.most_copies: int | None = None
-        """limit on the env copies that play, of all workers together (one worker may always play); None for no limit"""
         self._run = run
-        self.beside = False
-        """whether the pending evaluation runs alongside training"""
+        self._first = first
+        self._most_copies = most_copies
         self._most_workers = 0  # if copies are limited, how many workers may play; 0 for as many as the limit allows
-        self._plan: EvaluationPlan | None = None
-        self.version = -1
-        """the version of the weights that are evaluated"""
-        self._on_rows: OnRows | None = None
-        self._first = FIRST_TICKET  # number of the first ticket of this evaluation
-        self._seeds: list[tuple[int, ...]] = []  # seeds of each ticket
-        self._undealt: list[int] = []  # a heap of the indices of tickets that no worker has
+        self._late = late
+        self._on_rows = on_rows
+        self._undealt = list(range(len(self.seeds)))  # a heap of the indices of tickets that no worker has
         self._played: dict[int, Evaluated] = {}  # answers, by index of the ticket
         self._rows: dict[tuple[int, bytes], dict[int, list[EpisodeRows]]] = {}  # by ticket index and worker, then by episode
-        self._late: set[int] = set()  # sessions of workers whose ticket a second worker answered first
-
-    @property
-    def pending(self) -> bool:
-        """Whether an evaluation has begun and not ended."""
-        return self._plan is not None
 
     @property
     def done(self) -> bool:
-        """Whether all episodes of the pending evaluation have been played."""
-        return self._plan is not None and len(self._played) == len(self._seeds)
+        """Whether all episodes have been played."""
+        return len(self._played) == len(self.seeds)
 
     @property
     def episodes_played(self) -> int:
-        """The number of episodes of the pending evaluation that have been played."""
-        return sum(len(self._seeds[index]) for index in self._played)
-
-    @property
-    def plan(self) -> EvaluationPlan | None:
-        """The pending evaluation, if there is one."""
-        return self._plan
+        """The number of episodes that have been played."""
+        return sum(len(self.seeds[index]) for index in self._played)
 
     @property
     def players(self) -> list[Member]:
         """The workers that hold tickets."""
         return list({member.peer: member for members in self.playing.values() for member in members}.values())
 
-    def begin(self, plan: EvaluationPlan, version: int, on_rows: OnRows | None = None, *, beside: bool = False) -> None:
-        """Begin to evaluate this version, alongside training if `beside`. Then call `deal` to give out the tickets."""
-        assert not self.pending, "an evaluation is pending"
-        self._first += len(self._seeds)
-        self._plan = plan
-        self.version = version
-        self._on_rows = on_rows
-        self.beside = beside
-        self._most_workers = 0
-        self._seeds = [plan.seeds[i : i + plan.copies] for i in range(0, len(plan.seeds), plan.copies)]
-        self._undealt = list(range(len(self._seeds)))
-        self._played = {}
-        self._rows = {}
-
     def all_play(self) -> None:
-        """Let all workers play the pending evaluation, which has run alongside training so far.
+        """Let all workers play the evaluation, which has run alongside training so far.
 
         If copies are limited, only one of the other workers plays.
         """
         self.beside = False
         self._most_workers = 1
 
-    def end(self) -> list[PlayedEpisode]:
-        """End the evaluation.
-
-        Returns its episodes in the order of the seeds; if it isn't done, only those that have been played.
-        """
-        for number, members in self.playing.items():
-            for member in members:
-                del member.tickets[number]
-        self._plan = None
-        self.playing = {}
-        self._rows = {}
+    def episodes(self) -> list[PlayedEpisode]:
+        """The episodes that have been played, in the order of the seeds."""
         answers = [answer for _, answer in sorted(self._played.items())]
         return [PlayedEpisode(*both) for answer in answers for both in zip(answer.episodes, answer.cut, strict=True)]
 
@@ -212,10 +196,8 @@ class EvaluationDealer:
         Workers that only evaluate come first, then the others, each in the order of joining. If copies are limited, only the
         first workers play, because a worker keeps its copies.
         """
-        plan = self._plan
         out = list[Outgoing]()
-        assert plan is not None
-        members = self._who_may_play([member for member in active if member.hello.evaluates or not self.beside], plan)
+        members = self._who_may_play([member for member in active if member.hello.evaluates or not self.beside])
         holds = self._held_by()
         for most in range(1, HELD_AT_ONCE + 1):
             for member in members:
@@ -229,11 +211,9 @@ class EvaluationDealer:
 
     def share(self, active: Sequence[Member]) -> list[Outgoing]:
         """Give the oldest ticket that only one worker is playing to a second, idle worker as well."""
-        plan = self._plan
-        assert plan is not None
-        who = [member for member in active if member.hello.evaluates or not self.beside or self.most_copies is None]
+        who = [member for member in active if member.hello.evaluates or not self.beside or self._most_copies is None]
         holds = self._held_by()
-        idle = [member for member in self._who_may_play(who, plan) if not holds[member.peer]]
+        idle = [member for member in self._who_may_play(who) if not holds[member.peer]]
         alone = [number for number, members in self.playing.items() if len(members) == 1]
         if not idle or not alone:
             return []
@@ -248,9 +228,9 @@ class EvaluationDealer:
     def take_in(self, member: Member, answer: Evaluated) -> TakenAnswer:
         """Accept an answer. If its episodes can't be used, they are played again."""
         if not self._plays(member, answer.ticket):
-            return TakenAnswer()  # the answer is a repeat, or arrived after the end or after another worker's answer
+            return TakenAnswer()  # a repeat, or the answer of an earlier evaluation, or of the slower of two workers
         index = answer.ticket - self._first
-        if why := self._wrong(answer, len(self._seeds[index])):
+        if why := self._wrong(answer, len(self.seeds[index])):
             self.lose(member, answer.ticket)
             return TakenAnswer(ended=True, why=f"evaluation of ticket {answer.ticket}: {why}")
         rows = self._rows.get((index, member.peer), {})
@@ -258,10 +238,9 @@ class EvaluationDealer:
             if [_end(rows.get(n, ())) for n in range(len(answer.episodes))] != [one.length for one in answer.episodes]:
                 self.lose(member, answer.ticket)  # a message with rows was lost, so the episodes are played again
                 return TakenAnswer(ended=True)
-            assert self._plan is not None
             for episode, messages in sorted(rows.items()):
                 for message in messages:
-                    self._on_rows(index * self._plan.copies + episode, message)
+                    self._on_rows(index * self.plan.copies + episode, message)
         members = self.playing.pop(answer.ticket)
         if members[0] is not member:
             self._late.add(members[0].session)
@@ -278,13 +257,12 @@ class EvaluationDealer:
         if not self._plays(member, rows.ticket) or self._on_rows is None:
             return ""
         index = rows.ticket - self._first
-        if rows.episode >= len(self._seeds[index]):
-            return f"rows of ticket {rows.ticket}: expected an episode below {len(self._seeds[index])}, got {rows.episode}"
-        assert self._plan is not None
+        if rows.episode >= len(self.seeds[index]):
+            return f"rows of ticket {rows.ticket}: expected an episode below {len(self.seeds[index])}, got {rows.episode}"
         come = self._rows.setdefault((index, member.peer), {}).setdefault(rows.episode, [])
         if rows.first_step != _end(come):
             return ""
-        if why := reason_to_reject(rows, come, self._run, self._plan.most_steps, self._plan.send_frames):
+        if why := reason_to_reject(rows, come, self._run, self.plan.most_steps, self.plan.send_frames):
             return f"rows of ticket {rows.ticket}: {why}"
         come.append(rows)
         return ""
@@ -306,7 +284,7 @@ class EvaluationDealer:
         """How many tickets each worker holds."""
         return Counter(member.peer for members in self.playing.values() for member in members)
 
-    def _who_may_play(self, members: Sequence[Member], plan: EvaluationPlan) -> list[Member]:
+    def _who_may_play(self, members: Sequence[Member]) -> list[Member]:
         """The workers among these that may play. A worker that was late may play only if all were late.
 
         Workers that only evaluate come first. If copies are limited, only the first workers play, because a worker keeps its
@@ -314,9 +292,9 @@ class EvaluationDealer:
         """
         players = sorted(members, key=lambda member: not member.hello.evaluates)
         players = [member for member in players if member.session not in self._late] or players
-        if self.most_copies is None:
+        if self._most_copies is None:
             return players
-        return players[: self._most_workers or max(1, self.most_copies // plan.copies)]
+        return players[: self._most_workers or max(1, self._most_copies // self.plan.copies)]
 
     def _forget(self, member: Member, number: int) -> None:
         """Take the ticket from this member, and drop its rows."""
@@ -324,15 +302,14 @@ class EvaluationDealer:
         self._rows.pop((number - self._first, member.peer), None)
 
     def _order(self, member: Member, number: int) -> Evaluate:
-        plan = self._plan
-        assert plan is not None
+        plan = self.plan
         member.tickets[number] = member.replies
         opponents, teams = self._matches(number)
         return Evaluate(
             session=member.session,
             ticket=number,
             version=self.version,
-            seeds=self._seeds[number - self._first],
+            seeds=self.seeds[number - self._first],
             greedy=plan.greedy,
             most_steps=plan.most_steps,
             send_rows=plan.send_rows,
@@ -343,26 +320,65 @@ class EvaluationDealer:
 
     def _matches(self, number: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
         """The opponents and the evaluated teams of a ticket's episodes, chosen so that each opponent meets all teams."""
-        plan = self._plan
+        plan = self.plan
         count = len(self._run.teams)
-        if plan is None or not count:
+        if not count:
             return (), ()
         index = number - self._first
-        episodes = range(index * plan.copies, index * plan.copies + len(self._seeds[index]))
+        episodes = range(index * plan.copies, index * plan.copies + len(self.seeds[index]))
         opponents = tuple(plan.opponents[episode // count % len(plan.opponents)] for episode in episodes)
         return opponents, tuple(episode % count for episode in episodes)
 
     def _wrong(self, answer: Evaluated, seeds: int) -> str:
-        assert self._plan is not None
         if len(answer.episodes) != seeds or len(answer.cut) != seeds:
             return f"expected {seeds} episodes, got {len(answer.episodes)} and {len(answer.cut)} marks of cut ones"
         for episode in answer.episodes:
-            if why := wrong_episode(episode, self._run, self._plan.most_steps):
+            if why := wrong_episode(episode, self._run, self.plan.most_steps):
                 return f"episode: {why}"
         opponents, _ = self._matches(answer.ticket)
         if self._run.teams and tuple(episode.opponent for episode in answer.episodes) != opponents:
             return f"expected the opponents {opponents}, got {[episode.opponent for episode in answer.episodes]}"
         return ""
+
+
+class EvaluationDealer:
+    """The evaluations of a run, one after the other."""
+
+    def __init__(self, run: RunSpec) -> None:
+        """`run` describes the form of rows and episodes."""
+        self.pending: PendingEvaluation | None = None
+        self.most_copies: int | None = None
+        """limit on the env copies that play, of all workers together (one worker may always play); None for no limit"""
+        self._run = run
+        self._next_ticket = FIRST_TICKET
+        self._late: set[int] = set()  # sessions of workers whose ticket a second worker answered first
+
+    def begin(self, plan: EvaluationPlan, version: int, on_rows: OnRows | None = None, *, beside: bool = False) -> None:
+        """Begin to evaluate this version, alongside training if `beside`. Then call `deal` to give out the tickets."""
+        assert self.pending is None, "an evaluation is pending"
+        self.pending = PendingEvaluation(
+            plan,
+            version,
+            self._run,
+            first=self._next_ticket,
+            most_copies=self.most_copies,
+            late=self._late,
+            on_rows=on_rows,
+            beside=beside,
+        )
+        self._next_ticket += len(self.pending.seeds)
+
+    def end(self) -> list[PlayedEpisode]:
+        """End the pending evaluation.
+
+        Returns its episodes in the order of the seeds; if it isn't done, only those that have been played.
+        """
+        ended, self.pending = self.pending, None
+        assert ended is not None, "no evaluation is pending"
+        for number, members in ended.playing.items():
+            for member in members:
+                del member.tickets[number]
+        return ended.episodes()
 
 
 def _end(rows: Sequence[EpisodeRows]) -> int:

@@ -223,7 +223,8 @@ class Hub:
         `watch` is called with the number of episodes played and the number of env steps, at least every `POLL_S` seconds.
         Raises what `gather` raises.
         """
-        evaluation = self.coordinator.evaluation
+        evaluation = self.coordinator.evaluation.pending
+        assert evaluation is not None, "no evaluation is pending"
         steps_before = self._worker_steps()
         wait = LongWait(self._clock())  # starts again with each new env step
         steps = steps_before  # the number of env steps when `wait` began
@@ -253,7 +254,7 @@ class Hub:
                 "no env step of an evaluation was made",
             )
         finally:
-            played = evaluation.end()
+            played = self.coordinator.evaluation.end()
             self._time.turn("learning", self._clock())
         self.lag_statistics.published(self.coordinator.version, self._clock())  # from now on, rollouts use these weights
         return played
@@ -323,7 +324,8 @@ class Hub:
                 self.lag_statistics.arrived(worker, version, self._clock())
                 self._failures.collected(lane)
             case EpisodesArrived(worker):
-                self._failures.evaluated(worker if self.coordinator.evaluation.beside else None)
+                evaluation = self.coordinator.evaluation.pending
+                self._failures.evaluated(worker if evaluation is not None and evaluation.beside else None)
             case _:
                 self._count_failure(event)
 

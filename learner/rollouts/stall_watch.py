@@ -85,7 +85,8 @@ class StallWatch:
 
     def _takes_too_long(self, now: float) -> bool:
         """Whether no episode of the evaluation has arrived for too long. If so, restarts the timer."""
-        answered = self._coordinator.evaluation.episodes_played
+        evaluation = self._coordinator.evaluation.pending
+        answered = 0 if evaluation is None else evaluation.episodes_played
         overdue = answered == self._answered and now - self._answered_s > self._stall_timeout_s
         if overdue or answered != self._answered:
             self._answered = answered
@@ -102,8 +103,8 @@ class StallWatch:
     def _over_budget(self, now: float) -> tuple[CollectingMember, ...]:
         """The members that have held their oldest ticket for longer than all their tickets together may take."""
         coordinator = self._coordinator
-        plan = coordinator.evaluation.plan
-        episodes_s = 0.0 if plan is None else self._longest_s(plan.copies, plan.most_steps)
+        evaluation = coordinator.evaluation.pending
+        episodes_s = 0.0 if evaluation is None else self._longest_s(evaluation.plan.copies, evaluation.plan.most_steps)
         held = {
             (peer, number): self._rollout_s(number) if number in coordinator.rollouts.held else episodes_s
             for peer, member in coordinator.members.items()

@@ -142,20 +142,25 @@ class TicketCoordinator(Coordinator[CollectingMember]):
     def begin_evaluation(
         self, plan: EvaluationPlan, on_rows: OnRows | None = None, *, beside: bool = False
     ) -> list[Outgoing]:
-        """Begin to evaluate the newest weights, alongside training if `beside`. `self.evaluation.done` says when to end."""
+        """Begin to evaluate the newest weights, alongside training if `beside`.
+
+        The evaluation is then `self.evaluation.pending`; its `done` says when to end it.
+        """
         self.evaluation.begin(plan, self.version, on_rows, beside=beside)
         return self._deal()
 
     def await_evaluation(self) -> list[Outgoing]:
         """Let all workers play the awaited evaluation if no worker that only evaluates is left."""
-        if any(member.hello.evaluates for member in self.membership.active()):
+        evaluation = self.evaluation.pending
+        if evaluation is None or any(member.hello.evaluates for member in self.membership.active()):
             return []
-        self.evaluation.all_play()
+        evaluation.all_play()
         return self._deal()
 
     def share_evaluation(self) -> list[Outgoing]:
         """Let an idle worker, if there is one, also play the oldest ticket, because no answer has arrived for long."""
-        return self.weights.after(self.evaluation.share(self.membership.active()), self.members)
+        evaluation = self.evaluation.pending
+        return [] if evaluation is None else self.weights.after(evaluation.share(self.membership.active()), self.members)
 
     def collected(self) -> int:
         """The env steps made so far for the next update's rollouts, complete and running, as workers report them."""
@@ -176,9 +181,10 @@ class TicketCoordinator(Coordinator[CollectingMember]):
         if self.version < 0 or self.membership.draining is not None or not self.members:
             return []
         out = self._placement.place(self.members.values())
-        if self.evaluation.pending:
-            out += self.evaluation.deal(self.membership.active())
-        if self.evaluation.beside or not self.evaluation.pending:
+        evaluation = self.evaluation.pending
+        if evaluation is not None:
+            out += evaluation.deal(self.membership.active())
+        if evaluation is None or evaluation.beside:
             out += self._deal_rollouts()
         return self.weights.after(out, self.members)
 
@@ -198,8 +204,8 @@ class TicketCoordinator(Coordinator[CollectingMember]):
         """The versions, other than the newest, that orders may name."""
         opponents = self.rollouts.opponents
         needed = self.rollouts.rounds.acting()
-        if self.evaluation.pending:
-            needed.add(self.evaluation.version)
+        if self.evaluation.pending is not None:
+            needed.add(self.evaluation.pending.version)
         if opponents is not None:
             needed.update(opponents.versions)
         return needed
@@ -219,12 +225,12 @@ class TicketCoordinator(Coordinator[CollectingMember]):
                 return self._take_rollout(member, message)
             case Evaluated():
                 return self._take_evaluated(member, message)
-            case EpisodeRows():
-                why = self.evaluation.take_rows(member, message)
+            case EpisodeRows() if self.evaluation.pending is not None:
+                why = self.evaluation.pending.take_rows(member, message)
                 return self._unusable(member, why) if why else []
             case Goodbye(_, reason):
                 self.membership.leave(member, reason)
-        return []  # answers to orders that a run never sends are ignored
+        return []  # answers to orders that a run never sends, and rows of an evaluation that has ended, are ignored
 
     def _take_rollout(self, member: CollectingMember, rollout: Rollout) -> list[Outgoing]:
         """Accept a rollout, unless it had arrived before. If it can't be used, it is counted, and its ticket is lost."""
@@ -249,7 +255,10 @@ class TicketCoordinator(Coordinator[CollectingMember]):
 
     def _take_evaluated(self, member: CollectingMember, answer: Evaluated) -> list[Outgoing]:
         """Accept episodes of an evaluation, unless they had arrived before."""
-        taken = self.evaluation.take_in(member, answer)
+        evaluation = self.evaluation.pending
+        if evaluation is None:
+            return []
+        taken = evaluation.take_in(member, answer)
         if taken.ended:
             member.ended_steps += sum(episode.length for episode in answer.episodes)
         if taken.accepted:
@@ -270,7 +279,9 @@ class TicketCoordinator(Coordinator[CollectingMember]):
 
     def _again(self, member: CollectingMember, heartbeat: Heartbeat, lost: Sequence[int]) -> list[Outgoing]:
         out = self.weights.again(member, heartbeat)
-        orders = self.rollouts.send(member, lost) + self.evaluation.send(member, lost)
+        orders = self.rollouts.send(member, lost)
+        if self.evaluation.pending is not None:
+            orders += self.evaluation.pending.send(member, lost)
         return out + self.weights.after(orders, self.members)
 
     def _received(self, member: CollectingMember) -> tuple[Received, ...]:
@@ -280,8 +291,10 @@ class TicketCoordinator(Coordinator[CollectingMember]):
         """Count a lost worker's tickets as lost, and take away its lanes, so that `_deal` gives both to other workers."""
         self.rollouts.worker_lost(member, gone)
         for number in list(member.tickets):
-            dealer = self.rollouts if number in self.rollouts.held else self.evaluation
-            dealer.lose(member, number)
+            if number in self.rollouts.held:
+                self.rollouts.lose(member, number)
+            elif self.evaluation.pending is not None:
+                self.evaluation.pending.lose(member, number)
         self._placement.removed(member)
         self.weights.held.forget(member.peer)
 

@@ -15,7 +15,7 @@ from typing import Literal, get_args
 from millrace.learner.members.held_up import LONG_S, held_up
 from millrace.learner.members.member import Member
 from millrace.learner.members.worker_processes import WorkerProcesses
-from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan
+from millrace.learner.rollouts.evaluation_dealer import PendingEvaluation
 from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
 from millrace.protocol.bounds import one_line
 
@@ -72,8 +72,9 @@ class LearnerTime:
         members = self._coordinator.members
         spent_s = self.until(now)
         text = ""
-        if members and self.evaluating and (plan := self._coordinator.evaluation.plan) is not None:
-            return one_line(f"evaluating{' the best policy' * plan.of_best} for {lasts_s:.0f} s: {self._played(plan, now)}")
+        if members and self.evaluating and (evaluation := self._coordinator.evaluation.pending) is not None:
+            what = "evaluating the best policy" if evaluation.plan.of_best else "evaluating"
+            return one_line(f"{what} for {lasts_s:.0f} s: {self._played(evaluation, now)}")
         if lasts_s < LONG_S:
             text = self._last
         elif self.phase == "learning":
@@ -120,12 +121,11 @@ class LearnerTime:
         left = f", about {_in_words((of - made) / per_s)} left" if per_s and made < of else ""
         return f"; {which} rollouts: {made:,} of {of:,} env steps{left}"
 
-    def _played(self, plan: EvaluationPlan, now: float) -> str:
+    def _played(self, evaluation: PendingEvaluation, now: float) -> str:
         """How far an evaluation has got, and which of the workers playing it has been held up longest."""
-        evaluation = self._coordinator.evaluation
         who = self._held_up_longest(evaluation.players, now)
-        done = f"{evaluation.episodes_played} of {len(plan.seeds)} episodes"
-        return f"{done} (at most {plan.most_steps:,} env steps each); {who}"
+        done = f"{evaluation.episodes_played} of {len(evaluation.plan.seeds)} episodes"
+        return f"{done} (at most {evaluation.plan.most_steps:,} env steps each); {who}"
 
     def _held_up_longest(self, members: list[Member], now: float) -> str:
         """The worker held up longest: one of these members or, if other workers step for them, one of the other workers."""

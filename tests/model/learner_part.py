@@ -156,9 +156,10 @@ class Learner:
 
     def named(self) -> list[tuple[CollectingMember, int]]:
         """Which versions the orders of which workers name."""
-        members, evaluation = self.coordinator.members.values(), self.coordinator.evaluation
+        members, evaluation = self.coordinator.members.values(), self.coordinator.evaluation.pending
         versions = {number: {each.version, each.permit.opponent} for number, each in self.coordinator.rollouts.held.items()}
-        versions |= {number: {evaluation.version} for number in evaluation.playing}
+        if evaluation is not None:
+            versions |= {number: {evaluation.version} for number in evaluation.playing}
         every = ((member, version) for member in members for number in member.tickets for version in versions[number])
         return [(member, version) for member, version in every if version is not None]
 

@@ -110,7 +110,7 @@ MUTATIONS = {
         Rule.ARRIVED, ROLLOUTS, "self._end(member, permit).arrived(rollout.sequence)", "self._end(member, permit)"
     ),
     "a lost Collect is not sent again": Mutation(
-        Rule.ORDER_AGAIN, COORDINATOR, "self.rollouts.send(member, lost) + self.evaluation", "self.evaluation"
+        Rule.ORDER_AGAIN, COORDINATOR, "orders = self.rollouts.send(member, lost)", "orders = []"
     ),
     "lost weights are not sent again": Mutation(
         Rule.WEIGHTS_AGAIN, WEIGHTS, "for version in lost for message in", "for version in lost[:0] for message in"

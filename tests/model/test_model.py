@@ -15,7 +15,7 @@ from millrace.learner.members.describe_coordinator import DescribeCoordinator
 from millrace.learner.members.lane_placement import LanePlacement
 from millrace.learner.members.membership import Membership
 from millrace.learner.rollouts.collecting_member import CollectingMember
-from millrace.learner.rollouts.evaluation_dealer import EvaluationDealer
+from millrace.learner.rollouts.evaluation_dealer import EvaluationDealer, EvaluationPlan
 from millrace.learner.rollouts.lag_rule import Rounds
 from millrace.learner.rollouts.lanes import TakenRollouts, Ticket, TicketedLane
 from millrace.learner.rollouts.rollout_dealer import RolloutDealer
@@ -134,7 +134,10 @@ def test_every_field_of_the_program_is_in_the_state_or_left_out_on_purpose() -> 
     wait = DescribeCoordinator(WAIT, 0, worker_timeout_s=TIMEOUT_S, decliners_to_end=0)
     assert set(vars(wait)) == of_describing.SAVED | of_describing.NOT_SAVED
     assert set(vars(HeldDescriptions())) == describing_worker.SAVED
-    assert set(vars(EvaluationDealer(settings.run))) == of_evaluation.SAVED | of_evaluation.NOT_SAVED
+    dealer = EvaluationDealer(settings.run)
+    dealer.begin(EvaluationPlan((1,), copies=1, most_steps=1), version=0)
+    for part in (dealer, dealer.pending):
+        assert set(vars(part)) == of_evaluation.SAVED[type(part)] | of_evaluation.NOT_SAVED[type(part)]
     assert set(vars(HeldEvaluations())) == evaluating_worker.SAVED
     stepping = of_vector_env.Learner(Stepping(workers=1, lanes=1, calls=(), faults=0), 0, 0.0).coordinator
     assert type(stepping) is OrderCoordinator

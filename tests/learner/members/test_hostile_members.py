@@ -45,6 +45,7 @@ from tests.support.conversation.example_messages import example
 from tests.support.conversation.extreme_messages import SESSION, extremes, of_session
 from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS, SEATS, fake_rollout, run_spec, seated_rollout
 from tests.support.conversation.fake_link import FakeLink
+from tests.support.conversation.rules import pending_evaluation
 
 
 class Noisy:
@@ -415,7 +416,7 @@ def test_work_between_two_failures_ends_the_row(between: str) -> None:
             noisy.hub.publish(noisy.coordinator.version + 1, PARAMETERS, BUFFERS)
         elif between != "nothing":
             noisy.hub.begin_evaluation(EvaluationPlan((1,), copies=1, most_steps=9))
-            (asked,) = noisy.coordinator.evaluation.playing
+            (asked,) = pending_evaluation(noisy.coordinator).playing
             noisy.hears(
                 "honest", example(Evaluated, session=session, ticket=asked, episodes=(Episode(0.0, 1, 0.0),), cut=(False,))
             )

@@ -100,7 +100,7 @@ def test_while_one_of_them_lives_the_learner_waits() -> None:
     learner = learner_with(A, E)
     learner.begins(1, 2, 3)
     assert learner.awaits() == []
-    assert learner.coordinator.evaluation.beside
+    assert learner.evaluation.beside
 
 
 @pytest.mark.parametrize("ever", [True, False])

@@ -7,6 +7,7 @@ import random
 import pytest
 
 from tests.support.conversation.fake_ends import Faults, World
+from tests.support.conversation.rules import pending_evaluation
 
 BLOCKS, CASES = 25, 80
 
@@ -78,7 +79,7 @@ def test_a_worker_without_a_lane_evaluates_too() -> None:
     def watch() -> None:
         check()
         if world.plan is not None and len(world.plan.seeds) > 2 * world.plan.copies:
-            holders.add(tuple(sorted(member.peer for member in world.coordinator.evaluation.players)))
+            holders.add(tuple(sorted(member.peer for member in pending_evaluation(world.coordinator).players)))
 
     world.check = watch  # type: ignore[method-assign]
     world.play(updates=20)

@@ -66,27 +66,27 @@ def test_seeds_are_cut_into_tickets_whose_orders_say_what_the_plan_says() -> Non
 
 def test_the_episodes_are_in_the_order_of_the_seeds_whoever_answers_first() -> None:
     learner = learner_with(A, B)
-    evaluation = learner.coordinator.evaluation
     first, second = orders(learner.coordinator.begin_evaluation(plan(1, 2, 3)))
     for peer, order in ((B, second), (A, first)):
         learner.says(peer, answer(order))
-    played = evaluation.end()
+    played = learner.coordinator.evaluation.end()
     assert [one.episode.length for one in played] == [1, 2, 3]
     assert evaluation_of(played).cut == 1
 
 
 def test_nothing_of_an_evaluation_counts_in_the_next() -> None:
     learner = learner_with(A)
-    evaluation = learner.coordinator.evaluation
     (before,) = orders(learner.coordinator.begin_evaluation(plan(1, 2)))
     learner.says(A, answer(before))
-    evaluation.end()
+    learner.coordinator.evaluation.end()
+    assert learner.says(A, answer(before)) == [], "it is ignored while none is pending, too"
     (order,) = orders(learner.coordinator.begin_evaluation(plan(3, 4)))
-    assert evaluation.episodes_played == 0
+    assert learner.evaluation.episodes_played == 0
     learner.says(A, answer(before))
-    assert evaluation.episodes_played == 0
+    assert learner.evaluation.episodes_played == 0
     learner.says(A, answer(order))
-    assert [one.episode.length for one in evaluation.end()] == [3, 4]
+    assert [one.episode.length for one in learner.coordinator.evaluation.end()] == [3, 4]
+    assert learner.coordinator.members[A].strikes == 0
 
 
 TEAMS: dict[str, Any] = {
@@ -120,7 +120,7 @@ def test_opponents_take_turns_and_each_meets_all_teams() -> None:
     learner.says(A, against(found[1], found[1].opponents))
     assert [order.opponents for order in found] == [(0, 0, -1), (-1, 0, 0)]
     assert [order.teams for order in found] == [(0, 1, 0), (1, 0, 1)]
-    assert learner.coordinator.evaluation.done
+    assert learner.evaluation.done
     assert learner.coordinator.members[A].strikes == 0
 
 
@@ -139,7 +139,7 @@ def test_an_answer_of_other_matches_is_refused_and_its_ticket_is_dealt_again(
     opponents: Sequence[int | None], score: float, says: str
 ) -> None:
     learner = Learner(lanes=1, **TEAMS)
-    order, evaluation = asked(learner), learner.coordinator.evaluation
+    order, evaluation = asked(learner), learner.evaluation
     wrong = against(order, opponents, score)
     why = evaluation.take_in(learner.coordinator.members[A], wrong).why
     assert re.fullmatch(f"evaluation of ticket {order.ticket}: {says}", why), why
@@ -156,7 +156,7 @@ def test_without_teams_an_answer_names_no_opponents() -> None:
     order = asked(learner)
     assert order.opponents == order.teams == ()
     wrong = against(order, (0, 0, -1, -1, 0, 0))
-    why = learner.coordinator.evaluation.take_in(learner.coordinator.members[A], wrong).why
+    why = learner.evaluation.take_in(learner.coordinator.members[A], wrong).why
     assert why == f"evaluation of ticket {order.ticket}: episode: expected no opponent, got 0"
 
 
@@ -183,7 +183,7 @@ def test_rows_come_in_the_order_of_the_episodes_with_their_numbers_in_the_plan()
     learner.coordinator.evaluation.most_copies = 2
     found = EvaluationPlan((2, 2, 2, 2), copies=2, most_steps=9, send_rows=True)
     (order,) = orders(learner.coordinator.begin_evaluation(found, take))
-    while not learner.coordinator.evaluation.done:
+    while not learner.evaluation.done:
         for episode in (1, 0):
             for step in range(2):
                 learner.says(A, fake_rows(order.session, order.ticket, episode, step))
@@ -199,7 +199,7 @@ def test_a_rollout_on_a_ticket_of_an_evaluation_costs_the_evaluation_nothing() -
     learner.says(A, rollout)
     assert learner.coordinator.members[A].strikes == 1
     learner.says(A, answer(order))
-    assert learner.coordinator.evaluation.done
+    assert learner.evaluation.done
 
 
 def shared(on_rows: OnRows | None = None) -> tuple[Learner, Evaluate, Evaluate]:
@@ -216,7 +216,7 @@ def shared(on_rows: OnRows | None = None) -> tuple[Learner, Evaluate, Evaluate]:
 @pytest.mark.parametrize("faster", [A, B])
 def test_of_two_workers_that_play_a_ticket_the_first_answer_counts(faster: bytes) -> None:
     learner, first, second = shared()
-    evaluation = learner.coordinator.evaluation
+    evaluation = learner.evaluation
     slower, late = (B, answer(second)) if faster == A else (A, answer(first))
     learner.says(faster, answer(first) if faster == A else answer(second))
     assert evaluation.done
@@ -224,7 +224,7 @@ def test_of_two_workers_that_play_a_ticket_the_first_answer_counts(faster: bytes
     held = [number for member in learner.coordinator.members.values() for number in member.tickets]
     assert max(held) < FIRST_TICKET, "both are free for rollouts"
     learner.says(slower, late)
-    assert [one.episode.length for one in evaluation.end()] == [2, 3]
+    assert [one.episode.length for one in learner.coordinator.evaluation.end()] == [2, 3]
     assert learner.coordinator.members[slower].strikes == 0, "it is slow, and has done nothing wrong"
 
 
@@ -260,9 +260,9 @@ def test_a_wrong_answer_of_one_leaves_the_ticket_with_the_other() -> None:
     learner, first, second = shared()
     learner.says(B, msgspec.structs.replace(answer(second), cut=()))
     assert learner.coordinator.members[B].strikes == 1
-    assert [member.peer for member in learner.coordinator.evaluation.players] == [A]
+    assert [member.peer for member in learner.evaluation.players] == [A]
     learner.says(A, answer(first))
-    assert learner.coordinator.evaluation.done
+    assert learner.evaluation.done
 
 
 def test_rows_of_one_worker_count_only_with_its_own_answer() -> None:

@@ -73,7 +73,7 @@ def test_rows_of_a_worker_that_left_do_not_count() -> None:
     for step in range(2):
         played.learner.says(B, played.rows(step))
     played.learner.says(B, played.answer(2))
-    assert played.learner.coordinator.evaluation.done
+    assert played.learner.evaluation.done
     assert played.taken == [(0, 0), (0, 1)]
 
 
@@ -86,7 +86,7 @@ def test_rows_before_an_answer_that_they_do_not_fit_are_played_again() -> None:
     for step in (0, 0, 1, 1):  # a message may come twice
         played.learner.says(A, played.rows(step))
     played.learner.says(A, played.answer(2))
-    assert played.learner.coordinator.evaluation.done
+    assert played.learner.evaluation.done
     assert played.taken == [(0, 0), (0, 1)]
     assert played.strikes() == 0, "the network may lose a message"
 
@@ -111,24 +111,25 @@ def test_what_another_worker_says_of_a_ticket_changes_nothing() -> None:
     for step in range(5):
         played.learner.says(B, msgspec.structs.replace(played.rows(step), session=session))
     played.learner.says(B, msgspec.structs.replace(played.answer(5), session=session))
-    assert played.learner.coordinator.evaluation.episodes_played == 0
+    assert played.learner.evaluation.episodes_played == 0
     played.learner.says(A, played.rows(0))
     played.learner.says(A, played.answer(1))
-    assert played.learner.coordinator.evaluation.done
+    assert played.learner.evaluation.done
     assert (played.taken, played.strikes(B)) == ([(0, 0)], 0)
 
 
 def test_rows_that_were_not_asked_for_are_not_kept() -> None:
     """A worker could send as many as an episode may have, of each ticket."""
     played = Played()
-    evaluation = played.learner.coordinator.evaluation
-    evaluation.end()
+    played.learner.coordinator.evaluation.end()
+    played.learner.says(A, played.rows(0))  # while no evaluation is pending
     plan = EvaluationPlan((7,), 1, MOST_STEPS)
     played.order = played.order_in(played.learner.coordinator.begin_evaluation(plan), A)
     played.learner.says(A, played.rows(0))
-    assert evaluation._rows == {}
+    assert played.learner.evaluation._rows == {}
     played.learner.says(A, played.answer(1))
-    assert evaluation.done
+    assert played.learner.evaluation.done
+    assert played.strikes() == 0
 
 
 def test_an_answer_holds_nothing_but_what_was_asked_for() -> None:
@@ -159,8 +160,8 @@ def test_an_answer_that_no_player_gives_is_a_strike(changes: dict[str, object]) 
 @pytest.mark.parametrize("facts", [(), (1.0, 2.0), (math.inf,)])
 def test_an_answer_with_wrong_facts_is_a_strike(facts: tuple[float, ...]) -> None:
     played = Played()
-    dealer = played.learner.coordinator.evaluation
-    dealer._run = msgspec.structs.replace(dealer._run, facts=("a number",))
+    evaluation = played.learner.evaluation
+    evaluation._run = msgspec.structs.replace(evaluation._run, facts=("a number",))
     answer = played.answer(1)
     episodes = tuple(msgspec.structs.replace(episode, facts=facts) for episode in answer.episodes)
     played.learner.says(A, msgspec.structs.replace(answer, episodes=episodes))
@@ -196,7 +197,7 @@ def test_frames_have_one_size_and_end_at_a_limit() -> None:
     assert played.strikes() == 2
     played.learner.says(A, played.rows(MOST_FRAMES - 1))
     played.learner.says(A, played.answer(MOST_FRAMES))
-    assert played.learner.coordinator.evaluation.done
+    assert played.learner.evaluation.done
 
 
 @pytest.mark.parametrize(
@@ -242,12 +243,12 @@ def of_seats(played: Played, count: int) -> EpisodeRows:
 @pytest.mark.parametrize("count", [0, 1, 3])
 def test_rows_are_of_all_seats_of_the_run(count: int) -> None:
     played = Played()
-    dealer = played.learner.coordinator.evaluation
+    evaluation = played.learner.evaluation
     played.learner.says(A, of_seats(played, 2))
     assert played.strikes() == 1, "the run has no seats"
-    dealer._run = msgspec.structs.replace(dealer._run, seats=("black", "white"))
+    evaluation._run = msgspec.structs.replace(evaluation._run, seats=("black", "white"))
     for rows in (played.rows(0), of_seats(played, count)):
-        assert "expected float32[2, 2, 1], got" in reason_to_reject(rows, [], dealer._run, MOST_STEPS, with_frames=False)
+        assert "expected float32[2, 2, 1], got" in reason_to_reject(rows, [], evaluation._run, MOST_STEPS, with_frames=False)
         played.learner.says(A, rows)
     assert A not in played.learner.coordinator.members, "three strikes"
 
@@ -263,8 +264,8 @@ def test_the_first_wrong_value_of_a_row_is_named_by_its_seat() -> None:
 
 def test_a_return_is_one_that_the_rewards_of_all_seats_can_give() -> None:
     played = Played()
-    dealer = played.learner.coordinator.evaluation
-    dealer._run = msgspec.structs.replace(dealer._run, seats=("black", "white"))
+    evaluation = played.learner.evaluation
+    evaluation._run = msgspec.structs.replace(evaluation._run, seats=("black", "white"))
     for total, strikes in ((2.001 * LARGEST_REWARD, 1), (math.nan, 2), (2 * LARGEST_REWARD, 2)):
         played.learner.says(A, of_seats(played, 2))
         played.learner.says(A, msgspec.structs.replace(played.answer(1), episodes=(Episode(total, 1, 0.0),)))

@@ -28,6 +28,7 @@ from millrace.protocol.wire.weight_dtypes import ActingDtype, to_float32
 from tests.support.conversation.example_messages import example
 from tests.support.conversation.fake_ends import fake_rollout, run_spec
 from tests.support.conversation.fake_link import FakeLink
+from tests.support.conversation.rules import pending_evaluation
 from tests.support.in_process.fake_processes import FakeProcesses
 
 WORKER_TIMEOUT_S = 3.0
@@ -155,7 +156,7 @@ def test_a_wait_for_an_evaluation_without_env_steps_names_who_is_waited_for(
     def poll_while_it_works(timeout_s: float) -> bool:
         steps = int(10 * min(link.now, steps_until_s))
         if answers or link.now < steps_until_s:
-            ticket = next(iter(hub.coordinator.evaluation.playing))
+            ticket = next(iter(pending_evaluation(hub.coordinator).playing))
             link.inbox.append((b"w0", msgspec.structs.replace(heartbeat, versions=(0,), tickets=(ticket,), steps=steps)))
         link.now += timeout_s
         return poll(timeout_s)
@@ -218,7 +219,7 @@ def test_the_time_of_each_stage_begins_and_ends_with_it() -> None:
     hub.gather()
     link.now += 7.0
     hub.begin_evaluation(EvaluationPlan((1,), copies=1, most_steps=9))
-    (ticket,) = hub.coordinator.evaluation.playing
+    (ticket,) = pending_evaluation(hub.coordinator).playing
     arrives = 2.0, example(Evaluated, session=1, ticket=ticket, episodes=(Episode(0.0, 1, 0.0),), cut=(False,))
     hub.end_evaluation(lambda played, env_steps: None)
     link.now += 1.0
@@ -248,7 +249,7 @@ def test_only_an_answer_that_is_used_shows_that_the_environment_works() -> None:
     shown = list[str | None]()
     hub._failures.evaluated = shown.append  # type: ignore[method-assign, assignment]
     hub.begin_evaluation(EvaluationPlan((1,), copies=1, most_steps=9))
-    (ticket,) = hub.coordinator.evaluation.playing
+    (ticket,) = pending_evaluation(hub.coordinator).playing
     answer = example(Evaluated, session=1, ticket=ticket, episodes=(Episode(0.0, 1, 0.0),), cut=(False,))
     strangers = [(b"w7", answer), (b"w0", msgspec.structs.replace(answer, ticket=ticket + 1))]
     for peer, message in [*strangers, (b"w0", answer)]:

@@ -359,11 +359,11 @@ def test_a_worker_holds_a_second_ticket_of_an_evaluation_only_while_there_are_pl
     learner = about_to_evaluate()
     plan = EvaluationPlan(seeds=tuple(range(tickets)), copies=1, most_steps=10)
     learner.balanced(learner.coordinator.begin_evaluation(plan))
-    dealt = {number: list(members) for number, members in learner.coordinator.evaluation.playing.items()}
+    dealt = {number: list(members) for number, members in learner.evaluation.playing.items()}
     assert Counter(member.peer for (member,) in dealt.values()) == {A: shares[0], B: shares[1]}
     for peer in (A, B, A, B):
         learner.beats(peer)
-        assert learner.coordinator.evaluation.playing == dealt
+        assert learner.evaluation.playing == dealt
 
 
 @pytest.mark.parametrize(("most", "evaluators"), [(0, {A, B}), (5, {A, B}), (4, {A}), (1, {A})])
@@ -371,7 +371,7 @@ def test_with_a_limit_of_copies_as_few_workers_play_evaluations_as_it_allows(mos
     learner = about_to_evaluate()
     learner.coordinator.evaluation.most_copies = most - 1 if most else None
     learner.balanced(learner.coordinator.begin_evaluation(EvaluationPlan(seeds=(1, 2, 3, 4), copies=2, most_steps=10)))
-    assert {member.peer for member in learner.coordinator.evaluation.players} == evaluators
+    assert {member.peer for member in learner.evaluation.players} == evaluators
 
 
 @pytest.mark.parametrize(("of_run", "of_machine", "least"), [(0, 0, 0), (9, 0, 9), (0, 7, 7), (9, 7, 7), (7, 9, 7)])

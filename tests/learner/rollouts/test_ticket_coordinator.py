@@ -24,7 +24,7 @@ from millrace.learner.members.events import (
     describe,
 )
 from millrace.learner.members.membership import Outgoing
-from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan
+from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan, PendingEvaluation
 from millrace.learner.rollouts.lag_rule import Rounds
 from millrace.learner.rollouts.lane_history import LaneHistories
 from millrace.learner.rollouts.lanes import TicketedLane
@@ -72,7 +72,7 @@ from tests.support.conversation.fake_ends import (
     run_spec,
     spoiled,
 )
-from tests.support.conversation.rules import check_ledger
+from tests.support.conversation.rules import check_ledger, pending_evaluation
 
 M = TypeVar("M")
 A, B, C = b"a", b"b", b"c"
@@ -103,6 +103,11 @@ class Learner:
         self.now = 0.0
         if publish:
             self.publish(0)
+
+    @property
+    def evaluation(self) -> PendingEvaluation:
+        """The evaluation that is pending."""
+        return pending_evaluation(self.coordinator)
 
     def publish(self, version: int) -> list[Outgoing]:
         """New weights, with which the next update begins."""

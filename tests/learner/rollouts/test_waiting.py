@@ -16,6 +16,7 @@ from millrace.protocol.rollout import Episode
 from tests.learner.rollouts.test_ticket_coordinator import Learner
 from tests.support.conversation.example_messages import example
 from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS
+from tests.support.conversation.rules import pending_evaluation
 from tests.support.in_process.fake_processes import FakeProcesses
 
 A, B = b"a", b"b"
@@ -120,7 +121,7 @@ def test_env_steps_of_a_rollout_that_has_come_and_of_an_evaluation_are_not_count
     run.learner.delivers(0)
     assert coordinator.collected() == 1
     run.learner.take()
-    (ticket,) = coordinator.evaluation.playing
+    (ticket,) = pending_evaluation(coordinator).playing
     episode = Episode(1.0, 5, 0.0)
     run.learner.says(A, example(Evaluated, session=run.learner.session(A), ticket=ticket, episodes=(episode,), cut=(False,)))
     coordinator.evaluation.end()

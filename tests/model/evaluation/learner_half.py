@@ -11,7 +11,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from millrace.learner.members.membership import Outgoing
-from millrace.learner.rollouts.evaluation_dealer import FIRST_TICKET, EvaluationDealer
+from millrace.learner.rollouts.evaluation_dealer import FIRST_TICKET, EvaluationDealer, PendingEvaluation
 from millrace.protocol.messages import EpisodeRows, ToLearner
 from millrace.protocol.rules import Rule
 from tests.model import learner_part
@@ -20,13 +20,20 @@ from tests.model.learner_part import Learner
 from tests.model.message_content import EPISODE_STEPS, evaluated, peer_of, session, ticket, worker_of
 from tests.model.names import Kind, name
 from tests.support.conversation.fake_ends import fake_rows
+from tests.support.conversation.rules import pending_evaluation
 
 if TYPE_CHECKING:
     from tests.model.evaluation.evaluating import Evaluating
 
-SAVED = {"_plan", "version", "_first", "_seeds", "_undealt", "playing", "_played", "_rows", "beside"}
-"""What of `EvaluationDealer` is saved. `_seeds` follow from the plan."""
-NOT_SAVED = {"_run", "_on_rows", "most_copies", "_most_workers", "_late"}
+SAVED: dict[type, set[str]] = {
+    EvaluationDealer: {"pending", "_next_ticket"},
+    PendingEvaluation: {"plan", "version", "beside", "seeds", "playing", "_first", "_undealt", "_played", "_rows"},
+}
+"""What is saved. `seeds` follow from the plan, and `_next_ticket` from `_first` while an evaluation is pending."""
+NOT_SAVED: dict[type, set[str]] = {
+    EvaluationDealer: {"_run", "most_copies", "_late"},
+    PendingEvaluation: {"_run", "_on_rows", "_most_copies", "_most_workers", "_late"},
+}
 """A second worker is asked only after ten minutes, so there is none here, and nobody is late."""
 
 
@@ -42,9 +49,8 @@ class EvaluatingLearner(Learner):
     @property
     def awaits(self) -> bool:
         """Whether the learner waits for the pending evaluation: all play it, or the next one is due, or the run ends."""
-        evaluation, version = self.coordinator.evaluation, self.coordinator.version
-        waits = self.settings.evaluators is None or version >= self.settings.updates or self._is_due()
-        return evaluation.pending and waits
+        waits = self.settings.evaluators is None or self.coordinator.version >= self.settings.updates or self._is_due()
+        return self.coordinator.evaluation.pending is not None and waits
 
     # ---------------------------------------------------------------- events
 
@@ -54,8 +60,8 @@ class EvaluatingLearner(Learner):
 
     def check(self) -> None:
         super().check()
-        evaluation = self.coordinator.evaluation
-        if evaluation.pending and not evaluation.beside:
+        evaluation = self.coordinator.evaluation.pending
+        if evaluation is not None and not evaluation.beside:
             assert self.coordinator.rollouts.ledger.issued == self.barrier, (
                 "a ticket for a rollout was dealt during an evaluation"
             )
@@ -72,17 +78,17 @@ class EvaluatingLearner(Learner):
 
     def _publish(self, version: int) -> list[Outgoing]:
         self._set_weights(version)
-        out = self._begin_evaluation() if self._is_due() and not self.coordinator.evaluation.pending else []
+        out = self._begin_evaluation() if self._is_due() and self.coordinator.evaluation.pending is None else []
         return out if self.awaits else [*out, *self.coordinator.begin_update()]
 
     def _needed(self) -> set[int]:
-        evaluation = self.coordinator.evaluation
-        return super()._needed() | ({evaluation.version} if evaluation.pending else set())
+        evaluation = self.coordinator.evaluation.pending
+        return super()._needed() | (set() if evaluation is None else {evaluation.version})
 
     def _is_due(self) -> bool:
-        """Whether the newest version is to be evaluated, and that was not begun."""
-        version = self.coordinator.version
-        return version in self.settings.evaluated and version != self.coordinator.evaluation.version
+        """Whether the newest version is to be evaluated, and its evaluation isn't pending."""
+        version, pending = self.coordinator.version, self.coordinator.evaluation.pending
+        return version in self.settings.evaluated and (pending is None or version != pending.version)
 
     def _begin_evaluation(self) -> list[Outgoing]:
         coordinator, settings = self.coordinator, self.settings
@@ -104,7 +110,7 @@ class EvaluatingLearner(Learner):
 
     def _await(self) -> list[Outgoing]:
         """The learner waits: let all play, if they must. Go on if the evaluation is done."""
-        coordinator, evaluation = self.coordinator, self.coordinator.evaluation
+        coordinator, evaluation = self.coordinator, pending_evaluation(self.coordinator)
         if not evaluation.done:
             if not evaluation.beside:
                 return []
@@ -115,12 +121,13 @@ class EvaluatingLearner(Learner):
                 "all play an evaluation although a worker is there that only evaluates"
             )
             return out
+        is_due = self._is_due()
         self._end_evaluation()
-        out = self._begin_evaluation() if self._is_due() else []
+        out = self._begin_evaluation() if is_due else []
         return [*out, *self._gather()]
 
     def _end_evaluation(self) -> None:
-        plan, version = self.settings.plan, self.coordinator.evaluation.version
+        plan, version = self.settings.plan, pending_evaluation(self.coordinator).version
         played = [one.episode.reward for one in self.coordinator.evaluation.end()]
         assert played == [seed + version / 1000 for seed in plan.seeds], f"other episodes than those asked for: {played}"
         every = [(episode, step) for episode in range(len(plan.seeds)) for step in range(EPISODE_STEPS)]
@@ -134,11 +141,11 @@ class EvaluatingLearner(Learner):
 
 
 def saved(learner: EvaluatingLearner, now: float) -> Content:
-    """The training run, and the evaluation: its first ticket, their number, and more if it is pending."""
+    """The training run; then the next ticket of an evaluation or, if one is pending, its first ticket and its state."""
     content = learner_part.saved(learner, now)
-    tickets = learner.coordinator.evaluation
-    if not tickets.pending:
-        return content, (tickets._first - FIRST_TICKET, len(tickets._seeds))
+    tickets = learner.coordinator.evaluation.pending
+    if tickets is None:
+        return content, (learner.coordinator.evaluation._next_ticket - FIRST_TICKET,)
     held = tuple(
         (
             name(Kind.WORKER, worker_of(member.peer)),
@@ -160,29 +167,28 @@ def saved(learner: EvaluatingLearner, now: float) -> Content:
     first, undealt = tickets._first - FIRST_TICKET, tuple(sorted(tickets._undealt))
     barrier = None if tickets.beside else ticket(learner.barrier)
     more = undealt, held, played, rows, tickets.version, barrier, tuple(learner.rows)
-    return content, (first, len(tickets._seeds), *more)
+    return content, (first, *more)
 
 
 def is_pending(of_evaluation: Content) -> bool:
     """Whether an evaluation is pending in this part of a learner's content."""
-    return len(of_evaluation) > 2
+    return len(of_evaluation) > 1
 
 
 def loaded(content: Content, settings: Evaluating) -> EvaluatingLearner:
     """A learner at the time 0 with this content."""
-    both, (first, number, *of_evaluation) = content
+    both, (first, *of_evaluation) = content
     training = learner_part.loaded(both, settings)
     learner = EvaluatingLearner(settings, training.coordinator)
     vars(learner).update(vars(training))
     learner.rows = []
-    tickets: EvaluationDealer = learner.coordinator.evaluation
-    tickets._first = FIRST_TICKET + first
+    learner.coordinator.evaluation._next_ticket = FIRST_TICKET + first
     if not of_evaluation:
-        tickets._seeds = [()] * number
         return learner
     undealt, held, played, rows, version, barrier, of_learner = of_evaluation
     on_rows = learner._take_rows if settings.rows else None
-    tickets.begin(settings.plan, version, on_rows, beside=barrier is None)
+    learner.coordinator.evaluation.begin(settings.plan, version, on_rows, beside=barrier is None)
+    tickets = pending_evaluation(learner.coordinator)
     tickets._undealt = list(undealt)
     for worker, mine in held:
         member = learner.coordinator.members[peer_of(worker.value)]

@@ -26,26 +26,26 @@ MUTATIONS = {
     "tickets for rollouts are dealt during an evaluation": Mutation(
         None,
         COORDINATOR,
-        "if self.evaluation.beside or not self.evaluation.pending:",
+        "if evaluation is None or evaluation.beside:",
         "if True:",
     ),
     "the weights of an evaluation are not sent after its orders": Mutation(
         Rule.WEIGHTS_AFTER,
         COORDINATOR,
         "        return self.weights.after(out, self.members)",
-        "        return out if self.evaluation.pending else self.weights.after(out, self.members)",
+        "        return self.weights.after(out, self.members) if evaluation is None else out",
     ),
     "the lost weights of an evaluation are not sent again": Mutation(
         Rule.WEIGHTS_AGAIN, WEIGHTS, "return {order.ticket: order.versions}", "return {order.ticket: set()}"
     ),
     "a lost order to evaluate is not sent again": Mutation(
-        Rule.ORDER_AGAIN, COORDINATOR, " + self.evaluation.send(member, lost)", ""
+        Rule.ORDER_AGAIN, COORDINATOR, "orders += self.evaluation.pending.send(member, lost)", "pass"
     ),
     "the evaluation's tickets of a lost worker are kept": Mutation(
-        None, COORDINATOR, "dealer.lose(member, number)", "dealer is self.rollouts and dealer.lose(member, number)"
+        None, COORDINATOR, "self.evaluation.pending.lose(member, number)", "pass"
     ),
     "two evaluations number their tickets alike": Mutation(
-        Rule.TICKET_NUMBERS, TICKETS, "self._first += len(self._seeds)", "pass"
+        Rule.TICKET_NUMBERS, TICKETS, "self._next_ticket += len(self.pending.seeds)", "pass"
     ),
     "a ticket of an evaluation is dealt twice": Mutation(
         Rule.TICKET_NUMBERS, TICKETS, "heapq.heappop(self._undealt)", "self._undealt[0]"
@@ -96,16 +96,16 @@ MUTATIONS = {
         None, TICKETS, "if member.hello.evaluates or not self.beside]", "if member.hello.evaluates]"
     ),
     "rollouts wait for an evaluation beside training": Mutation(
-        None, COORDINATOR, "if self.evaluation.beside or not self.evaluation.pending:", "if not self.evaluation.pending:"
+        None, COORDINATOR, "if evaluation is None or evaluation.beside:", "if evaluation is None:"
     ),
     "an evaluation waits for a lost worker that only evaluates": Mutation(
-        None, COORDINATOR, "self.evaluation.all_play()\n", "pass\n"
+        None, COORDINATOR, "        evaluation.all_play()\n", "        pass\n"
     ),
     "all play an evaluation although a worker is there that only evaluates": Mutation(
-        None, COORDINATOR, "if any(member.hello.evaluates for member in self.membership.active()):", "if False:"
+        None, COORDINATOR, " or any(member.hello.evaluates for member in self.membership.active()):", ":"
     ),
     "the weights of a pending evaluation are not kept": Mutation(
-        None, COORDINATOR, "needed.add(self.evaluation.version)", "pass"
+        None, COORDINATOR, "needed.add(self.evaluation.pending.version)", "pass"
     ),
     "what a worker has dropped counts as held": Mutation(
         Rule.KEEP,

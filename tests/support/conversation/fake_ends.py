@@ -57,7 +57,7 @@ from millrace.workers.conversation.session import (
 )
 from millrace.workers.shared_weights import is_of_learner
 from tests.support.conversation.example_messages import example
-from tests.support.conversation.rules import check_tickets
+from tests.support.conversation.rules import check_tickets, pending_evaluation
 
 PARAMETERS = np.zeros(1, np.float32)
 BUFFERS = np.zeros(0, np.float32)
@@ -518,9 +518,9 @@ class World:
 
     def _evaluating(self) -> bool:
         """Whether the learner waits for an evaluation. Ends one that is done, and checks its result."""
-        evaluation = self.coordinator.evaluation
         if self.plan is None:
             return False
+        evaluation = pending_evaluation(self.coordinator)
         if not evaluation.done:
             if evaluation.beside and self.due:
                 self.to_workers(self.coordinator.await_evaluation())
@@ -530,7 +530,7 @@ class World:
                 self.shared += sum(len(members) > 1 for members in evaluation.playing.values())
             return self.due or not evaluation.beside
         plan, self.plan = self.plan, None
-        played = evaluation.end()
+        played = self.coordinator.evaluation.end()
         expected = [seed + self.evaluated / 1000 for seed in plan.seeds]
         assert [one.episode.reward for one in played] == expected, "the episodes are not those of the seeds"
         if plan.send_rows:
@@ -593,7 +593,7 @@ class World:
 
     def check(self) -> None:
         check_tickets(self.coordinator, self.max_lag, shares=self.faults.shares > 0.0)
-        if self.plan is not None and not self.coordinator.evaluation.beside:
+        if self.plan is not None and not pending_evaluation(self.coordinator).beside:
             issued = self.coordinator.rollouts.ledger.issued
             assert issued == self.issued_at_barrier, "a ticket for a rollout was dealt during an evaluation"
         if self.epoch == 0:

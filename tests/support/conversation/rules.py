@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from millrace.learner.rollouts.evaluation_dealer import FIRST_TICKET, HELD_AT_ONCE
+from millrace.learner.rollouts.evaluation_dealer import FIRST_TICKET, HELD_AT_ONCE, PendingEvaluation
 from millrace.learner.rollouts.rollout_dealer import AcceptedRollout
 from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
 from millrace.protocol.rules import Rule
@@ -43,7 +43,8 @@ def check_tickets(coordinator: TicketCoordinator, max_lag: int, *, shares: bool 
         assert rollouts.lanes[each.permit.lane].owner == each.peer, (
             f"{Rule.LANE_MOVES}: a ticket of a lane that its worker does not own"
         )
-    playing = [number for number, of_ticket in coordinator.evaluation.playing.items() for _ in of_ticket]
+    evaluation = coordinator.evaluation.pending
+    playing = [] if evaluation is None else [number for number, mine in evaluation.playing.items() for _ in mine]
     held = sorted([*rollouts.held, *playing])
     assert held == sorted(number for member in members.values() for number in member.tickets), (
         f"{Rule.TICKET_NUMBERS}: a ticket has two holders"
@@ -55,15 +56,22 @@ def check_tickets(coordinator: TicketCoordinator, max_lag: int, *, shares: bool 
     check_evaluation(coordinator, shares=shares)
 
 
+def pending_evaluation(coordinator: TicketCoordinator) -> PendingEvaluation:
+    """The evaluation that has begun and not ended."""
+    pending = coordinator.evaluation.pending
+    assert pending is not None, "no evaluation is pending"
+    return pending
+
+
 def check_evaluation(coordinator: TicketCoordinator, *, shares: bool = False) -> None:
     """While an evaluation is pending, its weights are kept, and each of its tickets is in one place."""
-    tickets, members = coordinator.evaluation, coordinator.members
-    if not tickets.pending:
+    tickets, members = coordinator.evaluation.pending, coordinator.members
+    if tickets is None:
         return
     assert tickets.version in coordinator.weights.kept, "the weights of an evaluation were dropped"
     held = [number - tickets._first for number in tickets.playing]
     every = sorted([*tickets._undealt, *held, *tickets._played])
-    assert every == list(range(len(tickets._seeds))), "a ticket of an evaluation is not in one place"
+    assert every == list(range(len(tickets.seeds))), "a ticket of an evaluation is not in one place"
     assert all(len(of_ticket) in (1, 2) for of_ticket in tickets.playing.values()), "a ticket is with nobody, or with three"
     for number, member in [(number, member) for number, of_ticket in tickets.playing.items() for member in of_ticket]:
         assert members.get(member.peer) is member, "a ticket of an evaluation is with a worker that is gone"

@@ -34,6 +34,7 @@ from millrace.learner.run_folder.progress import Progress
 from millrace.learner.run_folder.results import Evaluation
 from millrace.learner.run_folder.run_folder import Interrupted
 from millrace.protocol.rollout import Batch
+from tests.support.conversation.rules import pending_evaluation
 from tests.system.stage.processes import START_S, Stage, crowding
 from tests.system.stage.run_folders import folder_of, policy_of, saved_rollouts, summary
 
@@ -369,9 +370,9 @@ def interrupted_at_the_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, **se
     end_evaluation = Hub.end_evaluation
 
     def interrupted(hub: Hub, watch: Callable[[int, int], None]) -> list[PlayedEpisode]:
-        plan = hub.coordinator.evaluation.plan
+        of_best = pending_evaluation(hub.coordinator).plan.of_best
         played = end_evaluation(hub, watch)
-        if plan is not None and plan.of_best:
+        if of_best:
             raise KeyboardInterrupt
         return played
 
