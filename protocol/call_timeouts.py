@@ -64,8 +64,12 @@ class CallTimeouts(msgspec.Struct, frozen=True):
         """The longest time that a call may take; infinite if one of them may take any time."""
         return max(self.limit_s("making"), self.limit_s("stepping"))
 
-    def reason(self, doing: Doing) -> str:
-        """Why a worker that exceeds its limit is ended, in a line that names the flag."""
+    def limit_in_words(self, doing: Doing) -> str:
+        """The limit of this activity, and the flag that sets it."""
         flag = "step" if doing in ("stepping", "repeating", "acting", "evaluating") else "start"
         named = f" (--{flag}-timeout-s)" if doing != "closing" else ""
-        return f"was ended: {CALLS[doing]} took longer than {self.limit_s(doing):g} s{named}"
+        return f"{self.limit_s(doing):g} s{named}"
+
+    def reason(self, doing: Doing) -> str:
+        """Why a worker that exceeds its limit is ended, in a line that names the flag."""
+        return f"was ended: {CALLS[doing]} took longer than {self.limit_in_words(doing)}"

@@ -3,12 +3,14 @@
 Rule: waits shorter than `LONG_S` aren't mentioned. Between two long waits for rollouts, the line mentions the last wait, so
 that the text does not appear and disappear all the time. While the learner waits, the line names the lanes whose rollouts
 are missing for the next update. It also says how many of that update's env steps have been made, because with a slow
-simulator the first update may be far away. While the learner learns, the line says how many workers wait for weights. The
-shares are fractions of the training time since the learner started, without evaluations.
+simulator the first update may be far away, and how long a call that may hang can take. While the learner learns, the line
+says how many workers wait for weights. The shares are fractions of the training time since the learner started, without
+evaluations.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Literal, get_args
 
@@ -23,6 +25,7 @@ Phase = Literal["starting", "gathering", "learning", "evaluating"]
 SHARES_AFTER_S = 30.0
 SHORT_S = 180.0  # longer times are given in minutes
 MOST_LANES = 4  # the largest number of lanes that a line names
+LIMIT_AFTER_S = 20.0  # the line says how long a call may take once it has taken this long
 
 
 class LearnerTime:
@@ -129,7 +132,19 @@ class LearnerTime:
 
     def _held_up_longest(self, members: list[Member], now: float) -> str:
         """The worker held up longest: one of these members or, if other workers step for them, one of the other workers."""
-        return max((held_up(member, now) for member in self._processes.stepping() or members), default=("nobody plays",))[-1]
+        who = self._processes.stepping() or members
+        if not who:
+            return "nobody plays"
+        member = max(who, key=lambda member: held_up(member, now))
+        *_, line = held_up(member, now)
+        activity = member.activity
+        silent = now - member.alive_s >= LONG_S
+        if activity is None or silent or member.status(now).doing_s < LIMIT_AFTER_S:
+            return line
+        limits = self._coordinator.run.call_timeouts
+        if limits.limit_s(activity.doing) == math.inf:
+            return line
+        return f"{line}, at most {limits.limit_in_words(activity.doing)}"
 
 
 def _in_words(seconds: float) -> str:

@@ -165,6 +165,21 @@ def test_without_a_worker_it_says_what_is_known_of_the_last_one() -> None:
     assert run.line == f"waiting 3 s for {NO_WORKER}"
 
 
+@pytest.mark.parametrize(
+    ("doing", "said"),
+    [
+        ("stepping", "in step for 38 s, at most 600 s (--step-timeout-s)"),
+        ("resetting", "in reset for 38 s, at most 600 s (--start-timeout-s)"),
+    ],
+)
+def test_of_a_call_that_may_hang_it_is_said_when_it_is_ended(doing: Doing, said: str) -> None:
+    run = Run(lanes=1)
+    run.turn("gathering")
+    run.learner.now += 40.0
+    run.does(A, doing, 38.0)
+    assert run.line.startswith(f"waiting 40 s for lane 0 (worker a on host-of-a: {said})")
+
+
 def test_with_a_lag_every_lane_that_may_bring_the_next_rollout_counts_once() -> None:
     run = Run(lanes=2, max_lag=1, workers=(A, B))
     assert len(run.learner.tickets()) == 4

@@ -83,6 +83,8 @@ def test_numbers_have_the_same_words_everywhere() -> None:
     assert steps_in_words(progress) == "9,999 of 10,000"
     assert percent(progress) == "99%", "it is not done"
     assert workers_in_words(progress) == "1 of 2"
+    beyond = RunProgress(env_steps=9_900, collected=151, total_steps=10_000)
+    assert steps_in_words(beyond) == "10,000 of 10,000", "no update uses more"
     without_end = RunProgress(env_steps=9_000, workers_alive=3)
     assert (steps_in_words(without_end), percent(without_end), workers_in_words(without_end)) == ("9,000", "0%", "3")
     assert (return_in_words(None), return_in_words(-1_234.56)) == ("none yet", "-1,234.6")
