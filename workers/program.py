@@ -32,7 +32,7 @@ from millrace.workers.machine_slots import share_slots
 from millrace.workers.shared_weights import SharedWeightsReader
 from millrace.workers.supervise.process_group import kill, live_members
 from millrace.workers.supervise.worker_process import KILLED_WITHIN_S, NONCE_VARIABLE, POLL_S
-from millrace.workers.watchdog import Watchdog
+from millrace.workers.watchdog import STDERR, Watchdog
 from millrace.workers.worker import Worker, WorkerOptions, identity, parent_is_gone
 
 LEAVE_AT_ONCE = 2  # number of requests to leave after which the rollout in progress is abandoned
@@ -80,11 +80,19 @@ def work(flags: WorkerFlags, token: Token | None, signals: list[int]) -> int:
     left = Worker(link, session, options).run()
     watchdog.stop()
     if left.exit_code:
-        sys.stderr.write(f"worker {flags.called}: {_explained(left.reason, link)}\n")
+        _say(f"worker {flags.called}: {_explained(left.reason, link)}\n")
     if parent_is_gone(flags.parent):
         _remove_socket_of_killed_parent(flags.address)
         _kill_own_session()
     return _exit_code(left.exit_code, left.reason)
+
+
+def _say(text: str) -> None:
+    """Write to stderr, even if the environment has replaced or closed `sys.stderr`."""
+    with suppress(Exception):
+        sys.stderr.flush()
+    with suppress(OSError):
+        os.write(STDERR, text.encode(errors="backslashreplace"))
 
 
 def _exit_code(code: int, reason: str) -> int:
@@ -107,7 +115,8 @@ def _kill_own_session() -> None:
     This process is ended last, because only it still holds the slots of its env copies.
     """
     if os.getpgrp() == os.getpid():
-        sys.stderr.flush()
+        with suppress(Exception):  # the environment may have replaced or closed it
+            sys.stderr.flush()
         give_up_at_s = time.monotonic() + KILLED_WITHIN_S
         while (others := set(live_members(os.getpid())) - {os.getpid()}) and time.monotonic() < give_up_at_s:
             kill(others)

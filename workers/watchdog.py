@@ -18,6 +18,7 @@ from pathlib import Path
 
 FAULTHANDLER_HEADER = "Timeout ("  # the beginning of faulthandler's output
 LONGEST_S = 1e9  # used instead of infinity, which faulthandler doesn't accept
+STDERR = 2  # not `sys.stderr`, which an environment may have replaced by an object without a file descriptor
 OURS = f"{Path(__file__).parents[1]}/"
 LIBRARIES = ("<", f"{sysconfig.get_path('stdlib')}/", OURS)  # path prefixes of code that isn't the user's
 INSTALLED = "-packages/"  # part of the paths of site-packages, and of Debian's dist-packages
@@ -43,7 +44,7 @@ class Watchdog:
         if timeout_s == math.inf:
             self.stop()
         else:
-            faulthandler.dump_traceback_later(min(timeout_s, LONGEST_S) + interval_s, exit=True)
+            faulthandler.dump_traceback_later(min(timeout_s, LONGEST_S) + interval_s, exit=True, file=STDERR)
 
     def stop(self) -> None:
         """Stop the timer."""

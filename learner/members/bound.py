@@ -18,6 +18,7 @@ from millrace.protocol.env_spec import FACTORY, REGISTER_IT
 from millrace.protocol.errors import UsageError
 from millrace.protocol.keys.key_folder import Keyring
 from millrace.protocol.logs.notices import log_notice
+from millrace.protocol.machine.deferred_signals import signals_deferred
 from millrace.protocol.machine.open_files import raise_limit
 from millrace.protocol.wire.learner_link import LearnerLink
 
@@ -58,8 +59,9 @@ def bind(address: str, keyring: Keyring | None, resources: ExitStack, code: str 
     if code and address.startswith("tcp://") and keyring is None:
         instead = REGISTER_IT if code == FACTORY else ""
         raise UsageError(f"{code} is code: it travels over ipc or inproc only, or over tcp with keys{instead}")
-    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-    resources.callback(context.term)
-    link = LearnerLink(address, context, keyring)
-    resources.callback(link.close, linger_s)
+    with signals_deferred():  # a socket that nobody closes would make `context.term` wait forever
+        context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        resources.callback(context.term)
+        link = LearnerLink(address, context, keyring)
+        resources.callback(link.close, linger_s)
     return Bound(link, context, keyring)

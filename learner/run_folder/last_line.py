@@ -26,7 +26,8 @@ def resume_command(run: Path) -> str:
     elsewhere = False
     with suppress(UsageError):
         elsewhere = check_format(run).workers_elsewhere
-    return f"{typed_name()} {'learner' if elsewhere else 'train'} --resume {shlex.quote(str(run))}"
+    where = f"./{run}" if str(run).startswith("-") else str(run)  # else it would be taken for a flag
+    return f"{typed_name()} {'learner' if elsewhere else 'train'} --resume {shlex.quote(where)}"
 
 
 def complete(folder: Path) -> str:

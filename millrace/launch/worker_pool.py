@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import logging
 import math
+import os
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
@@ -132,7 +133,9 @@ def open_worker_pool(where: BindSettings, transport: str, code: str = "") -> Ite
 
     `code`: see `millrace.learner.members.bound.bind`. Raises `UsageError` if the address can't be bound.
     """
-    with ExitStack() as resources:
+    owner = os.getpid()
+    resources = ExitStack()
+    try:
         if where.bind:
             token = None
             bound = listen(where, resources, code)
@@ -140,6 +143,9 @@ def open_worker_pool(where: BindSettings, transport: str, code: str = "") -> Ite
             keyring, token = _temporary_keys(transport, where.keys, insecure=where.insecure)
             bound = bind(private_address(transport, resources), keyring, resources, code)
         yield ActingPool(bound, where, token)
+    finally:
+        if os.getpid() == owner:  # a forked child that ends must not remove the socket on which this process listens
+            resources.close()
 
 
 def _temporary_keys(transport: str, keys: str, *, insecure: bool) -> tuple[Keyring | None, Token | None]:

@@ -56,6 +56,14 @@ def test_a_process_that_feeds_or_stops_the_watchdog_is_not_ended(tmp_path: Path)
     assert run_program(tmp_path, FEED_OFTEN, 0.5, after_s=1.0).stdout == "alive\n"
 
 
+@pytest.mark.parametrize("stderr", ["None", "io.StringIO()"])
+def test_it_works_if_the_environment_has_replaced_stderr(tmp_path: Path, stderr: str) -> None:
+    replaced = f"import io; sys.stderr = {stderr}; watchdog.feed(time.monotonic() + 9); time.sleep(60)"
+    found = run_program(tmp_path, replaced, 0.3)
+    assert (found.returncode, found.stdout) == (1, "")
+    assert where_it_hung(found.stderr) is not None
+
+
 def test_output_without_a_hang_has_no_line() -> None:
     assert where_it_hung("Traceback …\nValueError: no") is None
     assert where_it_hung("said before\nTimeout (0:02:00)!\n") == "an unknown place"
@@ -88,7 +96,7 @@ def test_a_time_that_is_longer_than_any_timer_is_no_error(timeout_s: float) -> N
 def test_the_timer_is_set_at_once_when_another_run_allows_another_time(monkeypatch: pytest.MonkeyPatch) -> None:
     """A worker that no run has welcomed may wait for ever; the first thing that a run asks for may hang."""
     timers: list[float] = []
-    monkeypatch.setattr(faulthandler, "dump_traceback_later", lambda timeout_s, exit: timers.append(timeout_s))
+    monkeypatch.setattr(faulthandler, "dump_traceback_later", lambda timeout_s, exit, file: timers.append(timeout_s))
     monkeypatch.setattr(faulthandler, "cancel_dump_traceback_later", lambda: timers.append(math.inf))
     allowed_s = [math.inf, 100.0, 100.0, 8.0, math.inf]
     watchdog = Watchdog(lambda: allowed_s[0])

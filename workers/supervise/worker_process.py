@@ -68,6 +68,7 @@ class WorkerProcess:
 
     def __init__(self, start: WorkerCommand) -> None:
         self.name = start.name
+        self._owner = os.getpid()
         self._log = start.log
         self.process_nonce = int.from_bytes(os.urandom(6), "little")
         self._slots = open_slots()
@@ -117,6 +118,8 @@ class WorkerProcess:
 
     def ended(self) -> Ending | None:
         """How the worker ended; None while it, or a process that it started, still runs."""
+        if self._is_inherited:
+            return Ending(0, "belongs to the process that started it", on_purpose=True)
         if self._runs():
             return None
         if self._end is None:
@@ -210,8 +213,15 @@ class WorkerProcess:
 
     # ---------------------------------------------------------------- inside
 
+    @property
+    def _is_inherited(self) -> bool:
+        """Whether this process was forked from the one that started the worker. It must leave the worker alone."""
+        return os.getpid() != self._owner
+
     def _runs(self) -> bool:
-        """Whether the worker runs. If it has ended, its session is killed and the worker is reaped."""
+        """Whether the worker runs and belongs to this process. If it has ended, its session is killed and it is reaped."""
+        if self._is_inherited:
+            return False
         if self._exit_code is None and self._has_ended():
             self._kill_session()  # before the process is reaped: until then no other process can have its id
             self._exit_code = self._process.wait()

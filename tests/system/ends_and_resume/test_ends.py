@@ -102,6 +102,7 @@ def test_the_command_that_goes_on_is_of_the_same_kind_and_may_be_pasted_into_a_s
     assert resume_command(here) == "millrace train --resume 'my run'"
     assert resume_command(elsewhere) == "millrace learner --resume mine"
     assert resume_command(Path("gone")) == "millrace train --resume gone"
+    assert resume_command(Path("-gone")) == "millrace train --resume ./-gone"
 
 
 def test_a_watch_that_raises_in_an_evaluation(tmp_path: Path) -> None:

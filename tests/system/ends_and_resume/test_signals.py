@@ -8,12 +8,17 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from benchmarks.program import _run
 from millrace.learner.interrupts import SIGNALS, Interrupts, Stopped, stopped_by_signals
+from millrace.learner.members.bound import bind
+from millrace.protocol.machine.deferred_signals import signals_deferred
+from millrace.protocol.wire.socket_options import set_options
 
 INTERRUPTED = """
 import os, signal, sys, types
@@ -55,6 +60,28 @@ def test_only_the_first_signal_raises_and_at_the_end_they_are_ignored() -> None:
         finally:
             os.kill(os.getpid(), signal.SIGINT)
     assert [signal.getsignal(each) for each in SIGNALS] == [signal.SIG_IGN] * 3
+
+
+def test_a_deferred_signal_interrupts_after_the_block() -> None:
+    done = []
+    with pytest.raises(Stopped), stopped_by_signals():
+        with signals_deferred():
+            os.kill(os.getpid(), signal.SIGTERM)
+            done.append("block")
+        done.append("after it")
+    assert done == ["block"]
+
+
+def test_a_signal_while_the_address_is_bound_leaves_no_socket(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Otherwise, the end of its context would wait for ever."""
+
+    def interrupted(*arguments: Any) -> None:
+        os.kill(os.getpid(), signal.SIGINT)
+        set_options(*arguments)
+
+    monkeypatch.setattr("millrace.protocol.wire.learner_link.set_options", interrupted)
+    with pytest.raises(Stopped), stopped_by_signals(), ExitStack() as resources:
+        bind(f"ipc://{tmp_path}/learner", None, resources)
 
 
 def test_a_run_notices_a_signal_before_it_whose_exception_was_swallowed() -> None:

@@ -360,6 +360,33 @@ def test_no_process_outlives_the_learner(end: str, tmp_path: Path) -> None:
     assert set(os.listdir("/dev/shm")) <= before
 
 
+FORKS = """
+import os, sys
+import numpy as np
+import millrace
+
+if __name__ == "__main__":
+    env = millrace.make_vec("CartPole-v1", 4, workers=1)
+    env.reset(seed=1)
+    if os.fork() == 0:
+        sys.exit(0)
+    os.wait()
+    assert os.path.exists(env.address.removeprefix("ipc://")), "a replacement would find no socket"
+    *_, infos = env.step(np.zeros(4, int))
+    assert "worker_lost" not in infos
+    env.close()
+    print("stepped")
+"""
+
+
+def test_a_forked_child_that_ends_leaves_the_workers_and_their_socket_alone(tmp_path: Path) -> None:
+    script = tmp_path / "script.py"
+    script.write_text(FORKS)
+    env = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])}
+    ended = subprocess.run([sys.executable, str(script)], env=env, capture_output=True, text=True, timeout=60, check=False)
+    assert (ended.returncode, ended.stdout) == (0, "stepped\n"), ended.stderr
+
+
 def test_workers_elsewhere_join_by_tcp_and_come_back(elsewhere: Elsewhere) -> None:
     """The test starts the workers, which join over TCP. One is killed, and another takes its place."""
     elsewhere.start("a")
