@@ -17,11 +17,10 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Generic
 
 from millrace.learner.members.events import Event, WorkerStartFailed
 from millrace.learner.members.member import Member
-from millrace.learner.members.membership import Answered, M, Membership, Outgoing
+from millrace.learner.members.membership import Answered, Membership, Outgoing
 from millrace.protocol.alive import StartFailed
 from millrace.protocol.bounds import one_line
 from millrace.protocol.messages import (
@@ -35,15 +34,15 @@ from millrace.protocol.messages import (
 )
 
 
-class Coordinator(ABC, Generic[M]):
+class Coordinator(ABC):
     """Answers members' messages, removes members, and deals work to them."""
 
-    def __init__(self, membership: Membership[M], worker_timeout_s: float) -> None:
+    def __init__(self, membership: Membership, worker_timeout_s: float) -> None:
         self.membership = membership
         self.worker_timeout_s = worker_timeout_s
 
     @property
-    def members(self) -> dict[bytes, M]:
+    def members(self) -> dict[bytes, Member]:
         """Members by routing id."""
         return self.membership.members
 
@@ -62,7 +61,7 @@ class Coordinator(ABC, Generic[M]):
         self._not_of_member(message, heard)
         return heard.out + (self._deal() if heard.changed else [])
 
-    def take_over(self, waiting: Membership[Member], now: float) -> list[Outgoing]:
+    def take_over(self, waiting: Membership, now: float) -> list[Outgoing]:
         """Begin the run for the workers that are waiting for it. Call this before anything else."""
         return self.membership.take_over(waiting, now) + self._deal()
 
@@ -101,34 +100,34 @@ class Coordinator(ABC, Generic[M]):
     # ---------------------------------------------------------------- what a subclass defines
 
     @abstractmethod
-    def _answer(self, member: M, message: ToLearner) -> list[Outgoing]:
+    def _answer(self, member: Member, message: ToLearner) -> list[Outgoing]:
         """The answer to a message that a member sent in its session."""
 
-    def _not_of_member(self, message: ToLearner, answered: Answered) -> None:
+    def _not_of_member(self, message: ToLearner, answered: Answered) -> None:  # noqa: B027  # not every subclass needs it
         """Called with each message that the membership has answered instead of this object."""
 
     def _deal(self) -> list[Outgoing]:
         """Deal the work that no worker holds. Called after each event that may have made a worker available."""
         return []
 
-    def _again(self, member: M, heartbeat: Heartbeat, lost: Sequence[int]) -> list[Outgoing]:
+    def _again(self, member: Member, heartbeat: Heartbeat, lost: Sequence[int]) -> list[Outgoing]:
         """The messages to send again because this heartbeat shows that they were lost.
 
         `lost` has the member's tickets that were lost.
         """
         return []
 
-    def _received(self, member: M) -> tuple[Received, ...]:
+    def _received(self, member: Member) -> tuple[Received, ...]:
         """The lanes of this member, and which of their rollouts have arrived."""
         return ()
 
-    def _unusable(self, member: M, why: str) -> list[Outgoing]:
+    def _unusable(self, member: Member, why: str) -> list[Outgoing]:
         """Handle a member's message that could not be used."""
         return self.membership.refuse(member, why)
 
     # ---------------------------------------------------------------- inside
 
-    def _heartbeat(self, member: M, heartbeat: Heartbeat) -> list[Outgoing]:
+    def _heartbeat(self, member: Member, heartbeat: Heartbeat) -> list[Outgoing]:
         """Send lost messages again, then the reply."""
         lost = member.record_heartbeat(heartbeat)
         if member.draining:

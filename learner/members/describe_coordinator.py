@@ -49,12 +49,12 @@ class Unknown:
     accept: Accept = accept_any
 
 
-class DescribeCoordinator(Coordinator[Member]):
+class DescribeCoordinator(Coordinator):
     """The members waiting for the run, one of which describes the environment."""
 
     def __init__(self, wait: WaitSpec, first_session: int, *, worker_timeout_s: float, decliners_to_end: int) -> None:
         """The start fails once `decliners_to_end` different workers cannot describe the environment; 0 means never."""
-        super().__init__(Membership(wait, Member, self._removed, first_session, _was_not_asked), worker_timeout_s)
+        super().__init__(Membership(wait, self._removed, first_session, _was_not_asked), worker_timeout_s)
         self.described: DescribedEnv | None = None
         """The first usable description of the newest environment."""
         self.unsuitable: UsageError | None = None

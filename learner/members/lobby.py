@@ -17,7 +17,6 @@ from msgspec.structs import replace
 from millrace.learner.members.describe_coordinator import DescribeCoordinator, Unknown
 from millrace.learner.members.events import Event
 from millrace.learner.members.failure_count import FailureCount
-from millrace.learner.members.member import Member
 from millrace.learner.members.member_server import MemberServer, ServerSettings
 from millrace.learner.members.membership import Membership
 from millrace.learner.members.worker_processes import WorkerProcesses
@@ -151,7 +150,7 @@ class Lobby:
         self._server.listen(0.0)
         self._check()
 
-    def hand_over(self) -> Membership[Member]:
+    def hand_over(self) -> Membership:
         """Close the lobby. Returns the workers waiting for the run, for its hub to take over."""
         self._server.listen(0.0)  # first, because the hub must not take over ended or revoked workers
         self._server.close()

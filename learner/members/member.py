@@ -76,6 +76,8 @@ class Member:
     """Time when the worker joined."""
     takeovers: int = 0
     """How many times in a row another process has taken this name from a live process."""
+    strikes: int = 0
+    """The number of the worker's rollouts and messages that could not be used."""
     draining: bool = False
     """Whether the learner has asked it to leave."""
     lanes: set[int] = field(default_factory=set)
@@ -95,6 +97,8 @@ class Member:
     """Seconds that the worker's process spent in each stage before this session."""
     speed: Speed | None = None
     """The worker's speed; None before its first heartbeat."""
+    ended_steps: int = 0
+    """The env steps that its process made before this session, plus those in its rollouts and evaluations that arrived."""
     first_step_s: float | None = None
     """Time when its process was first known to have taken an env step, because it reported one or sent a rollout."""
     activity: WorkerActivity | None = None
@@ -136,6 +140,11 @@ class Member:
         """Seconds from its first known env step until it was last known to be alive; None without a known step."""
         return None if self.first_step_s is None else max(0.0, self.alive_s - self.first_step_s)
 
+    @property
+    def steps_under_way(self) -> int:
+        """The env steps that were made for its unfinished tickets, as of its newest heartbeat."""
+        return 0 if self.heartbeat is None else max(0, self.heartbeat.steps - self.ended_steps)
+
     def has_stepped(self) -> None:
         """Record that its process has taken an env step."""
         if self.first_step_s is None:
@@ -155,8 +164,11 @@ class Member:
 
         A ticket is lost if it was sent before a reply that the worker has received, and the worker does not hold it.
         """
-        if self.has_counted:
+        has_counted = self.has_counted
+        if has_counted:
             self.stages_before = heartbeat.stages
+        if has_counted or not heartbeat.tickets:  # the worker has no unfinished work of this session
+            self.ended_steps = heartbeat.steps
         self.heartbeat = msgspec.structs.replace(heartbeat, tickets=())  # a peer may list many, and the heartbeat is kept
         if heartbeat.steps:
             self.has_stepped()
@@ -210,10 +222,10 @@ class Member:
             tickets=len(self.tickets),
             steps=heartbeat.steps if heartbeat else 0,
             steps_per_s=0.0 if self.speed is None else self.speed.steps_per_s(now),
-            version=-1,
+            version=max(heartbeat.versions, default=-1) if heartbeat else -1,
             silent_s=max(0.0, now - self.heard_s),
             resident_bytes=heartbeat.resident_bytes if heartbeat else 0,
-            strikes=0,
+            strikes=self.strikes,
             doing=activity.doing if activity else "",
             doing_s=activity.for_s + max(0.0, said_s) if activity else 0.0,
             late_actions=heartbeat.late_actions if heartbeat else 0,

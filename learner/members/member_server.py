@@ -16,7 +16,7 @@ import socket
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 import msgspec
 
@@ -42,7 +42,6 @@ from millrace.learner.members.events import (
 from millrace.learner.members.held_up import what_they_do
 from millrace.learner.members.join_limiter import JoinLimiter
 from millrace.learner.members.key_revocation import KeyRevocation
-from millrace.learner.members.member import Member
 from millrace.learner.members.member_log import MemberLog
 from millrace.learner.members.membership import Membership, Outgoing
 from millrace.learner.members.worker_processes import WorkerProcesses
@@ -97,7 +96,7 @@ class MemberServer:
     def __init__(
         self,
         link: LearnerLink,
-        coordinator: Coordinator[Any],
+        coordinator: Coordinator,
         hub: ServedHub,
         processes: WorkerProcesses,
         settings: ServerSettings | None = None,
@@ -170,7 +169,7 @@ class MemberServer:
         if self._membership.events:
             self._log_events(cause)
 
-    def take_over(self, waiting: Membership[Member], described_in_s: float) -> None:
+    def take_over(self, waiting: Membership, described_in_s: float) -> None:
         """Begin the run for the workers waiting for it. `described_in_s`: how long the environment's description took.
 
         If the description took long, other workers may still be describing the environment. `wait_for` waits for them until

@@ -17,7 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Generic, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 from millrace.learner.members.events import (
     EnvironmentRaised,
@@ -89,28 +89,26 @@ class Gone(NamedTuple):
     """Whether its process was ended because a call took too long."""
 
 
-M = TypeVar("M", bound=Member)
 K = TypeVar("K")
 V = TypeVar("V")
 
 
-class Membership(Generic[M]):
+class Membership:
     """The members, by their routing ids."""
 
     def __init__(
         self,
         run: WaitSpec | RunSpec | StepSpec,
-        member_class: type[M],
-        on_removed: Callable[[M, Gone], None],
+        on_removed: Callable[[Member, Gone], None],
         first_session: int,
-        is_spare: Callable[[M], bool] = lambda member: False,
+        is_spare: Callable[[Member], bool] = lambda member: False,
     ) -> None:
         """`on_removed` is called with each member that was removed, and how its membership ended. It must take back the
         member's work.
 
         `is_spare` says whether the run doesn't need a member, so that its failures don't count.
         """
-        self.members: dict[bytes, M] = {}
+        self.members: dict[bytes, Member] = {}
         self.events: list[Event] = []
         self.draining: str | None = None
         """why the workers were asked to leave; None if they were not"""
@@ -121,22 +119,21 @@ class Membership(Generic[M]):
         self.has_policy_code = isinstance(run, RunSpec) and bool(run.policy_code)
         """whether a user-defined policy acts in the workers; if not, a failure is never blamed on the policy"""
         self._run = run
-        self._member_class = member_class
         self._on_removed = on_removed
         self.is_spare = is_spare
         self._first_session = self._next_session = first_session
         self._joins = 0
         self._none_silent_before_s = -math.inf  # before this time, no member can have been silent for too long
-        self._of_process: dict[tuple[str, int], M] = {}  # the members by name and process_nonce
+        self._of_process: dict[tuple[str, int], Member] = {}  # the members by name and process_nonce
         self._removed_for_silence: dict[str, int] = {}  # process_nonce by worker, until it joins again; oldest first
         self._stages_of_left: Stages = {}  # total seconds that members that have left spent in each stage
         self._refused: dict[bytes, tuple[int, str]] = {}  # by peer, the nonce of the process that was refused, and why
 
-    def active(self) -> list[M]:
+    def active(self) -> list[Member]:
         """The members that may be given work, in the order in which they joined."""
         return [each for each in self.members.values() if not (each.draining or each.describes)]
 
-    def collectors(self) -> list[M]:
+    def collectors(self) -> list[Member]:
         """The members that may have lanes."""
         return [member for member in self.members.values() if not member.hello.evaluates]
 
@@ -157,7 +154,7 @@ class Membership(Generic[M]):
         self.events = []
         return events
 
-    def hear(self, peer: bytes, message: ToLearner, now: float) -> M | Answered:
+    def hear(self, peer: bytes, message: ToLearner, now: float) -> Member | Answered:
         """The member in whose session this message was sent, if the caller must answer it; otherwise, the answer."""
         match message:
             case Hello():
@@ -174,7 +171,7 @@ class Membership(Generic[M]):
             return Answered([], changed=True)
         return member
 
-    def member_of_session(self, peer: bytes, message: ToLearner, now: float) -> M | None:
+    def member_of_session(self, peer: bytes, message: ToLearner, now: float) -> Member | None:
         """The member that sent this message in its current session, or None. Records when the member was last heard from."""
         member = self.members.get(peer)
         if member is None or isinstance(message, Hello | Alive) or member.session != message.session:
@@ -192,7 +189,7 @@ class Membership(Generic[M]):
         self.events.append(WorkerToldToRejoin(name_for_people(peer), message.session, late))
         return [(peer, Rejoin(message.session))]
 
-    def join(self, peer: bytes, hello: Hello, now: float) -> tuple[list[Outgoing], M | None]:
+    def join(self, peer: bytes, hello: Hello, now: float) -> tuple[list[Outgoing], Member | None]:
         """Answer a Hello. Returns the answer, and the member if one joined."""
         turned_away = self._turned_away(peer, hello)
         if turned_away is not None:
@@ -212,7 +209,7 @@ class Membership(Generic[M]):
                 self._remember_refusal(earlier, why)
             # rule LATER_HELLO
             self.remove(earlier, Gone("began again" if same_process else f"replaced by process {hello.pid}"))
-        member = self._member_class(peer, hello, self._next_session, self._joins, now, joined_s=now, takeovers=takeovers)
+        member = Member(peer, hello, self._next_session, self._joins, now, joined_s=now, takeovers=takeovers)
         self._next_session += 1
         self._joins += 1
         self.members[peer] = member
@@ -221,33 +218,32 @@ class Membership(Generic[M]):
         self.events.append(WorkerJoined(hello.worker, hello.host, hello.pid))
         return [self._welcome(member)], member
 
-    def take_over(self, waiting: Membership[Member], now: float) -> list[Outgoing]:
+    def take_over(self, waiting: Membership, now: float) -> list[Outgoing]:
         """Begin the run for the workers waiting for it. Their sessions continue; another Welcome sends them the run."""
         self._first_session = waiting._first_session
         self._next_session = waiting._next_session
         self._joins = waiting._joins
         self._refused = waiting._refused
         self._removed_for_silence = waiting._removed_for_silence
-        for peer, waited in waiting.members.items():
-            member = self._member_class(**vars(waited))
+        for peer, member in waiting.members.items():
             member.heard_s = member.joined_s = now
-            member.describes = bool(waited.tickets)
+            member.describes = bool(member.tickets)
             member.tickets = {}
             self.members[peer] = member
             self._of_process[member.hello.worker, member.hello.process_nonce] = member
             self.events.append(WorkerJoined(member.hello.worker, member.hello.host, member.hello.pid))
         return [self._welcome(member) for member in self.members.values()]
 
-    def welcome_again(self, member: M, heartbeat: Heartbeat) -> list[Outgoing]:
+    def welcome_again(self, member: Member, heartbeat: Heartbeat) -> list[Outgoing]:
         """Repeat the Welcome that sends the run, if this heartbeat shows that the Welcome was lost."""
         lost = heartbeat.waits and not isinstance(self._run, WaitSpec) and heartbeat.replies > member.welcomed
         return [self._welcome(member)] if lost else []
 
-    def leave(self, member: M, reason: str) -> None:
+    def leave(self, member: Member, reason: str) -> None:
         """Remove a member that said Goodbye."""
         self.remove(member, Gone(f"left: {reason}", on_purpose=True))
 
-    def refuse(self, member: M, why: str) -> list[Outgoing]:
+    def refuse(self, member: Member, why: str) -> list[Outgoing]:
         """Remove a member, and refuse its process from now on."""
         self._remember_refusal(member, why)
         return self._refuse_and_remove(member, f"refused: {why}", why)
@@ -281,7 +277,7 @@ class Membership(Generic[M]):
             member.supervisor = supervisor
         return answer, removed
 
-    def record_activity(self, activity: WorkerActivity, now: float, key: bytes | None = None) -> M | None:
+    def record_activity(self, activity: WorkerActivity, now: float, key: bytes | None = None) -> Member | None:
         """Record what a member's process is doing. Returns the member.
 
         `key` is the key of the supervisor that reports it; None if this program is the supervisor.
@@ -310,7 +306,7 @@ class Membership(Generic[M]):
             self.events.append(WorkerLeft(worker, reason, 0, False))
         return False
 
-    def remove_silent(self, now: float, timeout_s: float) -> list[M]:
+    def remove_silent(self, now: float, timeout_s: float) -> list[Member]:
         """Remove the members that have been silent for longer than `timeout_s`. Returns them."""
         if now < self._none_silent_before_s:
             return []
@@ -321,7 +317,7 @@ class Membership(Generic[M]):
         self._none_silent_before_s = min((member.alive_s for member in self.members.values()), default=now) + timeout_s
         return silent
 
-    def remove(self, member: M, gone: Gone) -> None:
+    def remove(self, member: Member, gone: Gone) -> None:
         """Remove a member. Nothing is sent to it."""
         del self.members[member.peer]
         _add(self._stages_of_left, member.stages())
@@ -363,14 +359,16 @@ class Membership(Generic[M]):
         self.events.append(WorkerRefused(hello.worker, why))
         return [(peer, Refuse(one_line(why)))]
 
-    def _fail(self, member: M, failure: Failure) -> None:
+    def _fail(self, member: Member, failure: Failure) -> None:
         """Remove a member that reports a failure of the environment's code or of the user's policy."""
         by_policy = failure.of_policy and self.has_policy_code
         kind = PolicyRaised if by_policy else EnvironmentRaised
         self.events.append(self._failed(kind, member, failure.error, failure.traceback, failure.lane))
         self.remove(member, Gone("failed", failed_lane=failure.lane))
 
-    def _failed(self, kind: type[Failed], member: M, error: str, traceback: str = "", lane: int | None = None) -> Failed:
+    def _failed(
+        self, kind: type[Failed], member: Member, error: str, traceback: str = "", lane: int | None = None
+    ) -> Failed:
         """The event of a member's failure: in `lane` if the member has this lane, otherwise in all of its lanes."""
         return kind(
             worker=member.hello.worker,
@@ -382,15 +380,15 @@ class Membership(Generic[M]):
             spare=self.is_spare(member),
         )
 
-    def _welcome(self, member: M) -> Outgoing:
+    def _welcome(self, member: Member) -> Outgoing:
         member.welcomed = member.replies
         return member.peer, Welcome(member.session, member.hello.attempt, self._run)
 
-    def _refuse_and_remove(self, member: M, why: str, refusal: str) -> list[Outgoing]:
+    def _refuse_and_remove(self, member: Member, why: str, refusal: str) -> list[Outgoing]:
         self.remove(member, Gone(why, refusal=refusal))
         return [(member.peer, Refuse(one_line(refusal)))]
 
-    def _remember_refusal(self, member: M, why: str) -> None:
+    def _remember_refusal(self, member: Member, why: str) -> None:
         _remember(self._refused, member.peer, (member.hello.process_nonce, one_line(why)))
 
 

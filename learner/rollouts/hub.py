@@ -18,7 +18,6 @@ import numpy as np
 from millrace.learner.members.events import EpisodesArrived, Event, RolloutArrived
 from millrace.learner.members.failure_count import FailureCount
 from millrace.learner.members.held_up import LONG_S
-from millrace.learner.members.member import Member
 from millrace.learner.members.member_server import MemberServer
 from millrace.learner.members.membership import Membership
 from millrace.learner.members.worker_processes import WorkerProcesses
@@ -116,7 +115,7 @@ class Hub:
         self._server = MemberServer(link, coordinator, self, self._processes, clock=clock)
         self._time = LearnerTime(coordinator, clock(), self._server.awaited, self._processes)
 
-    def take_over(self, waiting: Membership[Member], described_in_s: float) -> None:
+    def take_over(self, waiting: Membership, described_in_s: float) -> None:
         """Begin the run for the workers waiting for it. `described_in_s`: how long the environment's description took."""
         self._server.take_over(waiting, described_in_s)
 

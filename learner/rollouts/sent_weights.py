@@ -19,9 +19,8 @@ from weakref import WeakKeyDictionary
 
 import msgspec
 
-from millrace.learner.members.member import SharingSupervisor
+from millrace.learner.members.member import Member, SharingSupervisor
 from millrace.learner.members.membership import Outgoing
-from millrace.learner.rollouts.collecting_member import CollectingMember
 from millrace.protocol.alive import SHARED_VERSIONS
 from millrace.protocol.messages import Collect, Evaluate, Heartbeat, Weights, versions_of
 
@@ -65,7 +64,7 @@ class WeightsHeld:
         """The versions that this worker holds or is about to get."""
         return self.by_worker.get(peer, {}).keys()
 
-    def give(self, member: CollectingMember, version: int, supervisor: SharingSupervisor | None) -> bytes | None:
+    def give(self, member: Member, version: int, supervisor: SharingSupervisor | None) -> bytes | None:
         """Record that the worker gets these weights, through the supervisor if one is given.
 
         Returns the routing id to which they must be sent; None if they needn't be sent.
@@ -83,12 +82,12 @@ class WeightsHeld:
             del shared[oldest]
         return supervisor.peer
 
-    def needs(self, member: CollectingMember, tickets: Collection[int]) -> set[int]:
+    def needs(self, member: Member, tickets: Collection[int]) -> set[int]:
         """The versions that these tickets name. Tickets that have ended, or that the worker doesn't hold, are ignored."""
         named = self.named.get(member.peer, {})
         return {version for ticket in member.tickets.keys() & tickets for version in named[ticket]}
 
-    def note(self, member: CollectingMember, order: Collect | Evaluate) -> None:
+    def note(self, member: Member, order: Collect | Evaluate) -> None:
         """Record the versions that the tickets of this order name."""
         named = self.named.get(member.peer, {})
         outstanding = {ticket: versions for ticket, versions in named.items() if ticket in member.tickets}
@@ -99,7 +98,7 @@ class WeightsHeld:
         mine = self.by_worker.get(peer, {})
         self.by_worker[peer] = {version: standing for version, standing in mine.items() if version in versions}
 
-    def hear(self, member: CollectingMember, heartbeat: Heartbeat) -> None:
+    def hear(self, member: Member, heartbeat: Heartbeat) -> None:
         """Update the record from the worker's list of the weights that it holds.
 
         The worker lacks all other weights, unless they may still be on their way.
@@ -143,7 +142,7 @@ class SentWeights:
         self.kept = {version: weights for version, weights in self.kept.items() if version in needed}
         self.kept[newest.version] = newest
 
-    def after(self, orders: Sequence[Outgoing], members: Mapping[bytes, CollectingMember]) -> list[Outgoing]:
+    def after(self, orders: Sequence[Outgoing], members: Mapping[bytes, Member]) -> list[Outgoing]:
         """These orders, each with the versions that its worker must keep, followed by the weights that the workers lack."""
         out = list[Outgoing]()
         weights = list[Outgoing]()
@@ -163,13 +162,13 @@ class SentWeights:
             out.append((peer, order))
         return out + weights
 
-    def again(self, member: CollectingMember, heartbeat: Heartbeat) -> list[Outgoing]:
+    def again(self, member: Member, heartbeat: Heartbeat) -> list[Outgoing]:
         """The weights to send again, because this heartbeat shows that they were lost and unfinished tickets need them."""
         self.held.hear(member, heartbeat)
         lost = sorted(self.held.needs(member, heartbeat.tickets) - self.held.versions(member.peer))
         return [message for version in lost for message in self._send(member, version, None)]
 
-    def _send(self, member: CollectingMember, version: int, supervisor: SharingSupervisor | None) -> list[Outgoing]:
+    def _send(self, member: Member, version: int, supervisor: SharingSupervisor | None) -> list[Outgoing]:
         receiver = self.held.give(member, version, supervisor)
         return [] if receiver is None else [(receiver, self.kept[version])]
 

@@ -17,7 +17,6 @@ import math
 from dataclasses import dataclass
 
 from millrace.learner.members.member import Member
-from millrace.learner.rollouts.collecting_member import CollectingMember
 from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
 from millrace.protocol.call_timeouts import CallTimeouts
 
@@ -29,7 +28,7 @@ CHECK_BUDGETS_EVERY_S = 1.0
 class Standstill:
     """A verdict: refuse these members or, if there are no members, end the run."""
 
-    refuse: tuple[CollectingMember, ...]
+    refuse: tuple[Member, ...]
     why: str
 
 
@@ -100,7 +99,7 @@ class StallWatch:
             return False
         return said.for_s + now - member.activity_s <= self._timeouts.limit_s(said.doing) + ENDED_WITHIN_S
 
-    def _over_budget(self, now: float) -> tuple[CollectingMember, ...]:
+    def _over_budget(self, now: float) -> tuple[Member, ...]:
         """The members that have held their oldest ticket for longer than all their tickets together may take."""
         coordinator = self._coordinator
         evaluation = coordinator.evaluation.pending

@@ -20,7 +20,6 @@ from millrace.learner.members.events import EnvironmentNoted, EpisodesArrived, L
 from millrace.learner.members.lane_placement import LanePlacement, is_spare
 from millrace.learner.members.member import Member
 from millrace.learner.members.membership import Answered, Gone, Membership, Outgoing
-from millrace.learner.rollouts.collecting_member import CollectingMember
 from millrace.learner.rollouts.evaluation_dealer import EvaluationDealer, EvaluationPlan, OnRows
 from millrace.learner.rollouts.past_rollouts import PastRollouts, RoundsState
 from millrace.learner.rollouts.rollout_dealer import RolloutDealer
@@ -51,7 +50,7 @@ MOST_NOTES = 10  # how many notes are logged, of all workers together
 STRIKES = 3  # a worker is refused after this many rollouts or messages that could not be used
 
 
-class TicketCoordinator(Coordinator[CollectingMember]):
+class TicketCoordinator(Coordinator):
     """The members, their lanes and their tickets."""
 
     def __init__(
@@ -67,7 +66,7 @@ class TicketCoordinator(Coordinator[CollectingMember]):
         self.rollouts = rollouts
         self.evaluation = EvaluationDealer(run)
         lanes = self.rollouts.lanes
-        membership = Membership(run, CollectingMember, self._removed, first_session, lambda member: is_spare(member, lanes))
+        membership = Membership(run, self._removed, first_session, lambda member: is_spare(member, lanes))
         super().__init__(membership, worker_timeout_s)
         self.run = run
         self.version = -1  # version of the newest weights; -1 before the first `publish`
@@ -83,7 +82,7 @@ class TicketCoordinator(Coordinator[CollectingMember]):
         self.rollouts.ledger.messages_bad += 1
         return super().reject_message(peer, why, now)
 
-    def refuse(self, member: CollectingMember, why: str) -> list[Outgoing]:
+    def refuse(self, member: Member, why: str) -> list[Outgoing]:
         """Refuse a worker that holds tickets without working on them, and deal its tickets again."""
         return self.membership.refuse(member, why) + self._deal()
 
@@ -217,7 +216,7 @@ class TicketCoordinator(Coordinator[CollectingMember]):
             case Rollout():
                 self.rollouts.late(message)
 
-    def _answer(self, member: CollectingMember, message: ToLearner) -> list[Outgoing]:
+    def _answer(self, member: Member, message: ToLearner) -> list[Outgoing]:
         match message:
             case Heartbeat():
                 return self._heartbeat(member, message)
@@ -232,7 +231,7 @@ class TicketCoordinator(Coordinator[CollectingMember]):
                 self.membership.leave(member, reason)
         return []  # answers to orders that a run never sends, and rows of an evaluation that has ended, are ignored
 
-    def _take_rollout(self, member: CollectingMember, rollout: Rollout) -> list[Outgoing]:
+    def _take_rollout(self, member: Member, rollout: Rollout) -> list[Outgoing]:
         """Accept a rollout, unless it had arrived before. If it can't be used, it is counted, and its ticket is lost."""
         try:
             longest = self.rollouts.longest_episode(rollout.ticket, self.run.rollout_steps)
@@ -246,14 +245,14 @@ class TicketCoordinator(Coordinator[CollectingMember]):
             self.events.append(RolloutArrived(member.hello.worker, rollout.lane, rollout.version))
         return []
 
-    def _reject(self, member: CollectingMember, rollout: Rollout, why: str) -> list[Outgoing]:
+    def _reject(self, member: Member, rollout: Rollout, why: str) -> list[Outgoing]:
         self.events.append(RolloutRejected(member.peer, why))
         out = self._unusable(member, why)
         self.rollouts.reject(member, rollout)
         self._placement.ticket_ended(member)
         return out
 
-    def _take_evaluated(self, member: CollectingMember, answer: Evaluated) -> list[Outgoing]:
+    def _take_evaluated(self, member: Member, answer: Evaluated) -> list[Outgoing]:
         """Accept episodes of an evaluation, unless they had arrived before."""
         evaluation = self.evaluation.pending
         if evaluation is None:
@@ -265,7 +264,7 @@ class TicketCoordinator(Coordinator[CollectingMember]):
             self.events.append(EpisodesArrived(member.hello.worker))
         return self._unusable(member, taken.why) if taken.why else []
 
-    def _heartbeat(self, member: CollectingMember, heartbeat: Heartbeat) -> list[Outgoing]:
+    def _heartbeat(self, member: Member, heartbeat: Heartbeat) -> list[Outgoing]:
         self.rollouts.ledger.late_actions += member.new_late_actions(heartbeat)
         note = heartbeat.note
         if note and note not in self._notes and len(self._notes) < MOST_NOTES:
@@ -277,17 +276,17 @@ class TicketCoordinator(Coordinator[CollectingMember]):
             self._placement.joined()  # from now on, the worker may have lanes
         return out
 
-    def _again(self, member: CollectingMember, heartbeat: Heartbeat, lost: Sequence[int]) -> list[Outgoing]:
+    def _again(self, member: Member, heartbeat: Heartbeat, lost: Sequence[int]) -> list[Outgoing]:
         out = self.weights.again(member, heartbeat)
         orders = self.rollouts.send(member, lost)
         if self.evaluation.pending is not None:
             orders += self.evaluation.pending.send(member, lost)
         return out + self.weights.after(orders, self.members)
 
-    def _received(self, member: CollectingMember) -> tuple[Received, ...]:
+    def _received(self, member: Member) -> tuple[Received, ...]:
         return self.rollouts.received(member)
 
-    def _removed(self, member: CollectingMember, gone: Gone) -> None:
+    def _removed(self, member: Member, gone: Gone) -> None:
         """Count a lost worker's tickets as lost, and take away its lanes, so that `_deal` gives both to other workers."""
         self.rollouts.worker_lost(member, gone)
         for number in list(member.tickets):
@@ -298,7 +297,7 @@ class TicketCoordinator(Coordinator[CollectingMember]):
         self._placement.removed(member)
         self.weights.held.forget(member.peer)
 
-    def _unusable(self, member: CollectingMember, why: str) -> list[Outgoing]:
+    def _unusable(self, member: Member, why: str) -> list[Outgoing]:
         """Count a message that could not be used, and refuse the worker after `STRIKES` of them."""
         member.strikes += 1
         return super()._unusable(member, why) if member.strikes >= STRIKES else []

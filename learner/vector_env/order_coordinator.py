@@ -90,11 +90,11 @@ class OrderedLane(PlacedLane):
             self.order = None
 
 
-class OrderCoordinator(Coordinator[Member]):
+class OrderCoordinator(Coordinator):
     """Members, lanes, orders and their answers."""
 
     def __init__(self, spec: StepSpec, first_session: int, worker_timeout_s: float = math.inf) -> None:
-        membership = Membership(spec, Member, self._removed, first_session, lambda member: is_spare(member, self.lanes))
+        membership = Membership(spec, self._removed, first_session, lambda member: is_spare(member, self.lanes))
         super().__init__(membership, worker_timeout_s)
         self.spec = spec
         self.lanes = [OrderedLane(lane) for lane in range(len(spec.lanes))]

@@ -12,7 +12,6 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 
 from millrace.learner.members.events import Event, Failed, WorkerLeft, WorkerProcessFailed, WorkerRefused
-from millrace.learner.members.member import Member
 from millrace.learner.members.member_server import MemberServer, ServerSettings
 from millrace.learner.members.membership import Membership
 from millrace.learner.members.worker_processes import WorkerProcesses
@@ -70,7 +69,7 @@ class StepHub:
         settings = ServerSettings(grace_s=worker_timeout_s, log_tracebacks=False)
         self._server = MemberServer(link, self.coordinator, self, processes, settings, clock)
 
-    def take_over(self, waiting: Membership[Member], described_in_s: float) -> None:
+    def take_over(self, waiting: Membership, described_in_s: float) -> None:
         """Begin the vector environment for the workers waiting for it.
 
         `described_in_s`: how long the environment's description took.

@@ -9,8 +9,8 @@ from __future__ import annotations
 from typing import Self, TypeVar
 
 from millrace.learner.members.lane_placement import LanePlacement
+from millrace.learner.members.member import Member
 from millrace.learner.members.membership import Membership, Outgoing
-from millrace.learner.rollouts.collecting_member import CollectingMember
 from millrace.learner.rollouts.lag_rule import Rounds
 from millrace.learner.rollouts.lane_history import LaneHistories
 from millrace.learner.rollouts.lanes import TakenRollouts, Ticket, TicketedLane
@@ -47,7 +47,7 @@ SAVED: dict[type, set[str]] = {
     SentWeights: {"kept", "held"},
     WeightsHeld: {"by_worker"},
     Membership: {"members", "_next_session", "_joins", "_none_silent_before_s", "_of_process", "_refused"},
-    CollectingMember: {"peer", "hello", "session", "join_number", "heard_s", "lanes", "tickets", "replies"}
+    Member: {"peer", "hello", "session", "join_number", "heard_s", "lanes", "tickets", "replies"}
     | {"strikes", "takeovers", "welcomed", "describes"},
     TicketedLane: {"number", "incarnation", "owner", "moving", "due", "dealt", "outstanding", "next_sequence"}
     | {"out_of_order", "taken"},
@@ -62,9 +62,9 @@ NOT_SAVED: dict[type, set[str]] = {
     RolloutDealer: {"_absent", "_absent_pasts", "opponents", "histories", "attributes", "_first_round", "_steps_before"},
     SentWeights: set(),
     WeightsHeld: {"by_supervisor", "named"},
-    Membership: {"events", "draining", "progress", "_run", "_member_class", "_on_removed", "is_spare", "has_policy_code"}
+    Membership: {"events", "draining", "progress", "_run", "_on_removed", "is_spare", "has_policy_code"}
     | {"_first_session", "_removed_for_silence", "_stages_of_left"},
-    CollectingMember: {
+    Member: {
         "joined_s",
         "draining",
         "heartbeat",
@@ -154,7 +154,7 @@ class Learner:
         out = learner._resume(version)
         return learner, [*out, *learner._checkpoint(), *learner._gather()]
 
-    def named(self) -> list[tuple[CollectingMember, int]]:
+    def named(self) -> list[tuple[Member, int]]:
         """Which versions the orders of which workers name."""
         members, evaluation = self.coordinator.members.values(), self.coordinator.evaluation.pending
         versions = {number: {each.version, each.permit.opponent} for number, each in self.coordinator.rollouts.held.items()}
@@ -427,7 +427,7 @@ def loaded(content: Content, settings: Settings) -> Learner:
         coordinator.rollouts.held[permit.ticket] = Ticket(permit, under, peer)
         coordinator.rollouts.lanes[permit.lane].outstanding.add(permit.ticket)
         coordinator.weights.held.named.setdefault(peer, {})[permit.ticket] = versions_of(under, [permit.opponent])
-    membership_part.load(coordinator.membership, members, CollectingMember)
+    membership_part.load(coordinator.membership, members)
     for peer, by_version in zip(coordinator.members, held, strict=True):  # in the order in which they joined
         standings = {version: _standing(sent_at) for version, sent_at in by_version}
         coordinator.weights.held.by_worker[peer] = standings
@@ -445,11 +445,11 @@ def loaded(content: Content, settings: Settings) -> Learner:
     return learner
 
 
-def _waiting_for(coordinator: TicketCoordinator, number: Name, lanes: Content) -> CollectingMember:
+def _waiting_for(coordinator: TicketCoordinator, number: Name, lanes: Content) -> Member:
     for member in coordinator.members.values():
         if member.session == number.value:
             return member
-    gone = CollectingMember(b"gone", hello(0, 0, 1), number.value, 0, 0.0)  # it left, and placement still refers to it
+    gone = Member(b"gone", hello(0, 0, 1), number.value, 0, 0.0)  # it left, and placement still refers to it
     gone.lanes = set(lanes)
     return gone
 

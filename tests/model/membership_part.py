@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TypeVar
-
 from millrace.learner.members.member import Member
 from millrace.learner.members.membership import Membership
-from millrace.learner.rollouts.collecting_member import CollectingMember
 from millrace.learner.rollouts.evaluation_dealer import FIRST_TICKET
 from tests.model.conversation import Content
 from tests.model.message_content import hello, peer_of, session, ticket, worker_of
 from tests.model.names import Kind, Name, name
 from tests.model.settings import TIMEOUT_S
 
-M = TypeVar("M", bound=Member)
 
-
-def saved(membership: Membership[M], now: float) -> Content:
+def saved(membership: Membership, now: float) -> Content:
     """The members in the order in which they joined, the next session, and who is not to be given up or let in."""
     membership.events.clear()
     return (
@@ -46,24 +41,23 @@ def _member(member: Member, now: float) -> Content:
         replies(member.welcomed),
         member.takeovers,
         member.describes,
-        member.strikes if isinstance(member, CollectingMember) else None,
+        member.strikes,
     )
 
 
-def load(membership: Membership[M], content: Content, kind: type[M]) -> None:
+def load(membership: Membership, content: Content) -> None:
     """Give a new membership this content."""
     members, _, none_silent, refused = content
     for join_number, fields in enumerate(members):
         worker, nonce, attempt, evaluates, number, heard, lanes, tickets, *more = fields
         replies, welcomed, takeovers, describes, strikes = more
         said = hello(worker.value, nonce.value, attempt.value, evaluates=evaluates)
-        member = kind(peer_of(worker.value), said, number.value, join_number, heard)
+        member = Member(peer_of(worker.value), said, number.value, join_number, heard)
         member.lanes = set(lanes)
         member.describes = describes
         member.tickets = {each.value: sent_at.value for each, sent_at in tickets}
         member.replies, member.welcomed, member.takeovers = replies.value, welcomed.value, takeovers
-        if isinstance(member, CollectingMember):
-            member.strikes = strikes
+        member.strikes = strikes
         membership.members[member.peer] = member
         membership._of_process[said.worker, said.process_nonce] = member
     membership._joins, membership._none_silent_before_s = len(members), none_silent

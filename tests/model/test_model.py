@@ -13,8 +13,8 @@ import pytest
 
 from millrace.learner.members.describe_coordinator import DescribeCoordinator
 from millrace.learner.members.lane_placement import LanePlacement
+from millrace.learner.members.member import Member
 from millrace.learner.members.membership import Membership
-from millrace.learner.rollouts.collecting_member import CollectingMember
 from millrace.learner.rollouts.evaluation_dealer import EvaluationDealer, EvaluationPlan
 from millrace.learner.rollouts.lag_rule import Rounds
 from millrace.learner.rollouts.lanes import TakenRollouts, Ticket, TicketedLane
@@ -112,7 +112,7 @@ def test_every_field_of_the_program_is_in_the_state_or_left_out_on_purpose() -> 
     objects: list[object] = [
         coordinator,
         coordinator.membership,
-        CollectingMember(b"w0", hello(0, 1, 1), 0, 0, 0.0),
+        Member(b"w0", hello(0, 1, 1), 0, 0, 0.0),
         coordinator.rollouts,
         coordinator.weights,
         coordinator.weights.held,
@@ -126,7 +126,7 @@ def test_every_field_of_the_program_is_in_the_state_or_left_out_on_purpose() -> 
         session._current.rollouts,
         RolloutLane(0),
     ]
-    types = TicketCoordinator, Membership, CollectingMember, RolloutDealer, SentWeights, WeightsHeld
+    types = TicketCoordinator, Membership, Member, RolloutDealer, SentWeights, WeightsHeld
     of_lanes = TicketedLane, TakenRollouts, Ticket
     more = LanePlacement, Rounds, Session, _SessionState, HeldRollouts, RolloutLane
     assert [type(each) for each in objects] == [*types, *of_lanes, *more]

@@ -260,6 +260,18 @@ def test_the_run_begins_in_the_sessions_of_those_that_wait_for_it() -> None:
     assert told.session == session + 1
 
 
+def test_env_steps_that_a_worker_made_in_an_earlier_run_are_not_counted_in_the_run_that_it_waits_for() -> None:
+    made = coordinator()
+    session = join(made, A)
+    made.receive(A, msgspec.structs.replace(beat(session, 0), steps=20), 1.0)
+    made.receive(A, Described(session, order(made, A), DESCRIPTION), 1.0)
+    run = TicketCoordinator(run_spec(), RolloutDealer(4, Rounds(0)), worker_timeout_s=5, first_session=10)
+    run.take_over(made.membership, 2.0)
+    run.publish(0, np.zeros(1, np.float32), np.zeros(0, np.float32))
+    assert [type(message) for _, message in run.begin_update()] == [Collect, Weights]
+    assert run.collected() == 0
+
+
 def test_the_welcome_that_brings_the_run_is_sent_again_if_a_heartbeat_shows_that_it_was_lost() -> None:
     made = coordinator()
     session = join(made, A)
@@ -276,13 +288,13 @@ def test_the_welcome_that_brings_the_run_is_sent_again_if_a_heartbeat_shows_that
 
 def test_a_description_that_comes_after_the_run_has_begun_is_no_mistake() -> None:
     """Of a worker that was asked as well, because the first one took long."""
-    made = coordinator()
-    session = join(made, A)
-    late = Described(session, order(made, A), DESCRIPTION)
     for run in (
         TicketCoordinator(run_spec(), RolloutDealer(4, Rounds(0)), worker_timeout_s=5, first_session=10),
         OrderCoordinator(StepSpec((ENV,), (0,), (1,), (), ()), 10),
     ):
+        made = coordinator()
+        session = join(made, A)
+        late = Described(session, order(made, A), DESCRIPTION)
         run.take_over(made.membership, 2.0)
         assert run.receive(A, late, 3.0) == []
         assert A in run.members

@@ -12,7 +12,6 @@ import pytest
 
 from millrace.learner.members.describe_coordinator import DescribeCoordinator, Unknown
 from millrace.learner.members.events import Event, LaneContinued
-from millrace.learner.members.member import Member
 from millrace.learner.members.member_server import (
     ASK_PROCESSES_S,
     AWAY_S,
@@ -380,7 +379,7 @@ def test_whoever_waits_for_workers_is_told_how_many_came_and_how_to_start_one() 
     served.server.wait_for(1, 1.0, lambda: served.server.listen(POLL_S))
 
 
-def members_of_a_lobby() -> Membership[Member]:
+def members_of_a_lobby() -> Membership:
     """A worker that was asked to describe the environment, and has not answered yet."""
     made = DescribeCoordinator(WaitSpec(), 1, worker_timeout_s=TIMEOUT_S, decliners_to_end=0)
     made.ask(Unknown(EnvSpec("Fake-v0")))

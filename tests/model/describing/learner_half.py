@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING
 from gymnasium import spaces
 
 from millrace.learner.members.describe_coordinator import FIRST_TICKET, DescribeCoordinator, Unknown
-from millrace.learner.members.member import Member
 from millrace.learner.members.membership import Outgoing
 from millrace.learner.rollouts.lag_rule import Rounds
 from millrace.learner.rollouts.rollout_dealer import RolloutDealer
@@ -121,14 +120,15 @@ def _taken_over(coordinator: DescribeCoordinator, settings: Describing, now: flo
         first_session=0,
         check_rows=any_rows,
     )
+    sessions = {peer: member.session for peer, member in coordinator.members.items()}
+    unanswered = {peer for peer, member in coordinator.members.items() if member.tickets}
     out = made.take_over(coordinator.membership, now)
-    before = {peer: member.session for peer, member in coordinator.members.items()}
-    assert {peer: member.session for peer, member in made.members.items()} == before, (
+    assert {peer: member.session for peer, member in made.members.items()} == sessions, (
         f"{Rule.BEGINS}: a worker has lost its session"
     )
-    for peer, member in made.members.items():
-        unanswered = bool(coordinator.members[peer].tickets)
-        assert member.describes == unanswered, f"{Rule.BEGINS}: the run does not know who may still describe"
+    assert {peer for peer, member in made.members.items() if member.describes} == unanswered, (
+        f"{Rule.BEGINS}: the run does not know who may still describe"
+    )
     learner = Learner(settings, made)
     learner.updating = True
     return learner, out
@@ -168,5 +168,5 @@ def _loaded(content: Content) -> DescribeCoordinator:
     coordinator = _lobby(members[1].value, asked)
     coordinator._at_once = at_once
     coordinator.described = DESCRIBED if described else None
-    membership_part.load(coordinator.membership, members, Member)
+    membership_part.load(coordinator.membership, members)
     return coordinator

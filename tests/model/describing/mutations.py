@@ -29,7 +29,7 @@ MUTATIONS = {
         Rule.BEGINS, PLACEMENT, "each.hello.evaluates or each.describes", "each.hello.evaluates"
     ),
     "who describes is forgotten when the run begins": Mutation(
-        Rule.BEGINS, MEMBERSHIP, "member.describes = bool(waited.tickets)", "member.describes = False"
+        Rule.BEGINS, MEMBERSHIP, "member.describes = bool(member.tickets)", "member.describes = False"
     ),
     "a worker that has described never gets lanes": Mutation(
         Rule.BEGINS, MEMBER, "            self.describes = False\n", "            pass\n"

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from millrace.learner.members.member import Member
 from millrace.learner.members.membership import Outgoing
 from millrace.learner.vector_env.order_coordinator import (
     AnsweredOrder,
@@ -153,7 +152,7 @@ def loaded(content: Content, settings: Stepping, now: float) -> Learner:
     members, lanes, lost, tickets, of_caller = content
     learner = Learner(settings, members[1].value, now)
     coordinator, caller = learner.coordinator, learner.caller
-    membership_part.load(coordinator.membership, members, Member)
+    membership_part.load(coordinator.membership, members)
     for lane, (life, owner, started, of_lane) in zip(coordinator.lanes, lanes, strict=True):
         lane.incarnation, lane.started = life.value, started
         lane.owner = None if owner is None else peer_of(owner.value)

@@ -12,7 +12,6 @@ import random
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cache
-from typing import Any
 
 import msgspec
 import numpy as np
@@ -139,7 +138,7 @@ def seated_rollout(session: int) -> Rollout:
     )
 
 
-def process_ends(coordinator: Coordinator[Any], worker: str, why: str = "killed", nonce: int = -1) -> list[Outgoing]:
+def process_ends(coordinator: Coordinator, worker: str, why: str = "killed", nonce: int = -1) -> list[Outgoing]:
     """The learner hears that the process of this worker has ended. `nonce`: of one that is no member any more."""
     nonces = [each.hello.process_nonce for each in coordinator.members.values() if each.hello.worker == worker]
     return coordinator.process_ended(WorkerExit(worker, nonces[0] if nonces else nonce, why, failed=False))
