@@ -52,8 +52,6 @@ class TicketedLane(PlacedLane):
     """Open rounds without a ticket, in order."""
     dealt: int = 0
     """The number of tickets that were dealt to this incarnation, which is the sequence number of the next rollout."""
-    outstanding: set[int] = field(default_factory=set)
-    """Tickets that the lane's worker holds."""
     next_sequence: int = 0
     """The smallest sequence number of this incarnation whose rollout has not arrived."""
     out_of_order: set[int] = field(default_factory=set)
@@ -78,8 +76,12 @@ class TicketedLane(PlacedLane):
 
     @property
     def busy(self) -> int:
-        """The number of the lane's tickets that its worker holds."""
-        return len(self.outstanding)
+        """The number of the lane's tickets that its worker holds.
+
+        All others that were dealt to this incarnation have ended, each with a rollout that was accepted or rejected, because
+        the loss of the worker ends the incarnation.
+        """
+        return self.dealt - self.next_sequence - len(self.out_of_order)
 
     def restart(self) -> None:
         """Record that the lane left its worker. The incarnation rises only if a ticket was dealt to it."""
@@ -96,7 +98,6 @@ class TicketedLane(PlacedLane):
         """Make a ticket for the next rollout, for the lane's owner. `past` goes with the first ticket of an incarnation."""
         assert self.owner is not None
         permit = Permit(number, self.number, self.incarnation, self.dealt, round_number, opponent, past)
-        self.outstanding.add(number)
         self.dealt += 1
         return Ticket(permit, version, self.owner)
 

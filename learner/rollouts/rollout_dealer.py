@@ -221,8 +221,8 @@ class RolloutDealer:
         """Count the failures and losses of a lost member's lanes. Lanes that fail too often aren't replayed."""
         for number in member.lanes:
             lane = self.lanes[number]
-            failed = number == gone.failed_lane or (gone.hung and bool(lane.outstanding))
-            if failed or lane.outstanding:
+            failed = number == gone.failed_lane or (gone.hung and lane.busy > 0)
+            if failed or lane.busy:
                 lane.lost(failed=failed)
 
     def late(self, rollout: Rollout) -> None:
@@ -251,11 +251,9 @@ class RolloutDealer:
     # ---------------------------------------------------------------- inside
 
     def _end(self, member: Member, permit: Permit) -> TicketedLane:
-        """Remove a ticket from the outstanding tickets. Returns its lane."""
+        """Remove a ticket that has ended. Returns its lane."""
         del self.held[permit.ticket], member.tickets[permit.ticket]
-        lane = self.lanes[permit.lane]
-        lane.outstanding.remove(permit.ticket)
-        return lane
+        return self.lanes[permit.lane]
 
     def _past(self, lane: TicketedLane, first: int) -> LanePast | None:
         """The past that the lane's new owner continues. `first` is the first round that it collects."""

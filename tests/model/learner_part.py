@@ -49,8 +49,7 @@ SAVED: dict[type, set[str]] = {
     Membership: {"members", "_next_session", "_joins", "_none_silent_before_s", "_of_process", "_refused"},
     Member: {"peer", "hello", "session", "join_number", "heard_s", "lanes", "tickets", "replies"}
     | {"strikes", "takeovers", "welcomed", "describes"},
-    TicketedLane: {"number", "incarnation", "owner", "moving", "due", "dealt", "outstanding", "next_sequence"}
-    | {"out_of_order", "taken"},
+    TicketedLane: {"number", "incarnation", "owner", "moving", "due", "dealt", "next_sequence", "out_of_order"} | {"taken"},
     TakenRollouts: {"history"},
     Ticket: {"permit", "version", "peer"},
     LanePlacement: {"_lanes", "_unplaced", "_settled", "_waiting_for"},
@@ -425,7 +424,6 @@ def loaded(content: Content, settings: Settings) -> Learner:
     for fields, under, worker in tickets:
         permit, peer = record_of(Permit, fields), peer_of(worker.value)
         coordinator.rollouts.held[permit.ticket] = Ticket(permit, under, peer)
-        coordinator.rollouts.lanes[permit.lane].outstanding.add(permit.ticket)
         coordinator.weights.held.named.setdefault(peer, {})[permit.ticket] = versions_of(under, [permit.opponent])
     membership_part.load(coordinator.membership, members)
     for peer, by_version in zip(coordinator.members, held, strict=True):  # in the order in which they joined

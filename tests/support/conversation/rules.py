@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import Counter
+
 from millrace.learner.rollouts.evaluation_dealer import FIRST_TICKET, HELD_AT_ONCE, PendingEvaluation
 from millrace.learner.rollouts.rollout_dealer import AcceptedRollout
 from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
@@ -31,10 +33,10 @@ def check_tickets(coordinator: TicketCoordinator, max_lag: int, *, shares: bool 
     owners = sorted((number, member.peer) for member in members.values() for number in member.lanes)
     known = [(lane.number, lane.owner) for lane in rollouts.lanes if lane.owner is not None]
     assert owners == known, f"{Rule.LANE_MOVES}: a lane has two owners, or its owner does not know"
-    mine: list[set[int]] = [set() for _ in rollouts.lanes]
-    for number, each in rollouts.held.items():
-        mine[each.permit.lane].add(number)
-    assert mine == [lane.outstanding for lane in rollouts.lanes], "a lane does not know its tickets"
+    mine = Counter(each.permit.lane for each in rollouts.held.values())
+    assert [mine[lane.number] for lane in rollouts.lanes] == [lane.busy for lane in rollouts.lanes], (
+        "a lane does not know how many tickets it has"
+    )
     assert all(not lane.due or lane.number in rollouts._to_deal for lane in rollouts.lanes), (
         f"{Rule.LOST_TICKETS}: a lane gets no more tickets"
     )
