@@ -17,7 +17,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from millrace.learner.members.coordinator import Coordinator
-from millrace.learner.members.member import Member
+from millrace.learner.members.member import Member, SentTicket
 from millrace.learner.members.membership import MAX_MEMBERS, Gone, Membership, Outgoing
 from millrace.protocol.alive import NO_SLOT
 from millrace.protocol.env_spec import EnvSpec
@@ -103,7 +103,7 @@ class DescribeCoordinator(Coordinator):
     def _order(self, member: Member) -> Outgoing:
         unknown = self._unknown
         assert unknown is not None
-        member.tickets[self._tickets] = member.replies
+        member.tickets[self._tickets] = SentTicket(member.replies)
         return member.peer, Describe(member.session, self._tickets, unknown.env, unknown.vector, unknown.render_mode)
 
     def _again(self, member: Member, heartbeat: Heartbeat, lost: Sequence[int]) -> list[Outgoing]:

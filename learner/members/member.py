@@ -7,7 +7,9 @@ a number that no loop can reach. The list of tickets in a heartbeat is not kept,
 from __future__ import annotations
 
 import math
+from collections.abc import Collection, Set
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import msgspec
 
@@ -31,6 +33,15 @@ class SharingSupervisor:
     """Number of heartbeat replies that were sent to it."""
     received: int = 0
     """Number of the last reply that it has received. Messages sent before that reply have arrived or are lost."""
+
+
+class SentTicket(NamedTuple):
+    """What the learner remembers of a ticket that it has sent to a worker."""
+
+    replies: int
+    """The value of the member's `replies` when the ticket was last sent."""
+    versions: Set[int] = frozenset()
+    """The versions of all weights that the worker needs for it."""
 
 
 @dataclass(frozen=True)
@@ -81,8 +92,8 @@ class Member:
     draining: bool = False
     """Whether the learner has asked it to leave."""
     lanes: set[int] = field(default_factory=set)
-    tickets: dict[int, int] = field(default_factory=dict)
-    """The tickets that the worker holds, each with the value of `replies` when the ticket was last sent."""
+    tickets: dict[int, SentTicket] = field(default_factory=dict)
+    """The tickets that the worker holds, by number."""
     replies: int = 0
     """Number of heartbeat replies that were sent to the worker."""
     welcomed: int = 0
@@ -145,6 +156,10 @@ class Member:
         """The env steps that were made for its unfinished tickets, as of its newest heartbeat."""
         return 0 if self.heartbeat is None else max(0, self.heartbeat.steps - self.ended_steps)
 
+    def needs(self, tickets: Collection[int]) -> set[int]:
+        """The versions of all weights that the worker needs for these tickets. Tickets that it doesn't hold are ignored."""
+        return {version for ticket in self.tickets.keys() & tickets for version in self.tickets[ticket].versions}
+
     def has_stepped(self) -> None:
         """Record that its process has taken an env step."""
         if self.first_step_s is None:
@@ -177,7 +192,7 @@ class Member:
         elif heartbeat.steps != self.speed.steps and self.heard_s - self.speed.at_s >= MEASURE_S:
             self.speed = self.speed.after(heartbeat.steps, self.heard_s)
         held = set(heartbeat.tickets)
-        return [ticket for ticket, sent_at in self.tickets.items() if ticket not in held and heartbeat.replies > sent_at]
+        return [ticket for ticket, sent in self.tickets.items() if ticket not in held and heartbeat.replies > sent.replies]
 
     def begins(self, heartbeat: Heartbeat) -> None:
         """If this heartbeat shows that a worker that was describing an environment has begun the run, record that."""

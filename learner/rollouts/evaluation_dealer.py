@@ -24,7 +24,7 @@ from typing import NamedTuple
 
 import msgspec
 
-from millrace.learner.members.member import Member
+from millrace.learner.members.member import Member, SentTicket
 from millrace.learner.members.membership import Outgoing
 from millrace.learner.run_folder.results import Evaluation, fact_means
 from millrace.protocol.bounds import LARGEST
@@ -303,9 +303,8 @@ class PendingEvaluation:
 
     def _order(self, member: Member, number: int) -> Evaluate:
         plan = self.plan
-        member.tickets[number] = member.replies
         opponents, teams = self._matches(number)
-        return Evaluate(
+        order = Evaluate(
             session=member.session,
             ticket=number,
             version=self.version,
@@ -317,6 +316,8 @@ class PendingEvaluation:
             opponents=opponents,
             teams=teams,
         )
+        member.tickets[number] = SentTicket(member.replies, order.versions)
+        return order
 
     def _matches(self, number: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
         """The opponents and the evaluated teams of a ticket's episodes, chosen so that each opponent meets all teams."""

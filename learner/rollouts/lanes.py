@@ -16,7 +16,7 @@ import numpy as np
 from millrace.learner.members.lane_placement import PlacedLane
 from millrace.learner.rollouts.lane_history import LaneHistories, LaneHistory
 from millrace.protocol.arrays import Bools
-from millrace.protocol.messages import LanePast, Permit
+from millrace.protocol.messages import LanePast, Permit, versions_of
 from millrace.protocol.rollout import Rollout
 
 MOST_ATTEMPTS = 3  # copies start afresh once this many attempts to continue their lane have each lost a worker
@@ -167,3 +167,8 @@ class Ticket:
     version: int
     """Version of the weights that act."""
     peer: bytes
+
+    @property
+    def versions(self) -> set[int]:
+        """The versions of all weights that its rollout needs."""
+        return versions_of(self.version, [self.permit.opponent])

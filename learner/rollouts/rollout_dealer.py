@@ -12,7 +12,7 @@ from bisect import insort
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from millrace.learner.members.member import Member
+from millrace.learner.members.member import Member, SentTicket
 from millrace.learner.members.membership import Gone, Outgoing
 from millrace.learner.rollouts.lag_rule import Rounds
 from millrace.learner.rollouts.lane_history import LaneHistories
@@ -165,7 +165,7 @@ class RolloutDealer:
         A ticket that includes a lane's past gets its own order, because a past is long.
         """
         chosen = {number: self.held[number] for number in tickets if number in self.held}
-        member.tickets |= dict.fromkeys(chosen, member.replies)
+        member.tickets |= {number: SentTicket(member.replies, ticket.versions) for number, ticket in chosen.items()}
         out: list[Outgoing] = []
         for version in sorted({ticket.version for ticket in chosen.values()}):
             of_version = [ticket.permit for ticket in chosen.values() if ticket.version == version]

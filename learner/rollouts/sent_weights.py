@@ -22,7 +22,7 @@ import msgspec
 from millrace.learner.members.member import Member, SharingSupervisor
 from millrace.learner.members.membership import Outgoing
 from millrace.protocol.alive import SHARED_VERSIONS
-from millrace.protocol.messages import Collect, Evaluate, Heartbeat, Weights, versions_of
+from millrace.protocol.messages import Collect, Evaluate, Heartbeat, Weights
 
 
 @dataclass(frozen=True)
@@ -50,13 +50,11 @@ Standing = SentAfter | FromSupervisor | Confirmed
 
 
 class WeightsHeld:
-    """The only record of which weights each worker and each supervisor holds or is about to get, and which it needs."""
+    """The only record of which weights each worker and each supervisor holds or is about to get."""
 
     def __init__(self) -> None:
         self.by_worker: dict[bytes, dict[int, Standing]] = {}
         """the workers' weights, by routing id and version"""
-        self.named: dict[bytes, dict[int, set[int]]] = {}
-        """the versions that each ticket names, by routing id and ticket; may include tickets that have ended"""
         self.by_supervisor = WeakKeyDictionary[SharingSupervisor, dict[int, SentAfter]]()
         """for each supervisor, its weights by version, the newest last; dropped with the supervisor's last member"""
 
@@ -81,17 +79,6 @@ class WeightsHeld:
         for oldest in list(shared)[:-SHARED_VERSIONS]:
             del shared[oldest]
         return supervisor.peer
-
-    def needs(self, member: Member, tickets: Collection[int]) -> set[int]:
-        """The versions that these tickets name. Tickets that have ended, or that the worker doesn't hold, are ignored."""
-        named = self.named.get(member.peer, {})
-        return {version for ticket in member.tickets.keys() & tickets for version in named[ticket]}
-
-    def note(self, member: Member, order: Collect | Evaluate) -> None:
-        """Record the versions that the tickets of this order name."""
-        named = self.named.get(member.peer, {})
-        outstanding = {ticket: versions for ticket, versions in named.items() if ticket in member.tickets}
-        self.named[member.peer] = outstanding | _by_ticket(order)
 
     def keep_only(self, peer: bytes, versions: Collection[int]) -> None:
         """Record that the worker was told to drop all other versions."""
@@ -119,7 +106,6 @@ class WeightsHeld:
     def forget(self, peer: bytes) -> None:
         """Forget a worker whose session has ended."""
         self.by_worker.pop(peer, None)
-        self.named.pop(peer, None)
 
     def _may_be_under_way(self, version: int, supervisor: SharingSupervisor | None) -> bool:
         """Whether these weights may still be on their way to the supervisor. False if it no longer shares weights."""
@@ -148,15 +134,12 @@ class SentWeights:
         weights = list[Outgoing]()
         for peer, order in orders:
             if isinstance(order, Collect | Evaluate):
-                self.held.note(members[peer], order)
-        for peer, order in orders:
-            if isinstance(order, Collect | Evaluate):
                 member = members[peer]
                 for version in sorted(order.versions - self.held.versions(peer)):
                     # Opponents differ from worker to worker, so their weights are not shared.
                     supervisor = member.shared_by if version == order.version else None
                     weights += self._send(member, version, supervisor)
-                keep = self.held.needs(member, member.tickets)  # including those that later orders in this list name
+                keep = member.needs(member.tickets)  # including those that later orders in this list name
                 self.held.keep_only(peer, keep)
                 order = msgspec.structs.replace(order, keep=tuple(sorted(keep)))
             out.append((peer, order))
@@ -165,16 +148,9 @@ class SentWeights:
     def again(self, member: Member, heartbeat: Heartbeat) -> list[Outgoing]:
         """The weights to send again, because this heartbeat shows that they were lost and unfinished tickets need them."""
         self.held.hear(member, heartbeat)
-        lost = sorted(self.held.needs(member, heartbeat.tickets) - self.held.versions(member.peer))
+        lost = sorted(member.needs(heartbeat.tickets) - self.held.versions(member.peer))
         return [message for version in lost for message in self._send(member, version, None)]
 
     def _send(self, member: Member, version: int, supervisor: SharingSupervisor | None) -> list[Outgoing]:
         receiver = self.held.give(member, version, supervisor)
         return [] if receiver is None else [(receiver, self.kept[version])]
-
-
-def _by_ticket(order: Collect | Evaluate) -> dict[int, set[int]]:
-    """The versions that each ticket of an order names."""
-    if isinstance(order, Evaluate):
-        return {order.ticket: order.versions}
-    return {permit.ticket: versions_of(order.version, [permit.opponent]) for permit in order.permits}

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 
 from millrace.learner.members.coordinator import Coordinator
 from millrace.learner.members.lane_placement import LanePlacement, PlacedLane, is_spare
-from millrace.learner.members.member import Member
+from millrace.learner.members.member import Member, SentTicket
 from millrace.learner.members.membership import Gone, Membership, Outgoing
 from millrace.protocol.errors import BadMessage
 from millrace.protocol.messages import (
@@ -193,7 +193,7 @@ class OrderCoordinator(Coordinator):
         order = make_order(member.session, self._tickets, LaneIncarnation(lane.number, lane.incarnation))
         lane.started = True
         lane.order = SentOrder(order)
-        member.tickets[order.ticket] = member.replies
+        member.tickets[order.ticket] = SentTicket(member.replies)
         return member.peer, order
 
     def _answer(self, member: Member, message: ToLearner) -> list[Outgoing]:
@@ -234,7 +234,7 @@ class OrderCoordinator(Coordinator):
         return []
 
     def _again(self, member: Member, heartbeat: Heartbeat, lost: Sequence[int]) -> list[Outgoing]:
-        member.tickets |= dict.fromkeys(lost, member.replies)
+        member.tickets |= dict.fromkeys(lost, SentTicket(member.replies))
         unanswered = [each for lane in member.lanes if isinstance(each := self.lanes[lane].order, SentOrder)]
         orders = {sent.order.ticket: sent.order for sent in unanswered}
         return [(member.peer, orders[ticket]) for ticket in lost]

@@ -18,7 +18,7 @@ from millrace.learner.rollouts.ledger import Ledger
 from millrace.learner.rollouts.rollout_dealer import AcceptedRollout, RolloutDealer
 from millrace.learner.rollouts.sent_weights import Confirmed, SentAfter, SentWeights, Standing, WeightsHeld
 from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
-from millrace.protocol.messages import Permit, ToLearner, WorkerExit, versions_of
+from millrace.protocol.messages import Permit, ToLearner, WorkerExit
 from millrace.protocol.rules import Rule
 from tests.model import membership_part
 from tests.model.conversation import Content
@@ -60,7 +60,7 @@ NOT_SAVED: dict[type, set[str]] = {
     TicketCoordinator: {"run", "worker_timeout_s", "evaluation", "_notes", "_check_rows"},
     RolloutDealer: {"_absent", "_absent_pasts", "opponents", "histories", "attributes", "_first_round", "_steps_before"},
     SentWeights: set(),
-    WeightsHeld: {"by_supervisor", "named"},
+    WeightsHeld: {"by_supervisor"},
     Membership: {"events", "draining", "progress", "_run", "_on_removed", "is_spare", "has_policy_code"}
     | {"_first_session", "_removed_for_silence", "_stages_of_left"},
     Member: {
@@ -337,7 +337,6 @@ def _held(coordinator: TicketCoordinator) -> Content:
     members = sorted(coordinator.members.values(), key=lambda each: each.join_number)
     by_worker = coordinator.weights.held.by_worker
     assert by_worker.keys() <= coordinator.members.keys(), "weights count as held by a worker that is gone"
-    assert coordinator.weights.held.named.keys() <= coordinator.members.keys(), "a worker that is gone needs weights"
     return tuple(
         tuple(
             (version, name(Kind.REPLIES, standing.replies, member.session) if isinstance(standing, SentAfter) else None)
@@ -424,8 +423,10 @@ def loaded(content: Content, settings: Settings) -> Learner:
     for fields, under, worker in tickets:
         permit, peer = record_of(Permit, fields), peer_of(worker.value)
         coordinator.rollouts.held[permit.ticket] = Ticket(permit, under, peer)
-        coordinator.weights.held.named.setdefault(peer, {})[permit.ticket] = versions_of(under, [permit.opponent])
     membership_part.load(coordinator.membership, members)
+    for number, each in coordinator.rollouts.held.items():
+        of_member = coordinator.members[each.peer].tickets
+        of_member[number] = of_member[number]._replace(versions=each.versions)
     for peer, by_version in zip(coordinator.members, held, strict=True):  # in the order in which they joined
         standings = {version: _standing(sent_at) for version, sent_at in by_version}
         coordinator.weights.held.by_worker[peer] = standings

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from millrace.learner.members.member import Member
+from millrace.learner.members.member import Member, SentTicket
 from millrace.learner.members.membership import Membership
 from millrace.learner.rollouts.evaluation_dealer import FIRST_TICKET
 from tests.model.conversation import Content
@@ -36,7 +36,7 @@ def _member(member: Member, now: float) -> Content:
         session(member.session),
         max(member.heard_s - now, -TIMEOUT_S - 1.0),
         tuple(sorted(member.lanes)),
-        tuple((ticket(number), replies(sent_at)) for number, sent_at in member.tickets.items() if number < FIRST_TICKET),
+        tuple((ticket(number), replies(sent.replies)) for number, sent in member.tickets.items() if number < FIRST_TICKET),
         replies(member.replies),
         replies(member.welcomed),
         member.takeovers,
@@ -55,7 +55,7 @@ def load(membership: Membership, content: Content) -> None:
         member = Member(peer_of(worker.value), said, number.value, join_number, heard)
         member.lanes = set(lanes)
         member.describes = describes
-        member.tickets = {each.value: sent_at.value for each, sent_at in tickets}
+        member.tickets = {each.value: SentTicket(sent_at.value) for each, sent_at in tickets}
         member.replies, member.welcomed, member.takeovers = replies.value, welcomed.value, takeovers
         member.strikes = strikes
         membership.members[member.peer] = member

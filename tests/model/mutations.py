@@ -246,10 +246,10 @@ MUTATIONS = {
         Rule.WEIGHTS_AFTER, WEIGHTS, "sorted(order.versions -", "sorted({order.version} -"
     ),
     "the weights of opponents do not count as named": Mutation(
-        Rule.KEEP, WEIGHTS, "versions_of(order.version, [permit.opponent]) for", "{order.version} for"
+        Rule.KEEP, LANES, "return versions_of(self.version, [self.permit.opponent])", "return {self.version}"
     ),
     "what the earlier tickets of a worker name is forgotten": Mutation(
-        Rule.KEEP, WEIGHTS, "outstanding | _by_ticket(order)", "_by_ticket(order)"
+        Rule.KEEP, WEIGHTS, "keep = member.needs(member.tickets)", "keep = order.versions"
     ),
     "the weights of opponents are dropped": Mutation(None, COORDINATOR, "needed.update(opponents.versions)", "pass"),
     "an opponent is forgotten while a version can meet it": Mutation(

@@ -35,7 +35,7 @@ MUTATIONS = {
         Rule.BEGINS, MEMBER, "            self.describes = False\n", "            pass\n"
     ),
     "a worker that is asked counts as free": Mutation(
-        Rule.ONE_DESCRIBES, COORDINATOR, "member.tickets[self._tickets] = member.replies\n", "pass\n"
+        Rule.ONE_DESCRIBES, COORDINATOR, "member.tickets[self._tickets] = SentTicket(member.replies)\n", "pass\n"
     ),
     "a lost order to describe is not sent again": Mutation(
         Rule.ORDER_AGAIN, COORDINATOR, "            del member.tickets[ticket]  # so", "            pass  # so"

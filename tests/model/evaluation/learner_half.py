@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from millrace.learner.members.member import SentTicket
 from millrace.learner.members.membership import Outgoing
 from millrace.learner.rollouts.evaluation_dealer import FIRST_TICKET, EvaluationDealer, PendingEvaluation
 from millrace.protocol.messages import EpisodeRows, ToLearner
@@ -150,8 +151,8 @@ def saved(learner: EvaluatingLearner, now: float) -> Content:
         (
             name(Kind.WORKER, worker_of(member.peer)),
             tuple(
-                (number - tickets._first, name(Kind.REPLIES, sent_at, member.session))
-                for number, sent_at in sorted(member.tickets.items())
+                (number - tickets._first, name(Kind.REPLIES, sent.replies, member.session))
+                for number, sent in sorted(member.tickets.items())
                 if number >= FIRST_TICKET
             ),
         )
@@ -194,9 +195,7 @@ def loaded(content: Content, settings: Evaluating) -> EvaluatingLearner:
         member = learner.coordinator.members[peer_of(worker.value)]
         for index, sent_at in mine:
             tickets.playing[tickets._first + index] = [member]
-            member.tickets[tickets._first + index] = sent_at.value
-            named = learner.coordinator.weights.held.named.setdefault(member.peer, {})
-            named[tickets._first + index] = {version}
+            member.tickets[tickets._first + index] = SentTicket(sent_at.value, {version})
     tickets._played = {index: evaluated(0, tickets._first + index, returns) for index, returns in played}
     for index, episode, of_session, step in rows:
         (holder,) = tickets.playing[tickets._first + index]

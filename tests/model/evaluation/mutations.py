@@ -36,7 +36,7 @@ MUTATIONS = {
         "        return self.weights.after(out, self.members) if evaluation is None else out",
     ),
     "the lost weights of an evaluation are not sent again": Mutation(
-        Rule.WEIGHTS_AGAIN, WEIGHTS, "return {order.ticket: order.versions}", "return {order.ticket: set()}"
+        Rule.WEIGHTS_AGAIN, TICKETS, "SentTicket(member.replies, order.versions)", "SentTicket(member.replies)"
     ),
     "a lost order to evaluate is not sent again": Mutation(
         Rule.ORDER_AGAIN, COORDINATOR, "orders += self.evaluation.pending.send(member, lost)", "pass"
