@@ -19,6 +19,7 @@ from millrace.learner.rollouts.lane_history import LaneHistories
 from millrace.learner.rollouts.lanes import TakenRollouts, Ticket, TicketedLane
 from millrace.learner.rollouts.ledger import Ledger
 from millrace.learner.rollouts.opponent_pool import OpponentPool
+from millrace.learner.rollouts.sent_weights import SentWeights
 from millrace.protocol.arrays import Bools
 from millrace.protocol.errors import BadRollout
 from millrace.protocol.messages import Collect, LanePast, Permit, Received, Rollout
@@ -72,10 +73,8 @@ class RolloutDealer:
         self.ready: dict[int, dict[int, AcceptedRollout]] = {}
         """the rollouts that have arrived and were not taken, by round and by lane"""
         self.rounds = rounds
-        self.attributes: dict[int, bytes] = {}
-        """the packed attributes of env copies, by the version of the weights with which they were sent; versions without
-        attributes may be missing
-        """
+        self.weights = SentWeights()
+        """the weights that act in open rounds, and all others that workers need"""
         self._first_round = rounds.next
         self._steps_before = self.ledger.transitions_used  # before the run was resumed
         self._absent = list(incarnations[lanes:])  # incarnations of lanes that the run had earlier, and may have again
@@ -89,8 +88,6 @@ class RolloutDealer:
         for number in self.rounds.begin(version):
             for lane in self.lanes:
                 lane.due.append(number)
-        acting = self.rounds.acting()
-        self.attributes = {each: packed for each, packed in self.attributes.items() if each in acting}
         self._to_deal |= {lane.number for lane in self.lanes if lane.due}
 
     def take(self) -> list[AcceptedRollout] | None:
@@ -101,7 +98,8 @@ class RolloutDealer:
         self.rounds.end()
         self.ledger.used += len(taken)
         self.ledger.transitions_used += sum(arrived.rollout.env_steps for arrived in taken)
-        return [self._marked(arrived) for arrived in taken]
+        attributes = self._attributes_of(taken[0].rollout)  # made once, because the histories of all lanes refer to them
+        return [self._marked(arrived, attributes) for arrived in taken]
 
     def not_used(self, taken: list[AcceptedRollout]) -> None:
         """Put back the rollouts that `take` returned last, because their update was undone.
@@ -271,15 +269,16 @@ class RolloutDealer:
 
     def _attributes_of(self, rollout: Rollout) -> bytes:
         """The attributes, packed, that were set on the rollout's env copies."""
-        return self.attributes.get(rollout.version, b"")
+        attributes = self.weights.kept[rollout.version].env_attributes
+        return b"" if attributes is None else attributes.tobytes()
 
-    def _marked(self, arrived: AcceptedRollout) -> AcceptedRollout:
+    def _marked(self, arrived: AcceptedRollout, attributes: bytes) -> AcceptedRollout:
         """A rollout that the next update uses, with `fresh` set."""
         rollout = arrived.rollout
         fresh = self.lanes[rollout.lane].take(
             arrived.incarnation,
             rollout,
-            self._attributes_of(rollout),
+            attributes,
             self.histories,
             from_past=arrived.from_past,
         )

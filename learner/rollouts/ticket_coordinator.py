@@ -23,7 +23,6 @@ from millrace.learner.members.membership import Answered, Gone, Membership, Outg
 from millrace.learner.rollouts.evaluation_dealer import EvaluationDealer, EvaluationPlan, OnRows
 from millrace.learner.rollouts.past_rollouts import PastRollouts, RoundsState
 from millrace.learner.rollouts.rollout_dealer import RolloutDealer
-from millrace.learner.rollouts.sent_weights import SentWeights
 from millrace.protocol.errors import BadRollout
 from millrace.protocol.messages import (
     Array,
@@ -71,7 +70,7 @@ class TicketCoordinator(Coordinator):
         self.run = run
         self.version = -1  # version of the newest weights; -1 before the first `publish`
         self._placement = LanePlacement(lanes, _by_joining)
-        self.weights = SentWeights()
+        self.weights = rollouts.weights
         self._notes = set[str]()  # notes already logged; workers with the same environment send the same notes
         self._check_rows = check_rows
 
@@ -107,19 +106,11 @@ class TicketCoordinator(Coordinator):
         if self.rollouts.opponents is not None and env_steps is not None:
             self.rollouts.opponents.made(version, env_steps)
         self.version = version
-        weights = Weights(version, parameters, buffers, env_attributes)
-        self.weights.keep(weights, self._needed())
-        self._note_attributes(weights)
+        self.weights.keep(Weights(version, parameters, buffers, env_attributes), self._needed())
 
     def keep(self, weights: Weights) -> None:
         """Store weights that act in an open round of a resumed run."""
         self.weights.kept[weights.version] = weights
-        self._note_attributes(weights)
-
-    def _note_attributes(self, weights: Weights) -> None:
-        """Record the attributes that env copies have in rollouts with these weights."""
-        if weights.env_attributes is not None:
-            self.rollouts.attributes[weights.version] = weights.env_attributes.tobytes()
 
     def past(self) -> PastRollouts:
         """The state from which another learner continues after the last round that was taken."""

@@ -43,7 +43,7 @@ from tests.support.conversation.rules import check_tickets, waiting_rollouts
 MOST_STEPS = 1_000  # of an episode that is repeated
 SAVED: dict[type, set[str]] = {
     TicketCoordinator: {"version", "membership", "rollouts", "weights", "_placement"},
-    RolloutDealer: {"lanes", "ledger", "held", "ready", "rounds", "_to_deal"},
+    RolloutDealer: {"lanes", "ledger", "held", "ready", "rounds", "weights", "_to_deal"},
     SentWeights: {"kept", "held"},
     WeightsHeld: {"by_worker"},
     Membership: {"members", "_next_session", "_joins", "_none_silent_before_s", "_of_process", "_refused"},
@@ -58,7 +58,7 @@ SAVED: dict[type, set[str]] = {
 """What of each object is saved."""
 NOT_SAVED: dict[type, set[str]] = {
     TicketCoordinator: {"run", "worker_timeout_s", "evaluation", "_notes", "_check_rows"},
-    RolloutDealer: {"_absent", "_absent_pasts", "opponents", "histories", "attributes", "_first_round", "_steps_before"},
+    RolloutDealer: {"_absent", "_absent_pasts", "opponents", "histories", "_first_round", "_steps_before"},
     SentWeights: set(),
     WeightsHeld: {"by_supervisor"},
     Membership: {"events", "draining", "progress", "_run", "_on_removed", "is_spare", "has_policy_code"}

@@ -1203,15 +1203,25 @@ def saved(learner: Learner) -> object:
 
 def test_weights_that_still_act_keep_their_attributes_when_they_are_published_again_to_be_evaluated() -> None:
     """A run is resumed whose weights 2 act in round 3, and were being evaluated alongside training."""
-    learner = Learner(lanes=1, publish=False, rounds=Rounds(1, 3, {3: 2}))
+    learner = Learner(lanes=2, publish=False, rounds=Rounds(1, 3, {3: 2}))
     coordinator = learner.coordinator
-    coordinator.keep(Weights(2, PARAMETERS, BUFFERS, np.array([7], np.uint8)))
+    coordinator.keep(Weights(2, PARAMETERS, BUFFERS, np.array([7, 0], np.uint8)))
     coordinator.publish(2, PARAMETERS, BUFFERS)
-    coordinator.publish(3, PARAMETERS, BUFFERS, env_attributes=np.array([8], np.uint8))
+    coordinator.publish(3, PARAMETERS, BUFFERS, env_attributes=np.array([8, 0], np.uint8))
     coordinator.begin_update()
     sent = {each.version: each.env_attributes for _, each in learner.joins(A) if isinstance(each, Weights)}
-    assert [(version, None if each is None else each.tolist()) for version, each in sent.items()] == [(2, [7]), (3, [8])]
-    assert coordinator.rollouts.attributes == {2: bytes([7]), 3: bytes([8])}
+    assert [(version, None if each is None else each.tolist()) for version, each in sent.items()] == [
+        (2, [7, 0]),
+        (3, [8, 0]),
+    ]
+    coordinator.rollouts.histories = LaneHistories(copies=1, most_steps=100)
+    for ticket, begun in zip([0, 2, 1, 3], [(EpisodeBegin(0, 0, b""),)] * 2 + [()] * 2, strict=True):
+        learner.says(A, msgspec.structs.replace(learner.rollout_of(ticket), begun=begun, memory=fake_memory(1)))
+    for _ in range(2):
+        learner.take()
+    assert [past.attributes.by_row() for past in coordinator.rollouts.pasts()] == [{0: bytes([7, 0]), 1: bytes([8, 0])}] * 2
+    one, other = ([rows.attributes for rows in lane.history.rows] for lane in coordinator.rollouts.lanes if lane.history)
+    assert list(map(id, one)) == list(map(id, other)), "they may be long, and are stored once for all lanes"
 
 
 def test_incarnations_for_a_checkpoint_name_no_life_that_was_dealt_a_ticket() -> None:
