@@ -12,7 +12,7 @@ from millrace.flags.fields import Flag
 from millrace.flags.parse import parse_flags
 from millrace.planning.plan import LEAST_S, SECONDS, plan_of
 from millrace.planning.probe import ProbedEnv
-from millrace.planning.run_plan import screen
+from millrace.planning.run_plan import show
 from millrace.protocol.bounds import Natural
 from millrace.protocol.env_spec import Scalar
 
@@ -42,6 +42,8 @@ def run(argv: list[str]) -> int:
         plan = plan_of(env, max_env_copies=flags.max_env_copies, seconds=flags.seconds, say=shown.update)
     if flags.json:
         print(msgspec.json.encode({"type": type(plan).__name__, **msgspec.structs.asdict(plan)}).decode())
+    elif (console := Console()).is_terminal:
+        show(plan, console)
     else:
-        Console().print(screen(plan), highlight=False)
+        print(plan)
     return 0

@@ -85,7 +85,7 @@ class RunPlan(msgspec.Struct, frozen=True, kw_only=True):
 
     def __str__(self) -> str:
         text = io.StringIO()
-        Console(file=text, width=WIDTH).print(screen(self))
+        show(self, Console(file=text, width=WIDTH, color_system=None))
         return "\n".join(line.rstrip() for line in text.getvalue().splitlines())
 
 
@@ -118,8 +118,16 @@ def added_by_preset(env: str, env_kwargs: Mapping[str, Scalar], algo: str) -> st
 # ------------------------------------------------------------------------------------------------------------------ as text
 
 
-def screen(plan: RunPlan) -> RenderableType:
-    """The plan in a form that fits on one terminal screen."""
+def show(plan: RunPlan, console: Console) -> None:
+    """Print the plan in a form that fits on one terminal screen.
+
+    The command is one line, however long it is, so that it can be pasted. Only the terminal may wrap it.
+    """
+    console.print(_all_but_the_command(plan), highlight=False)
+    console.print(Text("  " + plan.command), soft_wrap=True)
+
+
+def _all_but_the_command(plan: RunPlan) -> RenderableType:
     found = Table.grid(padding=(0, 2))
     for name, value in _found(plan.measured):
         found.add_row(Text(name, style="dim"), Text(value))
@@ -139,7 +147,7 @@ def screen(plan: RunPlan) -> RenderableType:
         parts.append(Text("know", style="bold"))
         parts += [Padding(Text(line), INDENTED) for line in plan.advice]
         parts.append("")
-    return Group(*parts, Text("type", style="bold"), Padding(Text(plan.command), INDENTED))
+    return Group(*parts, Text("type", style="bold"))
 
 
 def _expected(plan: RunPlan) -> Table:
