@@ -88,6 +88,8 @@ class Measurements(msgspec.Struct, frozen=True, kw_only=True):
     """the smallest number of copies, more than one, that may have had a problem because they were in the same worker; 0 if
     there is none
     """
+    slowest_step_s: float = 0.0
+    """wall time of the slowest step of all copies"""
     reset_s: float = 0.0
     """mean wall time of a reset"""
     reset_cpu_s: float = 0.0

@@ -316,6 +316,7 @@ def _with_all(measured: Measurements, sessions: Sequence[_SteppedCopies]) -> Mea
         measured,
         masks_in_info=any(each.masks.in_info for each in sessions) and not wrong_masks,
         wrong_masks=wrong_masks,
+        slowest_step_s=max(float(each.steps[:, 1].max(initial=0.0)) for each in times),
         reset_s=float((resets[:, 1] - resets[:, 3]).mean()),
         reset_cpu_s=float((resets[:, 2] + share * resets[:, 1]).mean()),
         resets=len(resets),

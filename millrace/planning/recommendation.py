@@ -27,6 +27,10 @@ REPLAY_SIZES = (1_000_000, 500_000, 200_000, 100_000, 50_000, 20_000, 10_000)
 OF_MEMORY = 0.8  # share of the free memory that a run may use
 OF_MEMORY_FOR_REPLAY = 0.4  # share of the free memory that the replay buffer may use
 LAGS = (0, 1, 2)
+OUTSIDE_S = 1e-3  # a step that takes longer may be that of a program outside of the worker, which may hang
+STEP_TIMEOUTS_S = (30, 60, 120, 300)
+SLOWEST_STEPS = 100  # a step timeout is at least this many times the slowest measured step
+STARTS = 10  # and at least this many times a start or a reset, because some environments restart their simulator in a step
 NEEDED_STEPS = {"xqc": 100_000, "rainbow": 100_000, "sac": 300_000, "ppo": 1_000_000}
 """About how many env steps tasks such as MuJoCo's took with each algorithm. Other tasks may take more or fewer."""
 
@@ -135,6 +139,21 @@ def choose_replay_size(default: int, measured: Measurements, machine: Machine) -
     size = next((size for size in REPLAY_SIZES if size < default and size * of_one <= room), REPLAY_SIZES[-1])
     why = f"a transition takes {of_one:,} bytes, so {default:,} of them would take {default * of_one / 2**30:,.1f} GB"
     return ChosenSetting("replay_size", size, why)
+
+
+def choose_step_timeout(default_s: float, measured: Measurements) -> ChosenSetting | None:
+    """A shorter step timeout, if steps are so much faster than the default that one which hangs would waste time."""
+    if measured.alone.mean_s < OUTSIDE_S:
+        return None
+    least_s = max(SLOWEST_STEPS * measured.slowest_step_s, STARTS * max(measured.start_s, measured.reset_s))
+    timeout_s = next((each for each in STEP_TIMEOUTS_S if each >= least_s), None)
+    if timeout_s is None or timeout_s > default_s / 2:
+        return None
+    why = (
+        f"the slowest measured step took {time_in_words(measured.slowest_step_s)}; if a step hangs, its worker is restarted "
+        f"after {timeout_s} s instead of {default_s:g} s"
+    )
+    return ChosenSetting("step_timeout_s", timeout_s, why)
 
 
 # ---------------------------------------------------------------------------------------------------------------- the sizes

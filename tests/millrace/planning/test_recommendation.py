@@ -22,6 +22,7 @@ from millrace.planning.recommendation import (
     candidates,
     choose_algorithm,
     choose_replay_size,
+    choose_step_timeout,
     copies_at_once,
     on_machines,
     reasons,
@@ -209,6 +210,27 @@ def test_a_replay_buffer_that_takes_too_much_memory_is_smaller() -> None:
     assert isinstance(smaller.value, int)
     assert smaller.value * 84 * 84 * 4 < (MACHINE.free_bytes or 0) / 2
     assert smaller.value == 200_000
+
+
+@pytest.mark.parametrize(
+    ("wait_s", "slowest_step_s", "start_s", "reset_s", "expected"),
+    [
+        (0.04, 0.06, 0.5, 0.1, 30),
+        (0.04, 0.5, 0.5, 0.1, 60),
+        (0.04, 2.9, 0.5, 0.1, 300),
+        (0.04, 3.1, 0.5, 0.1, None),
+        (0.04, 0.06, 8.0, 0.1, 120),
+        (0.04, 0.06, 0.5, 8.0, 120),
+        (1e-4, 0.06, 0.5, 0.1, None),
+    ],
+)
+def test_a_step_timeout_is_far_above_all_measured_times_and_far_below_the_default(
+    wait_s: float, slowest_step_s: float, start_s: float, reset_s: float, expected: int | None
+) -> None:
+    found = measured(wait_s=wait_s, slowest_step_s=slowest_step_s, start_s=start_s, reset_s=reset_s)
+    chosen_timeout = choose_step_timeout(600.0, found)
+    assert (None if chosen_timeout is None else chosen_timeout.value) == expected
+    assert choose_step_timeout(40.0, found) is None
 
 
 def test_what_sets_the_number_of_copies_is_said() -> None:

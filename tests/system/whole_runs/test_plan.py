@@ -85,6 +85,8 @@ def test_the_command_measures_an_environment_that_waits_and_names_a_command_that
         chosen["workers"],
         {"seconds": step_s, "k": 5},
     )
+    assert found["measured"]["slowest_step_s"] >= alone["p95_s"]
+    assert config.step_timeout_s == chosen["step_timeout_s"] <= 300
     one, two, ten = (each["steps_per_s"] for each in found["expected"])
     assert 0 < one <= 2 / step_s
     assert one <= two <= ten
