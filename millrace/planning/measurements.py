@@ -77,13 +77,13 @@ class Measurements(msgspec.Struct, frozen=True, kw_only=True):
     side_by_side: tuple[StepCosts, ...]
     """costs of a step for each number of workers that was tried, in ascending order; never empty"""
     copies_worked: int = 1
-    """the largest number of copies that were stepped side by side without a problem"""
+    """the largest number of copies that were stepped side by side without a problem that is due to their number"""
     copies_failed: int = 0
     """the smallest number of copies, more than `copies_worked`, that may have had a problem because of their number; 0 if
     there is none
     """
     worked_in_one_worker: int = 1
-    """the largest number of copies that were stepped in the same worker without a problem"""
+    """the largest number of copies that were stepped in the same worker without such a problem"""
     failed_in_one_worker: int = 0
     """the smallest number of copies, more than one, that may have had a problem because they were in the same worker; 0 if
     there is none
@@ -103,6 +103,10 @@ class Measurements(msgspec.Struct, frozen=True, kw_only=True):
     """memory of a worker with one copy, including the processes that the copy has started"""
     deterministic: bool | None = None
     """whether another copy returns the same results for the same seed and actions; None if it isn't known"""
+    failures: int = 0
+    """number of crashes, exceptions and calls that hung, without those that were due to the number of copies"""
+    calls: int = 0
+    """number of steps and resets in which these failures happened"""
     findings: tuple[str, ...] = ()
     """problems that were found, such as a crash or a step that hung; one line each"""
 

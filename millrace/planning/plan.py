@@ -25,6 +25,7 @@ from millrace.planning.recommendation import (
     best,
     candidates,
     choose_algorithm,
+    choose_max_env_failures,
     choose_replay_size,
     choose_step_timeout,
     on_machines,
@@ -113,7 +114,8 @@ def plan_of(env: ProbedEnv, *, max_env_copies: int, seconds: float, say: Callabl
         replay_size = choose_replay_size(config.algorithm.replay_size, measured, machine)
         others += [] if replay_size is None else [replay_size]
     step_timeout = choose_step_timeout(config.step_timeout_s, measured)
-    others += [] if step_timeout is None else [step_timeout]
+    failures = choose_max_env_failures(config.max_env_failures, measured)
+    others += [each for each in (step_timeout, failures) if each is not None]
     say(f"updating with {config.algo}, and an environment that does nothing")
     stood_for = StoodFor(probed.observation_space, probed.action_space, probed.seats, measured.alone.wait_s)
     situation = Situation(measured=measured, overheads=overheads(config, stood_for), machine=machine)

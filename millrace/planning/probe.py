@@ -2,7 +2,8 @@
 
 Rule: the environment's code runs in workers, never in this process. Each session has a deadline; if it isn't whole by then,
 its number of copies counts as not measured. An error before the first step is raised; a later one becomes a finding of one
-line.
+line. If all copies of a session have taken enough steps, and then a call takes as long as half of the time that is left, the
+call counts as one that hangs, so the other half is left for other numbers of copies.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from millrace.learner.vector_env.settings import VectorEnvSettings
 from millrace.planning.measurements import ActionKind, Machine, Measurements, StepCosts
 from millrace.planning.probe_sizes import SessionSize, most_each, numbers_of_workers, two_fit
 from millrace.planning.random_actions import SEED, RandomActions, SeenMasks
+from millrace.planning.sessions import MORE_TIME, TRIES, WARM_UP, Failures, SteppedCopies, Tries
 from millrace.planning.stopwatch import CopyTimes, read_notes
 from millrace.protocol.arrays import Array
 from millrace.protocol.bounds import one_line
@@ -38,13 +40,10 @@ from millrace.protocol.errors import MillraceError, RunError, UsageError, first_
 from millrace.protocol.specs import ActionSpec
 
 LEAST_STEPS = 8  # number of steps that each copy takes, even if they last longer than planned
-WARM_UP = 2  # this many steps at the beginning of a copy aren't counted
 OF_ALONE = 0.15  # share of the time in which one copy steps alone
 EACH_S = 2.0  # how long each number of workers is measured
 GRACE_S = 1.0  # how long after its deadline a session waits for the last steps
 SHORT_S = 1e-3  # shorter steps are measured in workers with several copies, because a run steps them in this way
-OF_ITS_OWN = "if a copy needs a port, a folder or a licence of its own, see docs/how-to/simulators.md"
-MORE_TIME = "allow more time with --seconds"
 WORTH_WHILE = 1.1  # if more workers don't increase the env steps/s by this factor, even larger numbers aren't tried
 
 
@@ -80,101 +79,73 @@ def probe(env: ProbedEnv, machine: Machine, seconds: float) -> Probed:
     Raises `UserFacingError` if no step was completed.
     """
     end_s = time.monotonic() + seconds
-    first = _session(env, SessionSize(), OF_ALONE * seconds, end_s)
+    alone = _tries(env, SessionSize(), OF_ALONE * seconds, end_s)
+    first = alone.longest
     if not first.times or not len(first.times[0].steps):
         why = first.wrong or "the start of a copy, a reset or a step takes longer"
         raise RunError(f"plan: {env.name}: no step could be made within {seconds:g} s: {why}")
-    sessions = [first]
+    tried = [alone]
     measured = _measured_alone(env, first)
     each = 1
-    if first.is_whole and measured.alone.own_s < SHORT_S and (most := most_each(measured, machine)) > 1:
+    if alone.worked and measured.alone.own_s < SHORT_S and (most := most_each(measured, machine)) > 1:
         # Several workers need the other half of the time that is left.
-        several = _session(env, SessionSize(each=most), OF_ALONE * seconds, (time.monotonic() + end_s) / 2)
-        sessions.append(several)
-        if several.is_whole:
+        several = _tries(env, SessionSize(each=most), OF_ALONE * seconds, (time.monotonic() + end_s) / 2, first)
+        tried.append(several)
+        if several.worked:
             each = most
-            measured = msgspec.structs.replace(measured, side_by_side=(_costs(1, several.times),))
+            measured = msgspec.structs.replace(measured, side_by_side=(_costs(1, several.longest.times),))
     for workers in () if first.is_too_slow else numbers_of_workers(measured, machine, each):
-        session = _session(env, SessionSize(workers, each), EACH_S, end_s)
-        sessions.append(session)
-        if not session.is_whole:
+        tries = _tries(env, SessionSize(workers, each), EACH_S, end_s, first)
+        tried.append(tries)
+        if not tries.worked:
             break
-        costs = _costs(workers, session.times)
+        costs = _costs(workers, tries.longest.times)
         if costs.steps_per_s < WORTH_WHILE * measured.side_by_side[-1].steps_per_s:
             break
         measured = msgspec.structs.replace(measured, side_by_side=(*measured.side_by_side, costs))
-    if first.is_whole and not any(session.decides_about_two for session in sessions):
+    if alone.worked and not any(tries.decide_about_two for tries in tried):
         # An evaluation makes a second copy in a worker. It also shows whether the environment is deterministic.
-        sessions.append(_session(env, SessionSize(each=2 if two_fit(measured, machine) else 1), EACH_S, end_s))
-    return Probed(_with_all(measured, sessions), first.observation_space, first.action_space, first.seats)
+        two = SessionSize(each=2 if two_fit(measured, machine) else 1)
+        tried.append(_tries(env, two, EACH_S, end_s, first))
+    return Probed(_with_all(measured, tried), first.observation_space, first.action_space, first.seats)
 
 
 # ------------------------------------------------------------------------------------------------------------ one session
-
-
-class _SteppedCopies(NamedTuple):
-    """The record of a session in which some copies were stepped side by side."""
-
-    size: SessionSize
-    times: list[CopyTimes]
-    traces: list[list[int]]
-    """for each copy and step, a checksum of the observation, reward and flags that it returned"""
-    start_s: float
-    wrong: str
-    """what went wrong, as one line; empty if nothing did"""
-    cut_off: bool
-    """whether the deadline has passed before all copies had answered"""
-    masks: SeenMasks
-    observation_space: gymnasium.Space[Any]
-    action_space: gymnasium.Space[Any]
-    seats: tuple[str, ...]
-    time_limit: int | None
-
-    @property
-    def is_whole(self) -> bool:
-        """Whether all copies took steps, in time, and nothing went wrong."""
-        stepped = sum(len(each.steps) > WARM_UP for each in self.times)
-        return stepped == self.size.copies and not self.wrong and not self.cut_off
-
-    @property
-    def is_too_slow(self) -> bool:
-        """Whether the deadline passed before all copies had taken a few steps and answered."""
-        return not self.is_whole and not self.wrong
-
-    @property
-    def decides_about_two(self) -> bool:
-        """Whether two copies in one worker would show nothing more: two have failed, or several in one worker have not."""
-        return self.size.copies == 2 if self.wrong else self.size.each > 1
-
-    @property
-    def finding(self) -> str:
-        """What went wrong, and with how many copies, as one line; empty if nothing did."""
-        if self.is_whole:
-            return ""
-        if self.size.copies == 1:
-            calls = max(map(len, self.traces))
-            why = self.wrong or f"the time was up before another one returned; unless it hangs, {MORE_TIME}"
-            return f"one copy, after {calls} calls: {why}"
-        copies = f"{self.size.copies} copies {'in one worker' if self.size.workers == 1 else 'side by side'}"
-        if self.wrong:
-            return f"{copies}: {self.wrong}; {OF_ITS_OWN}"
-        why = "the time was up before all had taken a few steps"
-        return f"{copies} were not measured, because {why}; unless they hang, {MORE_TIME}"
 
 
 class _TimeIsUp(Exception):
     """A session's deadline has passed, and copies have not answered."""
 
 
-def _session(env: ProbedEnv, size: SessionSize, seconds: float, deadline_s: float) -> _SteppedCopies:
+class _CallHangs(Exception):
+    """A call to a copy has not returned for a long time, although all copies had taken enough steps before."""
+
+
+def _tries(
+    env: ProbedEnv, size: SessionSize, seconds: float, deadline_s: float, alone: SteppedCopies | None = None
+) -> Tries:
+    """Step copies as `_session` does, and try again as long as their number seems to be the reason why they fail."""
+    sessions: list[SteppedCopies] = []
+    while True:
+        sessions.append(_session(env, size, seconds, deadline_s))
+        tries = Tries(tuple(sessions), alone)
+        if not sessions[-1].wrong or not tries.show_a_limit or len(sessions) == TRIES:
+            return tries
+
+
+def _session(env: ProbedEnv, size: SessionSize, seconds: float, deadline_s: float) -> SteppedCopies:
     """Step copies for this many seconds, but not beyond the deadline. After the deadline, start no copies at all.
 
     Raises `UserFacingError` if there is only one copy and it can't be made.
     """
+    end_at_s = math.inf
 
     def check_time() -> None:
-        if time.monotonic() > deadline_s + GRACE_S:
+        now_s = time.monotonic()
+        if now_s > deadline_s + GRACE_S:
             raise _TimeIsUp
+        if now_s > (end_at_s + deadline_s) / 2 + GRACE_S and min(map(len, traces)) > LEAST_STEPS:
+            raise _CallHangs(f"a call took longer than {now_s - end_at_s:.0f} s; unless it hangs, {MORE_TIME}")
 
     with TemporaryDirectory(prefix="millrace-plan-") as folder:
         notes = Path(folder, "notes")
@@ -204,20 +175,23 @@ def _session(env: ProbedEnv, size: SessionSize, seconds: float, deadline_s: floa
                 limit = None if envs.spec is None else envs.spec.max_episode_steps
                 known = (envs.single_observation_space, envs.single_action_space, envs.seats, limit)
                 random_actions = RandomActions(*known[:2], max(1, len(envs.seats)))
+                end_at_s = time.monotonic() + seconds
                 try:
-                    _step(envs, random_actions, traces, time.monotonic() + seconds, deadline_s)
+                    _step(envs, random_actions, traces, end_at_s, deadline_s)
                 finally:
                     masks = random_actions.masks
         except UsageError:
             raise
         except _TimeIsUp:
             cut_off = True
+        except _CallHangs as hangs:
+            wrong = str(hangs)
         except MillraceError as error:
             if size.copies == 1 and not any(notes.iterdir()):
                 raise
             wrong = one_line(first_line(error, type(error).__name__))
         times = [each for each in read_notes(notes) if len(each.resets)]
-        return _SteppedCopies(size, times, traces, start_s, wrong, cut_off, masks, *known)
+        return SteppedCopies(size, times, traces, start_s, wrong, cut_off, masks, *known)
 
 
 def _step(
@@ -278,7 +252,7 @@ def _deterministic(traces: Sequence[Sequence[int]]) -> bool | None:
 # ------------------------------------------------------------------------------------------------------------ the numbers
 
 
-def _measured_alone(env: ProbedEnv, session: _SteppedCopies) -> Measurements:
+def _measured_alone(env: ProbedEnv, session: SteppedCopies) -> Measurements:
     """The measurements from a session with one copy."""
     leaves = observation_leaves(session.observation_space)
     keys = session.observation_space.spaces if isinstance(session.observation_space, spaces.Dict) else {}
@@ -295,19 +269,21 @@ def _measured_alone(env: ProbedEnv, session: _SteppedCopies) -> Measurements:
     )
 
 
-def _with_all(measured: Measurements, sessions: Sequence[_SteppedCopies]) -> Measurements:
+def _with_all(measured: Measurements, tried: Sequence[Tries]) -> Measurements:
     """Add the measurements that need all sessions.
 
     The first reset of a copy may be slower than the later ones, so it isn't counted unless no copy was reset twice.
     """
+    sessions = [session for tries in tried for session in tries.sessions]
     times = [each for session in sessions for each in session.times]
     later = [each.resets[1:] for each in times if len(each.resets) > 1]
     resets = np.concatenate(later or [each.resets for each in times])
     steps = sum(int(np.count_nonzero(each.steps[:, 0] < each.resets[-1, 0])) for each in times)  # steps of complete episodes
     share = max(each.others_cpu_share for each in times)
-    worked = max((each.size.copies for each in sessions if each.is_whole), default=1)
-    worked_in_one = max((each.size.each for each in sessions if each.is_whole), default=1)
-    failed = [each.size for each in sessions if each.wrong and each.size.copies > 1]
+    worked = max((tries.size.copies for tries in tried if tries.worked), default=1)
+    worked_in_one = max((tries.size.each for tries in tried if tries.worked), default=1)
+    failed = [tries.size for tries in tried if tries.show_a_limit and tries.size.copies > 1]
+    failures = Failures.of(tried)
     # If several copies have worked in one worker, a process allows several. If more then failed there, the reason may be
     # their number or the number in a process, so both are limited.
     too_many = [size for size in failed if size.copies > worked and (size.workers > 1 or worked_in_one > 1)]
@@ -326,7 +302,9 @@ def _with_all(measured: Measurements, sessions: Sequence[_SteppedCopies]) -> Mea
         failed_in_one_worker=min((size.each for size in failed if size.workers == 1), default=0),
         episode_steps=steps / sum(map(len, later)) if later else sessions[0].time_limit,
         deterministic=_deterministic([trace for session in sessions for trace in session.traces]),
-        findings=tuple(session.finding for session in sessions if not session.is_whole),
+        failures=len(failures.sessions),
+        calls=failures.calls,
+        findings=tuple(line for line in (failures.finding, *(tries.finding for tries in tried)) if line),
     )
 
 

@@ -7,11 +7,13 @@ docs/how-to/slow_environments.md.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping
 from typing import NamedTuple
 
 import msgspec
 
+from millrace.learner.members.failure_count import WORK_S
 from millrace.planning.expected_rate import Situation, Sizes
 from millrace.planning.in_words import counted, number_in_words, time_in_words
 from millrace.planning.measurements import WORKER_BYTES, Machine, Measurements
@@ -30,6 +32,8 @@ LAGS = (0, 1, 2)
 OUTSIDE_S = 1e-3  # a step that takes longer may be that of a program outside of the worker, which may hang
 STEP_TIMEOUTS_S = (30, 60, 120, 300)
 SLOWEST_STEPS = 100  # a step timeout is at least this many times the slowest measured step
+OFTENER = 2.0  # failures may become this many times as frequent as they were
+LEAST_BETWEEN_S = 1.0  # if failures are more frequent, no setting helps
 STARTS = 10  # and at least this many times a start or a reset, because some environments restart their simulator in a step
 NEEDED_STEPS = {"xqc": 100_000, "rainbow": 100_000, "sac": 300_000, "ppo": 1_000_000}
 """About how many env steps tasks such as MuJoCo's took with each algorithm. Other tasks may take more or fewer."""
@@ -154,6 +158,23 @@ def choose_step_timeout(default_s: float, measured: Measurements) -> ChosenSetti
         f"after {timeout_s} s instead of {default_s:g} s"
     )
     return ChosenSetting("step_timeout_s", timeout_s, why)
+
+
+def choose_max_env_failures(default: int, measured: Measurements) -> ChosenSetting | None:
+    """A larger number of failures that a run survives, if the environment failed so often that the default (at least 1)
+    might end a run.
+    """
+    if not measured.failures:
+        return None
+    between_s = measured.alone.mean_s * measured.calls / measured.failures
+    needed = math.ceil(OFTENER * WORK_S / max(between_s, LEAST_BETWEEN_S))
+    if needed <= default or between_s < LEAST_BETWEEN_S:
+        return None
+    why = (
+        f"a copy failed about once in {time_in_words(between_s)} of its steps; {default} allows a failure in "
+        f"{time_in_words(WORK_S / default)}, and {needed} in {time_in_words(WORK_S / needed)}"
+    )
+    return ChosenSetting("max_env_failures", needed, why)
 
 
 # ---------------------------------------------------------------------------------------------------------------- the sizes

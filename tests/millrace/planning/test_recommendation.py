@@ -14,6 +14,7 @@ from millrace.flags.parse import parse_flags
 from millrace.learner.config.command_line import read_config
 from millrace.learner.config.layers import resolve
 from millrace.learner.config.validation import check_copies
+from millrace.learner.members.failure_count import FailureCount
 from millrace.planning.allowed_copies import AllowedCopies
 from millrace.planning.measurements import ActionKind, Machine, Overheads
 from millrace.planning.recommendation import (
@@ -21,6 +22,7 @@ from millrace.planning.recommendation import (
     Learning,
     candidates,
     choose_algorithm,
+    choose_max_env_failures,
     choose_replay_size,
     choose_step_timeout,
     copies_at_once,
@@ -231,6 +233,25 @@ def test_a_step_timeout_is_far_above_all_measured_times_and_far_below_the_defaul
     chosen_timeout = choose_step_timeout(600.0, found)
     assert (None if chosen_timeout is None else chosen_timeout.value) == expected
     assert choose_step_timeout(40.0, found) is None
+
+
+def test_a_run_survives_failures_that_are_twice_as_frequent_as_in_the_measurement() -> None:
+    found = measured(wait_s=0.04, cpu_s=0, failures=4, calls=800)  # a failure every 8 s
+    (more,) = [choose_max_env_failures(3, found)]
+    assert more is not None
+    assert (more.name, more.value) == ("max_env_failures", 8)
+    now_s, failures = 0.0, FailureCount(int(more.value), copies=1)
+    for _ in range(500):
+        now_s += 4.0
+        assert not failures.failed([0], 4.0, now_s)
+        failures.collected(0)
+    assert choose_max_env_failures(8, found) is None
+
+
+def test_without_failures_or_with_too_many_of_them_the_default_number_stays() -> None:
+    assert choose_max_env_failures(3, measured(wait_s=0.04)) is None
+    assert choose_max_env_failures(3, measured(wait_s=0.04, failures=1, calls=2000)) is None
+    assert choose_max_env_failures(3, measured(wait_s=0.001, failures=3, calls=60)) is None
 
 
 def test_what_sets_the_number_of_copies_is_said() -> None:

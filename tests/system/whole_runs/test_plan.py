@@ -117,8 +117,84 @@ def test_a_crash_is_a_line_and_not_the_end(name: str, after: int) -> None:
 def test_a_single_copy_that_fails_does_not_count_as_a_failure_of_more_copies(tmp_path: Path) -> None:
     env = ProbedEnv(f"{TOY}:Raises", {"after": 20, "once": str(tmp_path / "failed")}, ())
     measured = probe(env, Machine(cores=2), seconds=BRIEF_S).measured
-    assert [line.partition(",")[0] for line in measured.findings] == ["one copy"]
-    assert measured.copies_failed == 0
+    assert (measured.failures, measured.copies_failed) == (1, 0)
+    (line,) = measured.findings
+    assert re.match(r"1 failure in [\d,]+ steps and resets \(.*%\), one copy, after \d+ calls: .*the toy is broken", line)
+
+
+class NowAndThen(gymnasium.Env[Any, Any]):
+    """Waits for 20 ms in each step. Of the steps of all copies together, each `every`th one dies or, if `hangs`, hangs."""
+
+    observation_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
+    action_space = gymnasium.spaces.Discrete(2)
+
+    def __init__(self, steps: str, every: int, hangs: bool) -> None:
+        self._steps = os.open(steps, os.O_CREAT | os.O_RDWR)
+        self._every = every
+        self._hangs = hangs
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action: Any) -> Any:
+        fcntl.flock(self._steps, fcntl.LOCK_EX)
+        steps = os.fstat(self._steps).st_size + 1
+        os.ftruncate(self._steps, steps)
+        fcntl.flock(self._steps, fcntl.LOCK_UN)
+        if steps % self._every == 0:
+            time.sleep(3600.0 if self._hangs else 0.0)
+            os._exit(1)
+        time.sleep(0.02)
+        return np.zeros(1, np.float32), 0.0, False, False, {}
+
+
+@pytest.mark.parametrize(("hangs", "says"), [(False, "ended with"), (True, "a call took longer than")])
+def test_crashes_and_hangs_now_and_then_limit_nothing_and_are_counted(tmp_path: Path, hangs: bool, says: str) -> None:
+    env_kwargs: dict[str, Any] = {"steps": str(tmp_path / "steps"), "every": 150, "hangs": hangs}
+    measured = probe(ProbedEnv(NowAndThen, env_kwargs, ()), Machine(cores=2), seconds=2 * BRIEF_S).measured
+    assert measured.failures >= 1
+    assert (measured.copies_failed, measured.failed_in_one_worker) == (0, 0)
+    assert measured.copies_worked >= (2 if hangs else 8)
+    assert len(measured.side_by_side) >= 2
+    assert says in measured.findings[0]
+    assert re.match(rf"{measured.failures} failures? in {measured.calls:,} steps", measured.findings[0])
+
+
+class FailsOnce(gymnasium.Env[Any, Any]):
+    """Waits for 5 ms in each step. The first time that a second copy is made, it fails."""
+
+    observation_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
+    action_space = gymnasium.spaces.Discrete(2)
+
+    def __init__(self, folder: str) -> None:
+        self._first = os.open(f"{folder}/first", os.O_CREAT | os.O_RDWR)
+        try:
+            fcntl.flock(self._first, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            with suppress(FileExistsError):
+                os.close(os.open(f"{folder}/failed", os.O_CREAT | os.O_EXCL))
+                raise RuntimeError("the server did not start") from None
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action: Any) -> Any:
+        time.sleep(0.005)
+        return np.zeros(1, np.float32), 0.0, False, False, {}
+
+    def close(self) -> None:
+        os.close(self._first)
+
+
+def test_a_number_of_copies_that_fails_once_is_tried_again(tmp_path: Path) -> None:
+    measured = probe(ProbedEnv(FailsOnce, {"folder": str(tmp_path)}, ()), Machine(cores=2), seconds=2 * BRIEF_S).measured
+    assert (tmp_path / "failed").exists()
+    assert (measured.failures, measured.copies_failed, measured.failed_in_one_worker) == (1, 0, 0)
+    assert measured.copies_worked >= 2
+    assert "2 copies side by side, after 0 calls: " in measured.findings[0]
+    assert "the server did not start" in measured.findings[0]
 
 
 @pytest.mark.parametrize("most_copies", [3, 5])
@@ -172,6 +248,7 @@ def test_a_plan_for_an_environment_of_which_a_second_copy_fails_has_one_copy(
     assert (plan.measured.copies_worked, plan.measured.copies_failed, plan.measured.failed_in_one_worker) == (1, 2, 0)
     (line,) = plan.measured.findings
     assert line.startswith("2 copies side by side: ")
+    assert "no licence is free (in all 3 tries)" in line
     assert line in plan.advice
     assert (plan.settings["envs"], plan.settings["workers"], plan.settings["lanes"]) == (1, 1, 1)
     assert plan.settings["eval_copies"] == 1

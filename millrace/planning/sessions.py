@@ -1,0 +1,167 @@
+"""What happened in the sessions of a probe, and whether copies failed because of their number. Pure.
+
+Rule: copies failed because of their number only if all tries with this number failed, and either not all copies could take
+a few steps, or one copy alone took at least `RARER` times as many steps for each failure. Any other failure, such as a crash
+or a hang now and then, can happen to each copy and limits nothing, so it is only counted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import gymnasium
+
+from millrace.planning.in_words import counted, number_in_words
+from millrace.planning.probe_sizes import SessionSize
+from millrace.planning.random_actions import SeenMasks
+from millrace.planning.stopwatch import CopyTimes
+
+WARM_UP = 2  # this many steps at the beginning of a copy aren't counted
+TRIES = 3  # how often a number of copies is tried, if they fail
+RARER = 3
+OF_ITS_OWN = "if a copy needs a port, a folder or a licence of its own, see docs/how-to/simulators.md"
+MORE_TIME = "allow more time with --seconds"
+STARTS_AGAIN = "a run starts a failed copy again, as docs/explanation/faults.md describes"
+
+
+class SteppedCopies(NamedTuple):
+    """The record of a session in which some copies were stepped side by side."""
+
+    size: SessionSize
+    times: list[CopyTimes]
+    traces: list[list[int]]
+    """for each copy and call, a checksum of the observation, reward and flags that it returned"""
+    start_s: float
+    wrong: str
+    """what went wrong, as one line; empty if nothing did"""
+    cut_off: bool
+    """whether the deadline has passed before all copies had answered"""
+    masks: SeenMasks
+    observation_space: gymnasium.Space[Any]
+    action_space: gymnasium.Space[Any]
+    seats: tuple[str, ...]
+    time_limit: int | None
+
+    @property
+    def has_stepped(self) -> bool:
+        """Whether all copies took so many steps that some can be counted."""
+        return sum(len(each.steps) > WARM_UP for each in self.times) == self.size.copies
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether all copies took steps, in time, and nothing went wrong."""
+        return self.has_stepped and not self.wrong and not self.cut_off
+
+    @property
+    def is_too_slow(self) -> bool:
+        """Whether the deadline passed before all copies had taken a few steps and answered."""
+        return not self.is_whole and not self.wrong
+
+    @property
+    def steps_together(self) -> int:
+        """The steps that all copies took until the slowest one stopped; 0 if one took none."""
+        if len(self.times) < self.size.copies:
+            return 0
+        return self.size.copies * min(len(each.steps) for each in self.times)
+
+    @property
+    def calls(self) -> int:
+        """How many steps and resets the copies have answered."""
+        return sum(map(len, self.traces))
+
+
+class Tries(NamedTuple):
+    """The sessions with the same number of copies: one, or several if they failed."""
+
+    sessions: tuple[SteppedCopies, ...]
+    alone: SteppedCopies | None
+    """the session with one copy; None if these sessions have only one copy themselves"""
+
+    @property
+    def size(self) -> SessionSize:
+        """The size of each of these sessions."""
+        return self.sessions[0].size
+
+    @property
+    def longest(self) -> SteppedCopies:
+        """The session to measure: the one with the most steps."""
+        return max(self.sessions, key=lambda session: session.steps_together)
+
+    @property
+    def failed(self) -> list[SteppedCopies]:
+        """The sessions in which something went wrong."""
+        return [session for session in self.sessions if session.wrong]
+
+    @property
+    def show_a_limit(self) -> bool:
+        """Whether the copies failed because of their number, by the rule at the top of this file."""
+        failed = self.failed
+        if not failed or any(session.is_whole for session in self.sessions):
+            return False
+        if not any(session.has_stepped for session in failed):
+            return True
+        if self.alone is None:
+            return False
+        together = sum(session.steps_together for session in failed) / len(failed)
+        return self.alone.steps_together / (1 + bool(self.alone.wrong)) >= RARER * together
+
+    @property
+    def worked(self) -> bool:
+        """Whether the copies were stepped side by side, even if one of them failed later for another reason."""
+        return not self.show_a_limit and any(each.is_whole or (each.wrong and each.has_stepped) for each in self.sessions)
+
+    @property
+    def decide_about_two(self) -> bool:
+        """Whether two copies in one worker would show nothing more: two have failed, or several in one worker have not."""
+        return self.size.copies == 2 if self.show_a_limit else self.size.each > 1
+
+    @property
+    def finding(self) -> str:
+        """Why this number of copies could not be measured, as one line; empty if it was."""
+        copies = _copies(self.size)
+        last = self.sessions[-1]
+        if self.show_a_limit and self.size.copies > 1:
+            failed = self.failed
+            tries = f"in all {len(failed)} tries" if len(failed) > 1 else "there was no time for a second try"
+            return f"{copies}: {failed[-1].wrong} ({tries}); {OF_ITS_OWN}"
+        if self.worked or not last.is_too_slow:
+            return ""
+        if self.size.copies == 1:
+            why = "the time was up before another one returned"
+            return f"one copy, after {last.calls} calls: {why}; unless it hangs, {MORE_TIME}"
+        why = "the time was up before all had taken a few steps"
+        return f"{copies} were not measured, because {why}; unless they hang, {MORE_TIME}"
+
+
+def _copies(size: SessionSize) -> str:
+    if size.copies == 1:
+        return "one copy"
+    return f"{size.copies} copies {'in one worker' if size.workers == 1 else 'side by side'}"
+
+
+class Failures(NamedTuple):
+    """The failures that did not depend on the number of copies."""
+
+    sessions: tuple[SteppedCopies, ...]
+    """the sessions that they ended"""
+    calls: int
+    """the number of steps and resets in all sessions that these or no failures ended"""
+
+    @classmethod
+    def of(cls, tried: Sequence[Tries]) -> Failures:
+        """The failures in all sessions."""
+        counted = [tries for tries in tried if not (tries.show_a_limit and tries.size.copies > 1)]
+        calls = sum(session.calls for tries in counted for session in tries.sessions)
+        return cls(tuple(session for tries in counted for session in tries.failed), calls)
+
+    @property
+    def finding(self) -> str:
+        """What went wrong, and how often, as one line; empty if nothing did."""
+        if not self.sessions:
+            return ""
+        last = self.sessions[-1]
+        often = f"{counted(len(self.sessions), 'failure')} in {self.calls:,} steps and resets"
+        share = f"{number_in_words(100 * len(self.sessions) / max(1, self.calls))}%"
+        such_as = "such as " if len(self.sessions) > 1 else ""
+        return f"{often} ({share}), {such_as}{_copies(last.size)}, after {last.calls} calls: {last.wrong}; {STARTS_AGAIN}"
