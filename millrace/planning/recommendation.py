@@ -184,7 +184,9 @@ def candidates(learning: Learning, measured: Measurements, machine: Machine) -> 
     """All sizes of a run to choose from."""
     at_once = copies_at_once(measured, machine, learning.acting_bytes).number
     for envs in _numbers_of_envs(measured, machine, learning, at_once):
-        numbers = {envs} if measured.failed_in_one_worker else {1, min(machine.cores, envs), min(at_once, envs)}
+        # Workers that wait only take memory. They are worth it even if updates are the limit: updates begin only after many
+        # env steps if there is a replay buffer, and if a copy hangs or crashes, no other copy is in its worker.
+        numbers = {envs} if measured.best_apart else {1, min(machine.cores, envs), min(at_once, envs)}
         for workers in sorted(numbers):
             for lanes in sorted({_lanes_for(workers, envs), envs}):
                 for lag in LAGS:
@@ -249,7 +251,7 @@ def _why_workers(sizes: Sizes, measured: Measurements, machine: Machine) -> str:
         return "several copies in one worker did not work, so each copy has a worker of its own"
     if measured.alone.computes and sizes.workers == machine.cores:
         return f"a step computes for {min(share, 1.0):.0%} of its time, so there is one for each core"
-    if sizes.workers == sizes.envs > 1:
+    if not measured.alone.computes and sizes.workers > 1:
         return f"a step waits for {1 - share:.0%} of its time, so each copy waits in a worker of its own"
     if sizes.workers == 1:
         return "more would hardly be faster"

@@ -154,6 +154,18 @@ def test_if_the_learner_is_the_limit_no_more_copies_are_chosen_than_it_can_use()
     assert found.rollout_steps * found.envs == REPLAY.rows_of_update
 
 
+@pytest.mark.parametrize("learning", [PPO, REPLAY])
+@pytest.mark.parametrize("update_s", [0.025, 0.04, 1.0])
+def test_steps_that_wait_get_a_worker_for_each_lane_even_if_updates_take_most_of_the_time(
+    update_s: float, learning: Learning
+) -> None:
+    where = situation(measured(wait_s=0.05), msgspec.structs.replace(OVERHEADS, update_s=update_s))
+    found = chosen(where, learning)
+    assert (found.workers, found.envs, found.lanes) == (8, 8, 8)
+    why = {each.name: each.why for each in reasons(found, learning, where, lambda sizes: rate(sizes, where))}
+    assert "each copy waits in a worker of its own" in why["workers"]
+
+
 def test_lag_is_chosen_only_if_it_is_faster() -> None:
     quick = Overheads(row_s=0, lane_row_s=0, copy_row_s=0, sent_s=0, round_s=0, rollout_s=0, received_s=0, update_s=1e-7)
     assert chosen(situation(measured(wait_s=0.01, cpu_s=0), quick)).max_lag == 0
