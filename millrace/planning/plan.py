@@ -22,6 +22,7 @@ from millrace.planning.recommendation import (
     NEEDED_STEPS,
     ChosenSetting,
     Learning,
+    about_first_steps,
     best,
     candidates,
     choose_algorithm,
@@ -151,6 +152,12 @@ def _decided(
     chosen += others
     needed = NEEDED_STEPS[config.algo]
     advice = _advice(sizes, situation, rate(sizes))
+    if isinstance(config.algorithm, OffPolicyConfig):
+        no_updates = msgspec.structs.replace(situation.overheads, update_s=0.0)
+        before = msgspec.structs.replace(situation, overheads=no_updates)
+        first_rate = steps_per_s(sizes, before, generator(1, Purpose.ROUNDS))
+        if line := about_first_steps(config.algo, config.algorithm.learning_starts, first_rate):
+            advice.append(line)
     if line := added_by_preset(env.name, env.kwargs, config.algo):
         advice.append(line)
     return RunPlan(

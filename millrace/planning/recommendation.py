@@ -29,6 +29,7 @@ REPLAY_SIZES = (1_000_000, 500_000, 200_000, 100_000, 50_000, 20_000, 10_000)
 OF_MEMORY = 0.8  # share of the free memory that a run may use
 OF_MEMORY_FOR_REPLAY = 0.4  # share of the free memory that the replay buffer may use
 LAGS = (0, 1, 2)
+NOTABLE_S = 10.0  # if the env steps before the first update take longer, a plan says so
 OUTSIDE_S = 1e-3  # a step that takes longer may be that of a program outside of the worker, which may hang
 STEP_TIMEOUTS_S = (30, 60, 120, 300)
 SLOWEST_STEPS = 100  # a step timeout is at least this many times the slowest measured step
@@ -130,6 +131,20 @@ def choose_algorithm(measured: Measurements, machine: Machine) -> ChosenSetting:
             return ChosenSetting("algo", "ppo", "only algorithms without a replay buffer take such actions")
     why = f"{takes}; above {time_in_words(slow_s)}, the algorithm is done first that takes the fewest; actions are {actions}"
     return ChosenSetting("algo", algo, why)
+
+
+def about_first_steps(algo: str, learning_starts: int, steps_per_s: float) -> str:
+    """A line about the env steps before the first update, if they take long; otherwise empty.
+
+    `steps_per_s`: the env steps/s as long as there are no updates.
+    """
+    seconds = learning_starts / steps_per_s
+    if seconds < NOTABLE_S:
+        return ""
+    return (
+        f"{algo} begins to learn after {learning_starts:,} env steps (learning_starts): until then, for about "
+        f"{time_in_words(seconds)}, actions are random, so returns don't improve"
+    )
 
 
 def choose_replay_size(default: int, measured: Measurements, machine: Machine) -> ChosenSetting | None:

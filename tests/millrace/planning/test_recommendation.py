@@ -20,6 +20,7 @@ from millrace.planning.measurements import ActionKind, Machine, Overheads
 from millrace.planning.recommendation import (
     ChosenSetting,
     Learning,
+    about_first_steps,
     candidates,
     choose_algorithm,
     choose_max_env_failures,
@@ -213,6 +214,13 @@ def test_the_algorithm_is_that_of_the_manual(each_ms: float, action: ActionKind,
 def test_the_share_of_a_reset_counts_as_time_of_a_step() -> None:
     assert choose_algorithm(measured(wait_s=0.04, cpu_s=0), MACHINE).value == "ppo"
     assert choose_algorithm(measured(wait_s=0.04, cpu_s=0, reset_s=10.0, episode_steps=100.0), MACHINE).value == "xqc"
+
+
+def test_a_line_tells_how_long_actions_are_random_if_it_is_long() -> None:
+    line = about_first_steps("xqc", 5000, 100.0)
+    assert line.startswith("xqc begins to learn after 5,000 env steps (learning_starts): until then, for about 50 s, ")
+    assert about_first_steps("xqc", 5000, 1000.0) == ""
+    assert about_first_steps("xqc", 0, 1.0) == ""
 
 
 def test_a_replay_buffer_that_takes_too_much_memory_is_smaller() -> None:

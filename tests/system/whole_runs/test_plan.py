@@ -479,5 +479,6 @@ class Boundless(gymnasium.Env[Any, Any]):
 def test_bounds_that_say_nothing_fit_a_plan(actions: str, algo: str) -> None:
     plan = millrace.plan(Boundless, env_kwargs={"actions": actions}, max_env_copies=2, seconds=BRIEF_S)
     assert plan.settings["algo"] == algo, "those for continuous actions need bounds"
+    assert any("actions are random" in line for line in plan.advice) == (algo == "rainbow")
     assert plan.steps_per_s > 0
     assert failures(plan.measured) == []
