@@ -18,7 +18,9 @@ from millrace.protocol.env_spec import Scalar
 
 
 class PlanFlags(msgspec.Struct, frozen=True, kw_only=True):
-    """Step an environment on this machine for half a minute, then say what to choose and what to expect, with reasons."""
+    """Measure an environment on this machine, which takes about a minute, then say what to choose and what to expect, with
+    reasons.
+    """
 
     env: Annotated[str, Flag(positional=True)]
     """Environment id for gymnasium.make, or a name, as for train"""
@@ -29,7 +31,9 @@ class PlanFlags(msgspec.Struct, frozen=True, kw_only=True):
     max_env_copies: Natural = 0
     """maximum number of env copies that may run at the same time, for example because of floating licences. 0: no limit"""
     seconds: Annotated[float, Meta(ge=LEAST_S)] = SECONDS
-    """about how long it may take; longer if a step or a start of the environment takes seconds"""
+    """about how long it takes on an idle machine; two to four times as long if other programs use the cores, and longer if
+    a step or a start of the environment takes seconds
+    """
     json: bool = False
     """print all measurements as one line of JSON"""
 

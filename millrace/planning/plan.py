@@ -72,7 +72,8 @@ def plan(
         wrappers: as in `millrace.train`.
         max_env_copies: maximum number of env copies that may run at the same time, for example because of floating licences;
             0: no limit.
-        seconds: about how long the measurement may take. Allow more time if a step, or the start of a copy, takes seconds.
+        seconds: about how long the measurement takes on an idle machine; two to four times as long if other programs use
+            the cores. Allow more time if a step, or the start of a copy, takes seconds.
 
     Returns a `RunPlan`. Raises `UsageError` if an argument is wrong or the environment can't be found, and a `RunError`,
     such as `EnvironmentFailed`, if the environment completed no step.
