@@ -2,7 +2,7 @@
 
 >>> from millrace.algorithms import PPO
 >>> from millrace.testing import check_algorithm
->>> check_algorithm(PPO, net=(16,), rollout_steps=8, learns=False)
+>>> check_algorithm(PPO, rollout_steps=8, learns=False)
 """
 
 from __future__ import annotations
@@ -24,7 +24,10 @@ class AlgorithmMistakes(MillraceError, AssertionError):
 
 
 def check_algorithm(algorithm: type, *, learns: bool = True, **settings: Any) -> None:
-    """Check that a class follows the rules of `millrace.algorithms.Algorithm`. This takes a few seconds, in this process.
+    """Check that a class follows the rules of `millrace.algorithms.Algorithm`, in this process.
+
+    This takes about 5 s of CPU time for a subclass of PPO or SAC, and 40 s for one of Rainbow. To save time, hidden layers
+    have at most 32 units and `learning_starts` is at most 100, unless you pass `net`, `critic_net` or `learning_starts`.
 
     The class learns from batches of a toy environment, with 2 lanes of 4 env copies and rollouts of `rollout_steps` steps
     (at most 64). The checks are that
@@ -39,7 +42,7 @@ def check_algorithm(algorithm: type, *, learns: bool = True, **settings: Any) ->
 
     Arguments:
         algorithm: The class.
-        learns: Whether to make the last check, which takes the longest.
+        learns: Whether to make the last check, whose duration depends on how fast the algorithm learns.
         **settings: Settings of the algorithm, by name, that replace its defaults.
 
     Raises `AlgorithmMistakes`, which is an AssertionError, with one line for each mistake.

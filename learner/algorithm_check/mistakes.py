@@ -46,6 +46,8 @@ from millrace.protocol.rollout import Batch
 from millrace.protocol.specs import PolicySpec
 
 MOST_STEPS = 64  # rollouts in this check have at most this many steps
+MOST_UNITS = 32  # limit on the units of a hidden layer, because the rules don't depend on the size
+MOST_AT_RANDOM = 100  # limit on the env steps before the first gradient step, because no rule is about them
 MOST_WARM_UP = 24  # limit on updates before the first gradient step, because a replay buffer may have to be filled first
 MORE_UPDATES = 3  # number of updates that follow the first gradient step
 TOTAL_STEPS = 20_000  # total env steps of the toy run; schedules are computed from it
@@ -111,7 +113,7 @@ def _subject(algorithm: type, settings: dict[str, Any]) -> Subject:
     name = name_of(algorithm)
     record = settings_record(name)
     try:
-        config = msgspec.convert(msgspec.to_builtins(record()) | settings, record)
+        config = msgspec.convert(_small_defaults(record) | settings, record)
     except msgspec.ValidationError as error:
         raise UsageError(f"settings: {one_line(str(error))}") from error
     made = algorithm_class(name)
@@ -129,6 +131,16 @@ def _subject(algorithm: type, settings: dict[str, Any]) -> Subject:
         encoder = describe_encoder(config.encoder, policy.observation, policy.action)
         policy = msgspec.structs.replace(policy, encoder=encoder)
     return Subject(made, config, policy, min(config.rollout_steps, MOST_STEPS), ())
+
+
+def _small_defaults(record: type[AlgorithmConfig]) -> dict[str, Any]:
+    """The default settings, with a smaller network and fewer env steps before the first gradient step, to save time."""
+    settings: dict[str, Any] = msgspec.to_builtins(record())
+    for net in {"net", "critic_net"} & settings.keys():
+        settings[net] = [min(size, MOST_UNITS) for size in settings[net]]
+    if "learning_starts" in settings:
+        settings["learning_starts"] = min(settings["learning_starts"], MOST_AT_RANDOM)
+    return settings
 
 
 def _with_batches(subject: Subject, made: list[str]) -> Subject:

@@ -14,6 +14,7 @@ import torch
 
 from millrace.algorithms import (
     PPO,
+    XQC,
     ActorCritic,
     ActorCriticConfig,
     ActorCriticNetwork,
@@ -418,6 +419,24 @@ def test_what_a_class_lacks_is_one_mistake() -> None:
         check_algorithm(Lacking)
     with pytest.raises(AlgorithmMistakes, match=r"settings: Expected `float`, got `str` - at `\$.bonus`"):
         check_algorithm(Sound, bonus="much")
+
+
+class Unready(XQC):
+    """Says which settings it got, and ends the check."""
+
+    def __init__(self, config: Any, *_: Any, **__: Any) -> None:
+        raise UsageError(f"got {config.net} {config.critic_net} {config.learning_starts}")
+
+
+@pytest.mark.parametrize(
+    ("settings", "got"),
+    [({}, "(32, 32) (32, 32) 100"), ({"net": (40,), "critic_net": (8,), "learning_starts": 300}, "(40,) (8,) 300")],
+)
+def test_the_check_uses_small_settings_unless_it_is_given_others(settings: dict[str, Any], got: str) -> None:
+    """XQC's defaults are 5,000 env steps, more than the check takes, before the first gradient step."""
+    with pytest.raises(AlgorithmMistakes) as caught:
+        check_algorithm(Unready, **settings)
+    assert caught.value.mistakes == [f"got {got}"]
 
 
 def test_states_are_compared_bit_for_bit() -> None:
