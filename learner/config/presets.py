@@ -60,7 +60,7 @@ def origin(config: Config) -> str:
     """Where the settings of a new run come from, as one line for the user.
 
     The preset counts as used if at least one setting has the preset's value and that value differs from the default. Without
-    a preset, the line names the algorithm's settings that differ from the defaults. The user gave these settings, or they
+    a preset, the line names the algorithm's settings that differ from the defaults as changed: the user gave them, or they
     come from a file or from another environment's preset.
     """
     preset = environment_presets(config.algo).get(config.env)
@@ -68,8 +68,8 @@ def origin(config: Config) -> str:
     defaults = _settings(type(config)(algorithm=type(config.algorithm)()))
     if preset is None:
         given = [name for name in config.algorithm.__struct_fields__ if mine[name] != defaults[name]]
-        which = f"settings: defaults, except {', '.join(given)}" if given else "settings: defaults"
-        return f"{which}, because {config.algo} has no preset for {config.env}"
+        which = f"settings: defaults, because {config.algo} has no preset for {config.env}"
+        return f"{which}; changed: {', '.join(given)}" if given else which
     changed = [name for name, value in preset.items() if not _agrees(mine[name], value)]
     if all(defaults[name] == preset[name] for name in preset.keys() - changed):
         return f"settings: without the preset of {config.algo} for {config.env}"

@@ -23,11 +23,11 @@ from millrace.learner.config.presets import origin
         ({"preset": "none", "seed": 2}, "settings: without the preset of ppo for CartPole-v1"),
         (
             {"env": "Taxi-v3", "gamma": 0.9, "steps": 7, "net": (64, 64)},
-            "settings: defaults, except gamma, because ppo has no preset for Taxi-v3",
+            "settings: defaults, because ppo has no preset for Taxi-v3; changed: gamma",
         ),
         (
             {"env": "Taxi-v3", "algo": "a2c", "preset": "CartPole-v1"},
-            "settings: defaults, except normalize_rewards, because a2c has no preset for Taxi-v3",
+            "settings: defaults, because a2c has no preset for Taxi-v3; changed: normalize_rewards",
         ),
         ({"algo": "reinforce", "env": "Acrobot-v1"}, "settings: defaults, because reinforce has no preset for Acrobot-v1"),
     ],
