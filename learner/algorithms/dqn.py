@@ -54,7 +54,10 @@ class DQN(OffPolicy):
         """Action values for any supported observation. Raises `UsageError` unless the action space is Discrete."""
         if action.kind != "discrete":
             name = cls.__name__.lower()
-            raise UsageError(f"{name}: expected an action space Discrete(n), got {action.in_words}; take --algo ppo for it")
+            others = "ppo, sac or xqc" if action.kind == "box" and action.unbounded is None else "ppo"
+            raise UsageError(
+                f"{name}: expected an action space Discrete(n), got {action.in_words}; take --algo {others} for it"
+            )
         return replace(OffPolicy.policy_spec(config, observation, action), head="q", dueling=config.dueling)
 
     def __init__(

@@ -91,7 +91,7 @@ class Continuous(OffPolicy):
         """
         name = cls.__name__.lower()
         if action.kind != "box":
-            others = "ppo or dqn" if action.kind == "discrete" else "ppo"
+            others = "ppo, dqn or rainbow" if action.kind == "discrete" else "ppo"
             raise UsageError(f"{name}: expected an action space Box, got {action.in_words}; take --algo {others} for it")
         if action.unbounded is not None:
             low, high = action.unbounded

@@ -335,16 +335,17 @@ def test_the_learning_rate_falls_to_zero_if_asked() -> None:
 
 
 @pytest.mark.parametrize(
-    ("action", "got"),
+    ("action", "got", "take"),
     [
-        (ActionSpec("box", (2,), "float32", low=(-1.0,) * 2, high=(1.0,) * 2), r"box\[2\]"),
-        (ActionSpec("multidiscrete", (2,), "int64", (2, 3), (0, 0)), r"multidiscrete\[2\]"),
-        (ActionSpec("multibinary", (4,), "int8"), r"multibinary\[4\]"),
+        (ActionSpec("box", (2,), "float32", low=(-1.0,) * 2, high=(1.0,) * 2), r"box\[2\]", "ppo, sac or xqc"),
+        (ActionSpec("box", (2,), "float32", low=(-np.inf,) * 2, high=(np.inf,) * 2), r"box\[2\]", "ppo"),
+        (ActionSpec("multidiscrete", (2,), "int64", (2, 3), (0, 0)), r"multidiscrete\[2\]", "ppo"),
+        (ActionSpec("multibinary", (4,), "int8"), r"multibinary\[4\]", "ppo"),
     ],
 )
-def test_actions_that_are_not_one_choice_are_refused(action: ActionSpec, got: str) -> None:
+def test_actions_that_are_not_one_choice_are_refused(action: ActionSpec, got: str, take: str) -> None:
     with pytest.raises(
-        UsageError, match=rf"dqn: expected an action space Discrete\(n\), got {got}; take --algo ppo"
+        UsageError, match=rf"dqn: expected an action space Discrete\(n\), got {got}; take --algo {take} for it"
     ) as error:
         DQN.policy_spec(PLAIN, (BOX,), action)
     assert "\n" not in str(error.value)

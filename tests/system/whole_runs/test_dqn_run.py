@@ -83,6 +83,6 @@ def test_dqn_learns_from_images(tmp_path: Path) -> None:
 
 def test_an_unsupported_action_space_is_refused_in_one_line(tmp_path: Path) -> None:
     with pytest.raises(
-        UsageError, match=r"dqn: expected an action space Discrete\(n\), got box\[1\]; take --algo ppo for it"
+        UsageError, match=r"dqn: expected an action space Discrete\(n\), got box\[1\]; take --algo ppo, sac or xqc for it"
     ):
         run(tmp_path, env="Pendulum-v1")
