@@ -116,7 +116,7 @@ class Evaluations:
         found_again = None
         if biased:
             found_again = self._evaluate(Purpose.CONFIRMATION, size, watch)
-            self._say(found_again, state.env_steps)
+            self._say(found_again, state.env_steps, ", on other episodes")
         self.final = found_again or evaluation
         self.ended_by = None if decided is None else decided.evaluation
         self.confirmed = self._confirm(found_again, size, watch)
@@ -174,8 +174,8 @@ class Evaluations:
         self._state.evaluated = of
         self._say(evaluation, of.env_steps)
 
-    def _say(self, evaluation: Evaluation, env_steps: int) -> None:
-        self._tally.note = f"{env_steps:,} env steps: greedy {evaluation}"
+    def _say(self, evaluation: Evaluation, env_steps: int, how: str = "") -> None:
+        self._tally.note = f"{env_steps:,} env steps: greedy {evaluation}{how}"
 
     def _evaluate(self, purpose: Purpose, size: EvaluationSize, watch: Callable[[], None]) -> Evaluation:
         """Evaluate the weights that were last published, while training waits."""

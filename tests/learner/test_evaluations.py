@@ -70,8 +70,8 @@ class Fakes:
         saved = SavedRun(state=state, episodes=settings.pop("episodes", []))
         config = Config(eval_every=every, eval_episodes=10, seed=seed, **settings)
         folder, algorithm, hub = cast(RunFolder, self), cast(Algorithm, self), cast(Hub, self)
-        tally = Tally(config, run_spec(), saved, ended_by)
-        return tally, Evaluations(RunParts(config, run_spec(), folder, algorithm, hub, tally), None)
+        self.tally = Tally(config, run_spec(), saved, ended_by)
+        return self.tally, Evaluations(RunParts(config, run_spec(), folder, algorithm, hub, self.tally), None)
 
 
 def due(parts: tuple[Tally, Evaluations], *env_steps: int) -> list[int]:
@@ -172,6 +172,7 @@ def test_the_return_that_reached_the_target_is_not_the_one_that_is_reported() ->
     """The best policy is the final one: a single evaluation on other episodes reports both."""
     fakes = Fakes(3.0, 6.0, 4.5)
     evaluations, state, again = concluded(fakes, 2, target_return=5.0)
+    assert fakes.tally.note == "200 env steps: greedy return 4.5 ± 0.0 over 10 episodes, on other episodes"
     assert evaluations.final is not None
     assert evaluations.confirmed is not None
     assert (evaluations.final.return_mean, evaluations.ended_by) == (4.5, 6.0)
