@@ -189,7 +189,7 @@ class Evaluations:
     def _plan(self, purpose: Purpose, size: EvaluationSize) -> EvaluationPlan:
         plan = EvaluationPlan.of(size.episodes, self._config.seed, self._config.eval_copies, size.max_steps, purpose)
         pool = self._tally.pool
-        return plan if pool is None else replace(plan, opponents=pool.yardsticks)
+        return replace(plan, time_limit=self._time_limit, opponents=() if pool is None else pool.yardsticks)
 
     def _end(self, watch: Callable[[], None]) -> Evaluation:
         """Wait for the pending evaluation, and return it."""

@@ -55,6 +55,8 @@ class EvaluationPlan:
     """the number of seeds in a ticket, which is how many episodes a worker plays at the same time"""
     most_steps: int
     """the number of env steps at which an episode is cut off"""
+    time_limit: int | None = None
+    """the number of env steps after which the environment itself truncates an episode, if that is known. It is only shown"""
     greedy: bool = True
     """whether to take the most probable actions; if not, actions are sampled"""
     send_rows: bool = False
@@ -87,6 +89,11 @@ class EvaluationPlan:
         episodes, steps = before
         counted = f"{episodes + played:,} of {episodes + len(self.seeds):,} episodes, {steps + env_steps:,} env steps"
         return f"{counted} ({bound} {self.most_steps:,} each)"
+
+    @property
+    def longest_episode(self) -> int:
+        """The largest number of env steps that an episode may have."""
+        return self.most_steps if self.time_limit is None else min(self.most_steps, self.time_limit)
 
 
 def episode_seeds(seed: int, episodes: int, purpose: Purpose = Purpose.EPISODES) -> tuple[int, ...]:

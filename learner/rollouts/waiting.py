@@ -128,7 +128,7 @@ class LearnerTime:
         """How far an evaluation has got, and which of the workers playing it has been held up longest."""
         who = self._held_up_longest(evaluation.players, now)
         done = f"{evaluation.episodes_played} of {len(evaluation.plan.seeds)} episodes"
-        return f"{done} (at most {evaluation.plan.most_steps:,} env steps each); {who}"
+        return f"{done} (at most {evaluation.plan.longest_episode:,} env steps each); {who}"
 
     def _held_up_longest(self, members: list[Member], now: float) -> str:
         """The worker held up longest: one of these members or, if other workers step for them, one of the other workers."""

@@ -39,6 +39,8 @@ class Fakes:
         """The attributes of environments that they had."""
         self.seeds: list[tuple[int, ...]] = []
         """The seeds of each evaluation."""
+        self.time_limits: list[int | None] = []
+        """The time limit of each evaluation's episodes."""
         self.writes = Writes()
         self.written: list[float] = []
         """The weights of each policy that was written as the best."""
@@ -49,6 +51,7 @@ class Fakes:
     def begin_evaluation(self, plan: EvaluationPlan, *, beside: bool = False) -> None:
         self.evaluated += 1
         self.seeds.append(plan.seeds)
+        self.time_limits.append(plan.time_limit)
 
     def end_evaluation(self, watch: Callable[[int, int], None]) -> list[PlayedEpisode]:
         return [PlayedEpisode(Episode(next(self.returns), 1, 0.0), cut=False)] * len(self.seeds[-1])
@@ -71,7 +74,7 @@ class Fakes:
         config = Config(eval_every=every, eval_episodes=10, seed=seed, **settings)
         folder, algorithm, hub = cast(RunFolder, self), cast(Algorithm, self), cast(Hub, self)
         self.tally = Tally(config, run_spec(), saved, ended_by)
-        return self.tally, Evaluations(RunParts(config, run_spec(), folder, algorithm, hub, self.tally), None)
+        return self.tally, Evaluations(RunParts(config, run_spec(), folder, algorithm, hub, self.tally), 50)
 
 
 def due(parts: tuple[Tally, Evaluations], *env_steps: int) -> list[int]:
@@ -172,6 +175,7 @@ def test_the_return_that_reached_the_target_is_not_the_one_that_is_reported() ->
     """The best policy is the final one: a single evaluation on other episodes reports both."""
     fakes = Fakes(3.0, 6.0, 4.5)
     evaluations, state, again = concluded(fakes, 2, target_return=5.0)
+    assert fakes.time_limits == [50] * 3, "that of the environment"
     assert fakes.tally.note == "200 env steps: greedy return 4.5 ± 0.0 over 10 episodes, on other episodes"
     assert evaluations.final is not None
     assert evaluations.confirmed is not None

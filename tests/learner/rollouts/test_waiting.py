@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from millrace.learner.members.held_up import LONG_S
@@ -246,19 +248,29 @@ def test_the_shares_are_those_of_training() -> None:
     assert run.line.endswith("; so far 60% waiting for rollouts, 40% learning")
 
 
-@pytest.mark.parametrize(("purpose", "what"), [(Purpose.EVALUATION, ""), (Purpose.CONFIRMATION, " the best policy")])
-def test_an_evaluation_says_how_far_it_is_and_who_is_held_up(purpose: Purpose, what: str) -> None:
+@pytest.mark.parametrize(
+    ("purpose", "what", "time_limit", "longest"),
+    [
+        (Purpose.EVALUATION, "", None, 500),
+        (Purpose.EVALUATION, "", 50, 50),
+        (Purpose.EVALUATION, "", 1_000, 500),
+        (Purpose.CONFIRMATION, " the best policy", None, 500),
+    ],
+)
+def test_an_evaluation_says_how_far_it_is_and_who_is_held_up(
+    purpose: Purpose, what: str, time_limit: int | None, longest: int
+) -> None:
     run = Run(workers=(A, B))
     run.learner.deliver_all()
     run.learner.take()
     run.learner.coordinator.publish(1, PARAMETERS, BUFFERS)
     run.turn("evaluating")
-    plan = EvaluationPlan.of(10, seed=1, copies=2, max_steps=5_000, purpose=purpose)
+    plan = replace(EvaluationPlan.of(10, seed=1, copies=2, max_steps=5_000, purpose=purpose), time_limit=time_limit)
     run.learner.balanced(run.learner.coordinator.begin_evaluation(plan))
     run.learner.now += 41.0
     run.does(A, "evaluating", 0.1)
     run.does(B, "evaluating", 11.0)
-    done = "0 of 10 episodes (at most 500 env steps each)"
+    done = f"0 of 10 episodes (at most {longest} env steps each)"
     assert run.line == f"evaluating{what} for 41 s: {done}; worker b on host-of-b: in evaluation for 11 s"
     for peer in (A, B):
         run.learner.says(peer, Goodbye(run.learner.session(peer), "told to stop", ()))
