@@ -25,7 +25,7 @@ pytestmark = [pytest.mark.cluster, pytest.mark.timeout(600)]
 
 PAGE = (ROOT / "docs/how-to/simulators.md").read_text()
 STAND_IN = Path(simulators.__file__)
-NAMES = ("socket", "socket, restarted", "folder", "MPI", "licences", "display of the machine", "display of a copy")
+NAMES = ("pipe", "socket", "socket, restarted", "folder", "MPI", "licences", "display of the machine", "display of a copy")
 COMMANDS = dict(zip(NAMES, (b.text for b in blocks(PAGE) if b.language == "bash"), strict=True))
 FAULTS: dict[str, dict[str, object]] = {
     "socket, restarted": {"dies_after": 90},
@@ -97,7 +97,13 @@ def test_a_recipe_works_as_it_is_written(name: str, folder: Path) -> None:
     assert "raised" not in said, said
 
 
-def test_a_simulator_that_hangs_is_ended_and_its_copy_made_again(folder: Path) -> None:
-    command = COMMANDS["socket"].replace("--step-timeout-s 30", "--step-timeout-s 3 --max-env-failures 9")
+@pytest.mark.parametrize("name", ["pipe", "socket"])
+def test_a_simulator_that_hangs_is_ended_and_its_copy_made_again(name: str, folder: Path) -> None:
+    command = COMMANDS[name].replace("--step-timeout-s 30", "--step-timeout-s 3 --max-env-failures 9")
     said = run(command, folder, hangs_after=300)
     assert "took longer than 3 s (--step-timeout-s)" in said
+
+
+def test_a_simulator_that_dies_names_its_exit_code_and_is_started_again(folder: Path) -> None:
+    said = run(f"{COMMANDS['pipe']} --max-env-failures 9", folder, dies_after=300)
+    assert "ConnectionError: the simulator has ended with code -6" in said, said

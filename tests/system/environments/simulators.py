@@ -1,6 +1,7 @@
 """Stand-ins for other people's simulators, as docs/how-to/simulators.md starts them. They behave as real ones do.
 
     python simulators.py simulator --port 5000 [--licences 127.0.0.1:4999]   # JSON lines; draws if $DISPLAY is set
+    python simulators.py simulator                                           # JSON lines, from its input to its output
     python simulators.py solver                                              # one interval in the working folder
     python simulators.py licence-server --port 4999 --licences 2
 
@@ -52,23 +53,30 @@ class Walk:
 
 
 def simulator(port: int, licences: str) -> None:
-    """Serve one client after the other, until SIGTERM. It outlives its clients, as most servers do."""
+    """Serve one client after the other, until SIGTERM. It outlives its clients, as most servers do.
+
+    Without a port, serve the program that started it, over pipes.
+    """
     faults = {**FAULTS, **json.loads(os.environ.get("STAND_IN", "{}"))}
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
     with checked_out(licences) if licences else nullcontext():
         if faults["draws"]:
             draw()
         time.sleep(faults["start_s"])
+        if not port:
+            serve(sys.stdin, sys.stdout, faults)
+            return
         with socket.create_server(("127.0.0.1", port)) as server:  # "Address already in use" if another one lives
             while True:
                 with server.accept()[0] as connection, suppress(ConnectionError):
-                    serve(connection.makefile("rw"), faults)
+                    stream = connection.makefile("rw")
+                    serve(stream, stream, faults)
 
 
-def serve(stream: TextIO, faults: dict[str, Any]) -> None:
+def serve(questions: TextIO, answers: TextIO, faults: dict[str, Any]) -> None:
     """Answer questions until the client goes."""
     walk, steps = Walk(0), 0
-    for line in stream:
+    for line in questions:
         question = json.loads(line)
         if "reset" in question:
             walk = Walk(question["reset"])
@@ -79,8 +87,8 @@ def serve(stream: TextIO, faults: dict[str, Any]) -> None:
             os.abort()
         if steps and steps == faults["hangs_after"]:
             time.sleep(1e6)
-        stream.write(json.dumps(answer) + "\n")
-        stream.flush()
+        answers.write(json.dumps(answer) + "\n")
+        answers.flush()
 
 
 @contextmanager
