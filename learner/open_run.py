@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import msgspec
@@ -43,6 +43,7 @@ from millrace.learner.run_state import SavedRun, restore, start_from
 from millrace.learner.shards.roles import lead
 from millrace.learner.shards.sharded import new_sharded
 from millrace.learner.torch_setup import threads, torch_device, updates_use_all_cores
+from millrace.protocol.bounds import one_line
 from millrace.protocol.envs.kinds_of_copies import has_attributes
 from millrace.protocol.errors import UsageError
 from millrace.protocol.logs.notices import log_notice
@@ -97,6 +98,9 @@ def open_run(setup: RunSetup, lobby: Lobby, watch: Watch, observer: HubObserver)
         name = folder.path.resolve().name
         callbacks.add(started_by("record")(config.record, setup.known.described, spec, name, resumed_at))
     setup.check_interrupt()
+    if setup.resumed and folder.callbacks and not callbacks.passed:
+        log.warning("%s", _without_callbacks(folder.callbacks))
+    folder.callbacks = callbacks.passed
     folder.remove_temporary()
     folder.write_config(config, workers_elsewhere=not lobby.processes.expected)
     folder.remove_summary()
@@ -111,6 +115,15 @@ def open_run(setup: RunSetup, lobby: Lobby, watch: Watch, observer: HubObserver)
         log_notice(log, files.continues())
     folder.keep()
     return run
+
+
+def _without_callbacks(names: Sequence[str]) -> str:
+    """A line about the callbacks without which a run is resumed."""
+    return one_line(
+        f"the run continues without the callbacks that a Python program passed to it ({', '.join(names)}): only that "
+        "program can pass them again, with callbacks=[…]",
+        500,
+    )
 
 
 def _why_no_attributes(vector: str) -> str:

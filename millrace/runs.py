@@ -321,7 +321,7 @@ def train(
     with progress_view(may_fail=False) if progress else nullcontext() as view:
         shown = [] if view is None else [view]
         objects_alone = [each for each in callbacks if not isinstance(each, str)]
-        folder = training.train(resolved, run, Callbacks([*shown, *objects_alone]), spec)
+        folder = training.train(resolved, run, Callbacks(shown, objects_alone), spec)
     return Run._trained(folder, objects)
 
 

@@ -27,11 +27,16 @@ Show = Callable[[Progress], object]
 class Callbacks:
     """The callbacks of one run."""
 
-    def __init__(self, callbacks: Sequence[object] = ()) -> None:
-        """`callbacks` are functions, or objects with some of `Callback`'s methods. Raises `UsageError` for anything else."""
+    def __init__(self, callbacks: Sequence[object] = (), passed: Sequence[object] = ()) -> None:
+        """Functions, or objects with some of `Callback`'s methods. Raises `UsageError` for anything else.
+
+        `passed` come after the others. The user's program has passed them, so only that program can pass them again.
+        """
         self.stop_reason: str | None = None
         """Why a callback ended the run; None if none did."""
-        self._callbacks = [_checked(callback) for callback in callbacks]
+        self._callbacks = [_checked(callback) for callback in (*callbacks, *passed)]
+        self.passed = tuple(one_line(_name(callback, "__call__"), 100) for callback in passed)
+        """The names of the callbacks that the user's program has passed."""
         self._started: list[object] = []  # callbacks whose `on_start` was called, even if it raised
 
     @staticmethod

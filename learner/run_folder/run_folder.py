@@ -123,6 +123,8 @@ class RunFolder:
         self._workers_elsewhere = False  # the value of this argument in the last call to `write_config`
         self.started_from = ""
         """See `RunFormat`."""
+        self.callbacks: tuple[str, ...] = ()
+        """See `RunFormat`."""
         self.writes = Writes()
         """Writes the files of the run, and retries writes that fail."""
         self.lock: RunLock | None = None
@@ -175,7 +177,9 @@ class RunFolder:
                     hint = f"; it holds runs: name one of them, such as {one_line(str(inside[-1]))}"
             raise UsageError(f"run {path}: expected a run folder, got one without {CONFIG_FILE}{hint}")
         folder = RunFolder(path)
-        folder.started_from = check_format(path).started_from
+        run_format = check_format(path)
+        folder.started_from = run_format.started_from
+        folder.callbacks = run_format.callbacks
         return folder
 
     @staticmethod
@@ -266,7 +270,9 @@ class RunFolder:
     def write_config(self, config: RunSettings, *, workers_elsewhere: bool = False) -> None:
         """Write config.toml and run.json, at the start and again when a run is resumed, perhaps with other settings."""
         self._workers_elsewhere = workers_elsewhere
-        write_format(self.path, workers_elsewhere=workers_elsewhere, started_from=self.started_from)
+        write_format(
+            self.path, workers_elsewhere=workers_elsewhere, started_from=self.started_from, callbacks=self.callbacks
+        )
         self._write(CONFIG_FILE, f"{HEAD}{config.to_toml()}{END}".encode("utf-8", "surrogateescape"))
 
     def write_policy(self, run: RunSpec, parameters: Floats, buffers: Floats, which: Which = "final") -> None:

@@ -56,6 +56,8 @@ class RunFormat(msgspec.Struct, frozen=True, kw_only=True):
     """whether the run's workers were started elsewhere; if so, its setting `workers` has no meaning"""
     started_from: str = ""
     """the line about the run from which this run started, as it was printed; empty if it began with random weights"""
+    callbacks: tuple[str, ...] = ()
+    """the names of the callbacks that a Python program passed as objects when the run was started or last resumed"""
 
 
 DISTRIBUTIONS = {"millrace": "millrace-rl", "torch": "torch", "gymnasium": "gymnasium", "numpy": "numpy"}
@@ -81,13 +83,16 @@ def versions() -> dict[str, str]:
     return versions
 
 
-def write_format(folder: Path, *, workers_elsewhere: bool = False, started_from: str = "") -> None:
+def write_format(
+    folder: Path, *, workers_elsewhere: bool = False, started_from: str = "", callbacks: tuple[str, ...] = ()
+) -> None:
     """Write run.json with the current format. Raises `RunError` if that fails."""
     run_format = RunFormat(
         format=RUN_FORMAT,
         millrace=versions().get("millrace", ""),
         workers_elsewhere=workers_elsewhere,
         started_from=started_from,
+        callbacks=callbacks,
     )
     content = msgspec.json.encode(run_format)
     write_file(folder / RUN_FILE, lambda file: file.write(content + b"\n"))

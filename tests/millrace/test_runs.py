@@ -239,6 +239,23 @@ def test_plot_is_a_picture_and_the_file_of_the_command(run: millrace.Run, tmp_pa
     assert ">CartPole-v1</text>" in picture.svg
 
 
+class Silent(millrace.Callback):
+    """Does nothing."""
+
+
+def test_a_resume_without_the_callbacks_that_a_program_passed_is_reported(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    run = millrace.train("CartPole-v1", run_dir=str(tmp_path), steps=128, callbacks=[Silent()], **SMALL)
+    run.resume(steps=192, callbacks=[Silent()], progress=False)
+    assert "callbacks" not in caplog.text
+    run.resume(steps=256, progress=False)
+    assert "the run continues without the callbacks that a Python program passed to it (Silent): only that" in caplog.text
+    caplog.clear()
+    run.resume(steps=320, progress=False)
+    assert "callbacks" not in caplog.text, "they were left out before"
+
+
 def test_the_caller_s_process_runs_no_environment_code(tmp_path: Path) -> None:
     """An environment that ends its process at the first step."""
     run = millrace.train(f"{TOY}Countdown-v0", run_dir=str(tmp_path), steps=64, **SMALL)

@@ -55,7 +55,7 @@ READERS: list[Callable[[Path], object]] = [
 def test_a_new_folder_carries_the_format_and_the_version_that_wrote_it(run: Path) -> None:
     written = json.loads((run / RUN_FILE).read_text())
     assert written["format"] == RUN_FORMAT == check_format(run).format
-    assert written.keys() == {"format", "millrace", "workers_elsewhere", "started_from"}
+    assert written.keys() == {"format", "millrace", "workers_elsewhere", "started_from", "callbacks"}
 
 
 @pytest.mark.parametrize("read", READERS[1:])
