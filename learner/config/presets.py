@@ -74,7 +74,22 @@ def origin(config: Config) -> str:
     if all(defaults[name] == preset[name] for name in preset.keys() - changed):
         return f"settings: without the preset of {config.algo} for {config.env}"
     which = f"settings: preset of {config.algo} for {config.env}"
-    return f"{which}, except {', '.join(changed)}" if changed else which
+    excepted = f", except {', '.join(changed)}" if changed else ""
+    return which + excepted + _other_update_size(config, defaults | preset)
+
+
+def _other_update_size(config: Config, preset: Mapping[str, Any]) -> str:
+    """The end of the line if updates have another number of env steps only because the preset has other `envs`.
+
+    That number matters as much as the learning rate, but not with a replay buffer, from which each update samples.
+    """
+    rollout_steps = preset["rollout_steps"]
+    envs = preset["envs"]
+    if "replay_size" in preset or config.envs == envs or config.algorithm.rollout_steps != rollout_steps:
+        return ""
+    size = envs * rollout_steps
+    keep = f"; --rollout-steps {size // config.envs} keeps them" if size % config.envs == 0 else ""
+    return f"; an update has {config.envs * rollout_steps:,} env steps instead of the preset's {size:,}{keep}"
 
 
 def _agrees(mine: Any, preset: Any) -> bool:

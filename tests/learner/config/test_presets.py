@@ -19,6 +19,21 @@ from millrace.learner.config.presets import origin
         ({"rollout_steps": 64, "net": (32,)}, "settings: preset of ppo for CartPole-v1, except rollout_steps"),
         ({"env": "millrace/Atari-v0"}, "settings: preset of ppo for millrace/Atari-v0"),
         ({"env": "millrace/Atari-v0", "net": (64,)}, "settings: preset of ppo for millrace/Atari-v0, except net"),
+        (
+            {"env": "Hopper-v5", "envs": 16},
+            "settings: preset of ppo for Hopper-v5, except envs; an update has 4,096 env steps instead of the preset's "
+            "2,048; --rollout-steps 128 keeps them",
+        ),
+        (
+            {"env": "Hopper-v5", "envs": 12, "lanes": 4},
+            "settings: preset of ppo for Hopper-v5, except envs; an update has 3,072 env steps instead of the preset's "
+            "2,048",
+        ),
+        (
+            {"env": "Hopper-v5", "envs": 16, "rollout_steps": 128},
+            "settings: preset of ppo for Hopper-v5, except envs, rollout_steps",
+        ),
+        ({"env": "HalfCheetah-v5", "algo": "sac", "envs": 16}, "settings: preset of sac for HalfCheetah-v5, except envs"),
         ({"preset": "none"}, "settings: without the preset of ppo for CartPole-v1"),
         ({"preset": "none", "seed": 2}, "settings: without the preset of ppo for CartPole-v1"),
         (

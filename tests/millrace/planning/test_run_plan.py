@@ -14,9 +14,12 @@ from millrace.planning.run_plan import ExpectedSpeed, RunPlan, show, train_comma
 from tests.millrace.planning.made_up import MACHINE, OVERHEADS, measured
 
 ENV = "my_module:MyEnv-v0"
+SETTINGS: dict[str, int | str] = {
+    "algo": "xqc", "workers": 8, "envs": 8, "lanes": 8, "max_lag": 1, "replay_size": 500_000,
+}  # fmt: skip
 CHOSEN = tuple(
     ChosenSetting(name, value, "a reason that takes more than one line if a terminal has only eighty columns, as most have")
-    for name, value in {"algo": "xqc", "workers": 8, "envs": 8, "lanes": 8, "max_lag": 1, "replay_size": 500_000}.items()
+    for name, value in SETTINGS.items()
 )
 PLAN = RunPlan(
     env=ENV,
