@@ -65,6 +65,7 @@ class DashboardServer:
     async def _connected(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         task = asyncio.current_task()
         assert task is not None
+        writer.transport.set_write_buffer_limits(high=0)  # so that `drain` waits until the whole part is sent
         self._open[task] = None
         if len(self._open) > MOST_CONNECTIONS:
             oldest = next(iter(self._open))

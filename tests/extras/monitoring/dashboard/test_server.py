@@ -137,6 +137,27 @@ def test_a_head_that_is_too_long_is_not_read() -> None:
         assert MOST_HEAD_BYTES < 1 << 22
 
 
+def test_a_client_that_reads_slowly_gets_the_whole_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+    connected = DashboardServer._connected
+
+    async def with_a_small_buffer(self: DashboardServer, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        writer.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4_096)
+        await connected(self, reader, writer)
+
+    monkeypatch.setattr(DashboardServer, "_connected", with_a_small_buffer)
+    with served(lambda request: PageAnswer(b"x" * 100_000)) as address, closing(socket.socket()) as client:
+        client.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4_096)
+        client.settimeout(TIMEOUT_S)
+        url = urlsplit(address)
+        client.connect((url.hostname, url.port))
+        client.sendall(f"GET {url.path} HTTP/1.1\r\nHost: {url.netloc}\r\n\r\n".encode())
+        received = b""
+        while part := client.recv(1_024):
+            received += part
+            threading.Event().wait(0.001)
+        assert received.count(b"x") >= 100_000
+
+
 def test_a_client_that_does_not_read_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(dashboard_server, "PART_WITHIN_S", 0.1)
     with served(lambda request: PageAnswer(b"x" * (1 << 25))) as address:
