@@ -54,6 +54,8 @@ class Owner(msgspec.Struct, frozen=True, kw_only=True):
     """The network namespace of the process; empty if unknown. A container may have its own."""
     pid_namespace: Line = ""
     """The namespace of `pid`; empty if unknown. A container may have its own."""
+    folder: Line = ""
+    """The inode number of the run folder; empty if unknown. A renamed folder keeps it, and a copy has another."""
     address: Line = ""
     """The learner's address for other machines; empty if nobody can ask the learner, or if it does not listen yet."""
     here: Line = ""

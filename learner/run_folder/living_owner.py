@@ -11,7 +11,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 from millrace.learner.run_folder.lease import WIDTH, Owner, Unreachable, decoded
-from millrace.learner.run_folder.owner_process import can_look_up, is_gone, is_in_this_network, is_on_this_machine
+from millrace.learner.run_folder.owner_process import (
+    can_look_up,
+    is_copy,
+    is_gone,
+    is_in_this_network,
+    is_on_this_machine,
+)
 from millrace.learner.run_folder.regular_files import read, reason
 from millrace.learner.run_folder.run_lock import LOCK_FILE, PACE
 from millrace.protocol.address import is_local
@@ -54,9 +60,9 @@ def learner_of_run(folder: Path) -> LearnerOfRun:
 def living_owner(folder: Path, now: float) -> Owner:
     """The process that seems to train the run in this folder, for display. `now` is wall-clock time.
 
-    A process on this machine is looked up by its process number. Any other, such as one in a container, counts as alive if
-    it rewrote the file in the last few seconds. Raises `UsageError`, with a one-line message, if no process seems to train
-    the run.
+    A process on this machine is looked up by its process number, and doesn't train a copy of its folder. Any other process,
+    such as one in a container, counts as alive if it rewrote the file in the last few seconds. Raises `UsageError`, with a
+    one-line message, if no process seems to train the run.
     """
     path = folder / LOCK_FILE
     try:
@@ -70,4 +76,6 @@ def living_owner(folder: Path, now: float) -> Owner:
         raise UsageError(f"run {folder}: {LOCK_FILE} names no process; it is being written, or damaged: try again")
     if is_gone(owner) or (not can_look_up(owner) and age_s >= PACE.dead_after):
         raise UsageError(f"run {folder}: no process trains it now; {owner} did, and is gone")
+    if is_copy(folder, owner):
+        raise UsageError(f"run {folder}: no process trains it now; it is a copy of the folder in which {owner} trains")
     return owner

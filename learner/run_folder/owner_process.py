@@ -18,8 +18,8 @@ NETWORK = Path("/proc/self/ns/net")
 NUMBERS = Path("/proc/self/ns/pid")
 
 
-def new_owner() -> Owner:
-    """The owner of a new lock, which is this process."""
+def new_owner(folder: Path) -> Owner:
+    """The owner of a new lock in this run folder, which is this process."""
     return Owner(
         host=socket.gethostname(),
         pid=os.getpid(),
@@ -27,6 +27,7 @@ def new_owner() -> Owner:
         token=secrets.token_hex(8),
         network_namespace=_namespace(NETWORK),
         pid_namespace=_namespace(NUMBERS),
+        folder=inode(folder),
     )
 
 
@@ -48,6 +49,23 @@ def can_look_up(owner: Owner) -> bool:
 def is_gone(owner: Owner) -> bool:
     """Whether the owner's process has ended. False if that cannot be known."""
     return can_look_up(owner) and not _is_alive(owner.pid)
+
+
+def is_copy(folder: Path, owner: Owner) -> bool:
+    """Whether this folder is a copy of the folder that the owner trains. False if that cannot be known.
+
+    Device numbers aren't compared, because one file system may have several. Other machines aren't compared, because some
+    network file systems have different inode numbers on each machine.
+    """
+    return can_look_up(owner) and "" != owner.folder != inode(folder)
+
+
+def inode(folder: Path) -> str:
+    """The inode number of this folder; empty if it cannot be read."""
+    try:
+        return str(folder.stat().st_ino)
+    except OSError:
+        return ""
 
 
 def _is_alive(pid: int) -> bool:

@@ -26,7 +26,7 @@ from msgspec.structs import replace
 
 from millrace.learner.run_folder.atomic_write import TEMPORARY
 from millrace.learner.run_folder.lease import LeaseWatch, Listens, Owner, Unreachable, Verdict, decoded
-from millrace.learner.run_folder.owner_process import is_gone, new_owner
+from millrace.learner.run_folder.owner_process import inode, is_gone, new_owner
 from millrace.learner.run_folder.regular_files import open_regular, read
 from millrace.protocol.errors import RunError, RunTakenOver, UsageError
 
@@ -98,7 +98,7 @@ class RunLock:
         self._clock = clock
         self._sleep = sleep
         self._wall_clock = wall_clock
-        self._owner = new_owner()
+        self._owner = new_owner(folder)
         self._file = -1
         self._seen_s = 0.0  # wall-clock time of the last look at the file that showed that the run is still ours
         self._lost = ""  # why the run is no longer ours
@@ -309,6 +309,7 @@ class RunLock:
         self._close()
         self._file = file
         self._lock_by_system()
+        self._owner = replace(self._owner, folder=inode(self._folder))
         self._write()
 
     def _write(self) -> None:

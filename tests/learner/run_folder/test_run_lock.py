@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import fcntl
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -421,6 +422,24 @@ def test_a_process_that_is_gone_trains_nothing(tmp_path: Path, address: str) -> 
         learner_of_run(tmp_path)
     (tmp_path / LOCK_FILE).write_bytes(replace(mine, pid_namespace="pid:[1]").encoded())
     assert str(living_owner(tmp_path, time.time())).startswith(f"process {ended.pid}"), "a container has other numbers"
+
+
+def test_a_copy_of_a_folder_is_not_trained_by_the_process_that_trains_the_original(tmp_path: Path) -> None:
+    original, copy, renamed = (tmp_path / name for name in ("original", "copy", "renamed"))
+    original.mkdir()
+    with lock(original) as held:
+        shutil.copytree(original, copy)
+        with pytest.raises(UsageError, match=rf"no process trains it now; it is a copy of .* process {os.getpid()} on"):
+            living_owner(copy, time.time())
+        assert living_owner(original, time.time()).pid == os.getpid()
+        original.rename(renamed)
+        assert living_owner(renamed, time.time()).pid == os.getpid()
+        original.mkdir()
+        held.confirm()
+        assert living_owner(original, time.time()).pid == os.getpid(), "the run continues in a new folder"
+        elsewhere = replace(owner_of(original), boot_id="another kernel")
+    (copy / LOCK_FILE).write_bytes(elsewhere.encoded())
+    assert living_owner(copy, time.time()) == elsewhere, "another machine may see other inode numbers"
 
 
 @pytest.mark.parametrize(
