@@ -29,6 +29,7 @@ MAX_COPIES = 1 << 16  # env copies in one lane
 MAX_SAVED_BYTES = 1 << 22  # bytes of one env copy's state, as its environment saved it
 MAX_SEEDS = 1_024  # seeds in one Evaluate order
 MAX_FACTS = 32  # facts about one episode
+LONGEST_S = 1e9  # longest time that is reported, in seconds
 MOST_OTHER_KEYS = 10_000  # keys of one dict that aren't text: anybody can choose such keys so that each hits all others
 MOST_KEYS_SQUARED = MOST_OTHER_KEYS**2  # sum of these squared numbers over all dicts of one value: half a second at most
 MOST_WITH_ONE_HASH = 64  # of these keys, those with the same hash: Python compares them, and they can be long
@@ -45,7 +46,7 @@ Count = Annotated[int, Meta(ge=1, le=LARGEST)]
 Whole = Annotated[int, Meta(ge=-LARGEST, le=LARGEST)]
 Version = Annotated[int, Meta(ge=-1, le=LARGEST)]
 Pid = Annotated[int, Meta(ge=0, le=2**31)]
-Seconds = Annotated[float, Meta(ge=0, le=1e9)]
+Seconds = Annotated[float, Meta(ge=0, le=LONGEST_S)]
 Moment = Annotated[float, Meta(ge=0, le=1e11)]
 """Seconds since 1970."""
 Real = Annotated[float, Meta(ge=-1.7976931348623157e308, le=1.7976931348623157e308)]

@@ -56,6 +56,8 @@ class LastEpisode(msgspec.Struct, frozen=True, array_like=True):
     """whether the previous episode is over, so that the next step begins this one"""
     saved: bool = False
     """whether `LanePast.memory` has the state of the copy after the last row, so nothing needs to be replayed"""
+    steps: Natural = 0
+    """number of steps of the copy's running episode so far, as the learner counts them in the rows"""
 
     @property
     def goes_on(self) -> bool:

@@ -137,14 +137,14 @@ def memory_bytes(run: RunSpec) -> int:
     """
     if run.teams:
         return 0
-    of_copies = run.copies * (run.seats_of_copy + 2) * 8
+    of_copies = run.copies * (run.seats_of_copy + 1) * 8
     of_state = run.columns * run.policy.state_size * 4
     if not run.seats:
         return of_copies + of_state
     action = run.policy.action
     chosen = 32 * (action.choices + math.prod(action.shape) + 1)  # bytes of an action, its distribution params and its noise
     extras = sum(math.prod(extra.shape) * np.dtype(extra.dtype).itemsize for extra in run.extras)
-    return of_copies + 2 * of_state + run.columns * (1 + chosen + extras)
+    return of_copies + 2 * of_state + run.columns * (chosen + extras)
 
 
 class Batch(msgspec.Struct, frozen=True):

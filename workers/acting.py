@@ -58,6 +58,10 @@ class StepActions(Protocol):
 class RolloutActions(StepActions, Protocol):
     """Chooses the actions of one rollout for each of L lanes, and stores them."""
 
+    def chosen(self, i: int) -> Array:
+        """The actions [T, N, *action] of lane i, which are among the arrays `written`."""
+        ...
+
     def columns(self, i: int) -> ActedRows:
         """The arrays of lane i, once all T steps are done."""
         ...
@@ -156,6 +160,9 @@ class _BuiltInActions:
         self._action[:, t] = action
         return action
 
+    def chosen(self, i: int) -> Array:
+        return self._action[i]  # type: ignore[no-any-return]
+
     def columns(self, i: int) -> ActedRows:
         log_prob = self._distribution.log_prob(self._params[i], self._action[i], self._noise[i])  # rule LOG_PROB
         return ActedRows(self._action[i], log_prob, ())
@@ -211,6 +218,9 @@ class _OwnActions:
             for array, extra in zip(self._written, acted.extras, strict=False):  # log_prob, the last, may be absent
                 array[i, t] = extra
         return np.array(self._action[:, t])  # a copy, because an environment may change its action
+
+    def chosen(self, i: int) -> Array:
+        return self._action[i]  # type: ignore[no-any-return]
 
     def columns(self, i: int) -> ActedRows:
         return ActedRows(self._action[i], self._log_prob[i], tuple(extra[i] for extra in self._extras))

@@ -13,6 +13,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from msgspec import structs
 
 from millrace.protocol.arrays import Array, Bools
 from millrace.protocol.lane_past import AttributeChanges, EpisodeBegin, LanePast, LastEpisode
@@ -134,17 +135,19 @@ class LaneHistory:
         random = None if began is None else began.random
         if resets[T]:
             return LastEpisode(start, random, self.count + T, True)
-        if resets.any():
-            return LastEpisode(start, random, self.count + int(np.flatnonzero(resets)[-1]) + 1, False)
-        if began is not None:
-            return LastEpisode(start, random, self.count, False)
+        if resets.any() or began is not None:
+            first = int(np.flatnonzero(resets)[-1]) + 1 if resets.any() else 0
+            return LastEpisode(start, random, self.count + first, False, steps=T - first)
+        steps = last.steps + T
         # The rows before a saved state were dropped. Unless a newer state was saved, the episode can't be continued.
-        return LastEpisode(start, None, self.count, False) if last.saved else last
+        if last.saved:
+            return LastEpisode(start, None, self.count, False, steps=steps)
+        return structs.replace(last, steps=steps)
 
     def _saved(self, n: int) -> None:
         """Record that the rows of copy n aren't needed, because `memory` has its state after the last row."""
         last = self.copies[n]
-        self.copies[n] = LastEpisode(last.start, last.random, self.count, last.over, saved=True)
+        self.copies[n] = structs.replace(last, first=self.count, saved=True)
 
     @property
     def longest_given_up(self) -> int:
@@ -162,14 +165,14 @@ class LaneHistory:
             if last.goes_on and (not known or self.count - last.first > self.most_steps):
                 if known and self.most_steps >= 0:
                     self.too_long[n] = last.first
-                self.copies[n] = LastEpisode(last.start, None, self.count, False)
+                self.copies[n] = LastEpisode(last.start, None, self.count, False, steps=last.steps)
         first_row = min((_needed_from(last) for last in self.copies if last.goes_on), default=self.count)
         while self.rows and self.rows[0].first + len(self.rows[0].action) <= first_row:
             self.rows.popleft()
 
     def _shifted(self, last: LastEpisode, start: int) -> LastEpisode:
         first = last.first - start if last.goes_on else 0
-        return LastEpisode(last.start, last.random, first, last.over, last.saved)
+        return structs.replace(last, first=first)
 
 
 def _needed_from(last: LastEpisode) -> int:

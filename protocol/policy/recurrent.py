@@ -22,11 +22,20 @@ from millrace.protocol.arrays import Floats
 from millrace.protocol.specs import PolicySpec
 
 GATES = {"lstm": 4, "gru": 3}  # number of gates, where the candidate state counts as one
+MOST_OUTPUT = 1.01  # largest output of a core; it is 1 without rounding
 
 
 def zero_state(spec: PolicySpec, *lead: int) -> Floats:
     """The state at the beginning of an episode: zeros [*lead, S]. S is 0 without a core."""
     return np.zeros((*lead, spec.state_size), np.float32)
+
+
+def is_possible(spec: PolicySpec, state: Floats) -> bool:
+    """Whether a policy can have these states [..., S]. They are finite, and a core's output is a mean of numbers between -1
+    and 1, except for rounding. With a larger output, the core's next step could overflow.
+    """
+    output = state[..., : spec.core_size if spec.core else 0]
+    return bool(np.isfinite(state).all() and (np.abs(output) <= MOST_OUTPUT).all())
 
 
 def core_shapes(spec: PolicySpec, inputs: int) -> tuple[tuple[int, int], tuple[int, int]]:

@@ -80,8 +80,9 @@ def validate(rollout: Rollout, run: RunSpec, most_steps: int = LARGEST) -> None:
     begun = [each.copy for each in rollout.begun]
     if len(set(begun)) < len(begun) or max(begun, default=0) >= run.copies:
         raise BadRollout(f"begun: expected each of the copies 0 to {run.copies - 1} at most once, got {begun[:100]}")
-    if (start := max((each.start for each in rollout.begun), default=0)) > LARGEST // 2:  # later starts must fit too
-        raise BadRollout(f"begun: expected starts up to {LARGEST // 2}, got {start}")
+    most_starts = LARGEST // 2 + rollout.ticket  # later starts must fit too, and each needs another ticket
+    if (start := max((each.start for each in rollout.begun), default=0)) > most_starts:
+        raise BadRollout(f"begun: expected starts up to {most_starts}, got {start}")
     if len(set(rollout.saved)) < len(rollout.saved) or max(rollout.saved, default=0) >= run.copies:
         raise BadRollout(f"saved: expected copies 0 to {run.copies - 1}, each at most once, got {rollout.saved[:100]}")
     most = memory_bytes(run) + len(rollout.saved) * (MAX_SAVED_BYTES + OF_SAVED_BYTES)

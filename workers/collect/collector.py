@@ -157,8 +157,8 @@ class Collector:
             lane.set_attributes(self.env_attributes, pulse)
             lane.start([0] * run.copies, pulse)
         else:  # rule PAST
-            written = self._runner.acting.begin([self._action_streams(number).of(0)]).written(0)
-            self.note = bring_back(run, lane, permit.past, self.env_attributes, pulse, written) or self.note
+            actions = self._runner.acting.begin([self._action_streams(number).of(0)])
+            self.note = bring_back(run, lane, permit.past, self.env_attributes, pulse, actions) or self.note
         self.note = self.note or lane.copies.note
         self.stages["open"] += perf_counter() - began
         return lane

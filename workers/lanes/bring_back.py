@@ -4,7 +4,8 @@ Rule: each episode begins as it did before, and its actions are replayed without
 together. Then the copies' observations, returns and lengths are compared with the history. If they differ, the environment
 is not deterministic, and the copy begins a new episode, with the next start number. Replayed steps are subject to the
 environment's usual timeouts, but don't count as env steps. If an environment has saved its state, the state is loaded
-instead, and nothing is replayed.
+instead, and nothing is replayed. The history comes from another worker, which may be hostile, so what can't be compared is
+checked: it must be possible in the run. Otherwise the lane's next rollouts could be refused, or the policy could fail.
 """
 
 from __future__ import annotations
@@ -16,11 +17,14 @@ import msgspec
 import numpy as np
 
 from millrace.protocol.arrays import Array, Doubles
+from millrace.protocol.bounds import INVALID
 from millrace.protocol.envs.env_actions import action_converter_of
 from millrace.protocol.envs.seats import columns_of
 from millrace.protocol.lane_past import LanePast
-from millrace.protocol.policy.masks import stored_leaves
+from millrace.protocol.policy.masks import not_allowed, stored_leaves
+from millrace.protocol.rows.array_checks import wrong_values
 from millrace.protocol.specs import RunSpec
+from millrace.workers.acting import RolloutActions
 from millrace.workers.copies.env_copies import LoopedCopies, StepResult, copy_seed
 from millrace.workers.copies.env_errors import environment_failures
 from millrace.workers.copies.env_loop import Pulse
@@ -32,15 +36,19 @@ NOT_DETERMINISTIC = (
     "the environment isn't deterministic: when a lost episode was begun again with the same seed and its actions were "
     "replayed, or its saved state was loaded, {}; so a new episode began instead, and results depend on who was lost"
 )
+IMPOSSIBLE = (
+    "the state of a lane, as the worker that had the lane sent it, isn't possible in this run; so new episodes began "
+    "instead, and results depend on who was lost"
+)
 
 
 def bring_back(
-    run: RunSpec, lane: Lane, past: LanePast, attributes: bytes, pulse: Pulse, written: Sequence[Array] = ()
+    run: RunSpec, lane: Lane, past: LanePast, attributes: bytes, pulse: Pulse, actions: RolloutActions | None = None
 ) -> str:
     """Continue a lane from its history (`past`) on a new `Lane`. The copies of the new lane must not have been reset yet.
 
-    At the end, the copies have these `attributes` (packed). With seats, `written` has arrays [T, N · A, …] of the shapes and
-    dtypes that the policy writes. If the history doesn't fit the lane, it is not continued, and new episodes begin instead.
+    At the end, the copies have these `attributes` (packed). With seats, `actions` are the policy's for one lane; what they
+    have written is overwritten. If the history doesn't fit the lane, it is not continued, and new episodes begin instead.
     Returns a line for the user, or an empty string if there is nothing to report. Raises `EnvironmentFailed` if a copy
     raises.
     """
@@ -49,14 +57,18 @@ def bring_back(
     states: list[SavedCopy] = []
     saved = any(last.saved for last in past.copies)
     memory = past.memory[:-1] if saved else past.memory
-    if isinstance(copies, LoopedCopies) and lane.remembers and _fits(past, memory, lane, run, written):
-        continued = [n for n, last in enumerate(past.copies) if last.goes_on]
-        states = _states(past.memory[-1], lane) if saved else []
-    if not isinstance(copies, LoopedCopies) or not continued:  # nothing is reported, because the learner knows why
+    why = ""
+    if isinstance(copies, LoopedCopies) and lane.remembers and any(last.goes_on for last in past.copies):
+        if _fits(past, memory, lane, run, actions):
+            continued = [n for n, last in enumerate(past.copies) if last.goes_on]
+            states = _states(past.memory[-1], lane) if saved else []
+        else:
+            why = IMPOSSIBLE
+    if not isinstance(copies, LoopedCopies) or not continued:  # if `why` is empty, the learner knows why
         lane.set_attributes(attributes, pulse)
         starts = [last.start + 1 for last in past.copies]
         lane.start(starts if len(starts) == lane.count else [max(starts, default=1)] * lane.count, pulse)
-        return ""
+        return why
     repeated = _Repeated(run, lane, copies, msgspec.structs.replace(past, memory=memory), continued, pulse)
     with environment_failures(lane.number, "while its episode was continued"), copies.repeating():
         repeated.repeat()
@@ -86,6 +98,7 @@ class _Repeated:
         self._pulse = pulse
         self._seats = run.seats_of_copy
         self._acts = np.zeros(lane.columns, bool)
+        self._waits = np.zeros(lane.columns, bool)
         self._obs = [np.empty_like(leaf) for leaf in past.obs]
         self._returns = np.zeros((lane.count, self._seats))
         self._sizes = np.zeros(lane.count)  # [N] sum of the rewards' absolute values
@@ -116,16 +129,18 @@ class _Repeated:
     def load(self, states: list[SavedCopy]) -> None:
         """Load the saved states. If the episode of a copy is over, let the next step reset the copy."""
         for n in list(self.continued):
-            if self._past.copies[n].saved:
-                why = self._copies.load(n, states[n]) if n < len(states) else "its state is damaged"
-                if why:
-                    self._differs(n, why)
+            last = self._past.copies[n]
+            if not last.saved:
+                continue
+            damaged = n >= len(states) or not (last.over or {last.steps}.issuperset(states[n].elapsed))
+            if why := "its state is damaged" if damaged else self._copies.load(n, states[n]):
+                self._differs(n, why)
         self._copies.end([n for n in self.continued if self._past.copies[n].over])
 
     def compare(self) -> None:
         """Compare the copies with the history, and stop continuing those that differ."""
         past = self._past
-        returns = past.memory[0][:, :-2]
+        returns = past.memory[0][:, :-1]
         for n in list(self.continued):
             if not past.copies[n].is_repeated:
                 continue
@@ -135,6 +150,8 @@ class _Repeated:
                 self._differs(n, "it shows another observation")
             elif not np.abs(self._returns[n] - returns[n]).max() <= most < np.inf:  # tolerates another order of summation
                 self._differs(n, "its rewards add up to another return")
+            elif self._run.masked and self._forbidden(columns):
+                self._differs(n, "an agent waits after an action that its mask forbids")
 
     def start_others(self) -> None:
         """Begin a new episode in each copy that isn't continued, with its next start number."""
@@ -158,9 +175,17 @@ class _Repeated:
         lane.playing[over] = False
         lane.episodes.begin(perf_counter())
         lane.episodes.returns += self._returns
-        lane.recall(past.memory, self.continued)
+        lane.recall(past.memory, [last.steps for last in past.copies], self.continued)
+        lane.episodes.returns[over] = 0.0
+        lane.episodes.lengths[over] = 0
         if lane.seats is not None:
             lane.seats.acts = self._acts
+            lane.seats.waits = self._waits
+
+    def _forbidden(self, columns: Sequence[int]) -> bool:
+        """Whether the mask of one of these seats forbids the action after which the seat waits."""
+        wrong = not_allowed(self._past.action[-1], self._past.obs[-1], self._run.policy.action)
+        return bool((wrong & self._waits)[columns].any())
 
     def _first(self, n: int) -> int:
         """The row of the first action in the episode of copy n."""
@@ -198,6 +223,7 @@ class _Repeated:
     def _began(self, copies: list[int], seeds: Sequence[int | None]) -> None:
         result = self._copies.reset_some(copies, seeds, self._pulse)
         self._see(result, copies)
+        self._waits[columns_of(copies, self._seats)] = False
         self._returns[copies] = 0.0
         self._sizes[copies] = 0.0
         if result.columns is not None:
@@ -213,7 +239,9 @@ class _Repeated:
     def _step(self, taken: Array, copies: list[int]) -> StepResult:
         """Step these copies, and add up their rewards. A copy whose episode ends is no longer continued."""
         self._pulse()
-        result = self._copies.step(taken[columns_of(copies, self._seats)], self._pulse, copies)
+        columns = columns_of(copies, self._seats)
+        self._waits[columns] |= self._acts[columns]
+        result = self._copies.step(taken[columns], self._pulse, copies)
         write_numbers(self._numbers, slice(None), (result.reward, result.terminated, result.truncated))
         reward, terminated, truncated = self._numbers
         self._count(copies, reward)
@@ -221,6 +249,8 @@ class _Repeated:
         if result.columns is not None:
             self._count(copies, result.columns.outside)
             over = result.columns.over
+            self._waits[columns] &= ~result.columns.complete[columns]
+            self._acts[columns] = result.columns.acts[columns]
         for n in copies:
             if over[n]:
                 self._differs(n, "it ended earlier")
@@ -241,24 +271,40 @@ def _states(blob: Array, lane: Lane) -> list[SavedCopy]:
     """Decode the states of all copies. Returns an empty list if they are damaged."""
     try:
         states = unpacked(blob)
-    except (msgspec.MsgspecError, ValueError):
+    except INVALID:
         return []
     return states if len(states) == lane.count else []
 
 
-def _fits(past: LanePast, memory: Sequence[Array], lane: Lane, run: RunSpec, written: Sequence[Array]) -> bool:
+def _fits(past: LanePast, memory: Sequence[Array], lane: Lane, run: RunSpec, actions: RolloutActions | None) -> bool:
     """Whether the arrays fit this lane. They come from another worker, by way of the learner, and so may be wrong."""
+    if len(past.copies) != lane.count or len(past.obs) != len(stored_leaves(run)):
+        return False
     action = run.policy.action
     rows = past.action.shape[0] if past.action.ndim else 0
     expected: Iterable[tuple[Array, tuple[int, ...], str]] = [
         (past.action, (rows, lane.columns, *action.shape), action.stored_dtype),
         *(
             (array, (lane.columns, *leaf.shape), leaf.dtype)
-            for array, leaf in zip(past.obs, stored_leaves(run), strict=False)
+            for array, leaf in zip(past.obs, stored_leaves(run), strict=True)
         ),
     ]
     shapes = all(array.shape == shape and array.dtype == dtype for array, shape, dtype in expected)
     before = [1 if last.random and last.is_repeated else 0 for last in past.copies]  # 1 if the row of the reset comes first
     firsts = all(least <= last.first <= rows for least, last in zip(before, past.copies, strict=True))
-    counts = len(past.copies) == lane.count and len(past.obs) == len(stored_leaves(run))
-    return shapes and firsts and counts and lane.can_recall(memory, written)
+    written = () if lane.seats is None or actions is None else actions.written(0)
+    if not (shapes and firsts and lane.can_recall(memory, written, [last.steps for last in past.copies])):
+        return False
+    return actions is None or not written or _held_fits(past, memory[len(memory) - len(written) :], run, actions)
+
+
+def _held_fits(past: LanePast, held: Sequence[Array], run: RunSpec, actions: RolloutActions) -> bool:
+    """Whether the rows of seats that wait will be valid. They repeat what the policy wrote when these seats `held` acted."""
+    for array, of_columns in zip(actions.written(0), held, strict=True):
+        array[:] = of_columns
+    action = actions.chosen(0)
+    if wrong_values(action, run.policy.action) or not (action[-1:] == past.action[-1:]).all():
+        return False
+    with np.errstate(all="ignore"):
+        acted = actions.columns(0)
+    return not any(wrong_values(array) for array in (acted.log_prob, *acted.extras))

@@ -18,7 +18,7 @@ from millrace.protocol.bounds import LARGEST
 from millrace.protocol.envs.seats import columns_of
 from millrace.protocol.lane_past import EpisodeBegin
 from millrace.protocol.policy.masks import stored_leaves
-from millrace.protocol.policy.recurrent import zero_state
+from millrace.protocol.policy.recurrent import is_possible, zero_state
 from millrace.protocol.rows.rollout_checks import LARGEST_REWARD
 from millrace.protocol.specs import RunSpec
 from millrace.protocol.wire.plain_values import pack, unpack
@@ -167,21 +167,26 @@ class Lane:
             copies.note = f"{error}, so its episodes are replayed if a worker is lost"
             return []
 
-    def can_recall(self, memory: Sequence[Array], written: Sequence[Array]) -> bool:
-        """Whether this memory fits this lane. For `written`, see `bring_back`."""
+    def can_recall(self, memory: Sequence[Array], written: Sequence[Array], steps: Sequence[int]) -> bool:
+        """Whether this memory fits this lane, and is possible in episodes that have made so many `steps` [N].
+
+        With seats, `written` has arrays [T, N · A, …] of the shapes and dtypes that the policy writes.
+        """
         own = self.memory()
-        rest = memory[len(own) :]
-        held = written if self.seats is not None and rest else ()
+        held = () if self.seats is None else written
         expected = [*((each.shape, each.dtype) for each in own), *((each.shape[1:], each.dtype) for each in held)]
         if [(each.shape, each.dtype) for each in memory] != expected:
             return False
-        return self.episodes.can_recall(memory[0])
+        states = memory[1 : len(own)]
+        return self.episodes.can_recall(memory[0], steps) and all(is_possible(self._run.policy, each) for each in states)
 
-    def recall(self, memory: Sequence[Array], copies: Sequence[int]) -> None:
-        """For these copies, restore the state from the `memory` of another lane. `can_recall` must have returned True."""
+    def recall(self, memory: Sequence[Array], steps: Sequence[int], copies: Sequence[int]) -> None:
+        """For these copies, restore the state from the `memory` of another lane, and from the numbers of `steps` [N] of
+        their episodes. `can_recall` must have returned True.
+        """
         left = list(memory)
         columns = columns_of(copies, self.columns // self.count)
-        self.episodes.recall(left.pop(0), copies, perf_counter())
+        self.episodes.recall(left.pop(0), steps, copies, perf_counter())
         if self.state.size:
             self.state[columns] = left.pop(0)[columns]
         if self.seats is not None:

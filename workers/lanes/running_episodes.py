@@ -13,9 +13,9 @@ from typing import NamedTuple
 import numpy as np
 
 from millrace.protocol.arrays import Array, Bools, Doubles
-from millrace.protocol.bounds import LARGEST
+from millrace.protocol.bounds import LARGEST, LONGEST_S
 from millrace.protocol.rollout import Episode
-from millrace.protocol.rows.rollout_checks import wrong_episode
+from millrace.protocol.rows.rollout_checks import LARGEST_REWARD, wrong_episode
 from millrace.protocol.specs import RunSpec
 from millrace.workers.copies.env_errors import environment_failed
 from millrace.workers.opponents import OtherTeams, whole_episode
@@ -53,22 +53,27 @@ class RunningEpisodes:
         self._no_facts = (math.nan,) * len(run.info_keys)
 
     def memory(self, now_s: float) -> Doubles:
-        """[N, A + 2] the returns, the number of steps, and the seconds of each running episode so far."""
-        memory = np.empty((len(self.lengths), self.returns.shape[1] + 2))
-        memory[:, :-2] = self.returns
-        memory[:, -2] = self.lengths
+        """[N, A + 1] the returns and the seconds of each running episode so far."""
+        memory = np.empty((len(self.lengths), self.returns.shape[1] + 1))
+        memory[:, :-1] = self.returns
         memory[:, -1] = [now_s - began_s for began_s in self.began_s]
         return memory
 
-    def can_recall(self, memory: Doubles) -> bool:
-        """Whether these numbers are possible returns, steps and times: finite, and with no negative time."""
-        return bool(np.isfinite(memory).all() and (memory[:, -1] >= 0).all())
+    def can_recall(self, memory: Doubles, steps: Sequence[int]) -> bool:
+        """Whether these numbers are possible returns and times of episodes that have made so many `steps` [N].
 
-    def recall(self, memory: Doubles, copies: Sequence[int], now_s: float) -> None:
-        """For these copies, restore the state from the `memory` of another lane."""
+        If they are, a learner will accept the episodes. Environments with seats may give rewards before the first step.
+        """
+        most = np.maximum(steps, 1) * LARGEST_REWARD
+        seconds = memory[:, -1]
+        possible = (np.abs(memory[:, :-1]) <= most[:, None]).all() and (seconds >= 0).all()  # NaN is not
+        return bool(possible and (seconds <= LONGEST_S / 2).all())  # the other half is left for the rest of the episode
+
+    def recall(self, memory: Doubles, steps: Sequence[int], copies: Sequence[int], now_s: float) -> None:
+        """For these copies, restore the state from the `memory` of another lane, and from the numbers of `steps` [N]."""
         for n in copies:
-            self.returns[n] = memory[n, :-2]
-            self.lengths[n] = memory[n, -2]
+            self.returns[n] = memory[n, :-1]
+            self.lengths[n] = steps[n]
             self.began_s[n] = now_s - float(memory[n, -1])
 
     def begin(self, now_s: float) -> None:

@@ -24,18 +24,18 @@ class Seats:
     def __init__(self, policy: PolicySpec, columns: int) -> None:
         self.acts: Bools = np.zeros(columns, bool)
         """[N · A] whether the seat acts in the next step"""
-        self._waits = np.zeros(columns, bool)  # [N · A] whether the seat has acted, and its row is not complete yet
+        self.waits: Bools = np.zeros(columns, bool)
+        """[N · A] whether the seat has acted, and its row is not complete yet"""
         self._held: list[Array] = []  # [N · A, …] each, what the policy wrote when each seat last acted
         self._held_state = zero_state(policy, columns)  # [N · A, S] the policy's state before each seat last acted
 
     def memory(self) -> tuple[Array, ...]:
-        """The state that `recall` needs: which seats wait, the policy's state before each acted, and what it then wrote."""
-        return (self._waits.copy(), self._held_state.copy(), *(held.copy() for held in self._held))
+        """The state that `recall` needs: the policy's state before each seat acted, and what the policy then wrote."""
+        return (self._held_state.copy(), *(held.copy() for held in self._held))
 
     def recall(self, memory: Sequence[Array], columns: Sequence[int]) -> None:
         """For these columns, restore the state from the `memory` of another lane's seats."""
-        waits, held_state, *held = memory
-        self._waits[columns] = waits[columns]
+        held_state, *held = memory
         self._held_state[columns] = held_state[columns]
         self._held = [np.zeros_like(array) for array in held]
         for mine, array in zip(self._held, held, strict=True):
@@ -46,7 +46,7 @@ class Seats:
 
         For a seat that waits, it is the state before the seat acted.
         """
-        return np.where(self._waits[:, None], self._held_state, state)
+        return np.where(self.waits[:, None], self._held_state, state)
 
     def acted(self, t: int, written: Sequence[Array], before: Floats, state: Floats) -> None:
         """Correct what the policy has written for all columns at step t, because only some seats act.
@@ -61,9 +61,9 @@ class Seats:
             array[t] = held
         self._held_state[self.acts] = before[self.acts]
         state[~self.acts] = before[~self.acts]
-        self._waits |= self.acts
+        self.waits |= self.acts
 
     def stepped(self, columns: SeatColumns) -> None:
         """Record the result of a step: which rows it completes, and which seats act next."""
-        self._waits &= ~columns.complete
+        self.waits &= ~columns.complete
         self.acts = columns.acts

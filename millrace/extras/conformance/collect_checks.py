@@ -551,7 +551,7 @@ def _past_of(rollouts: Sequence[Rollout]) -> LanePast:
         of_copy = resets[:, begun.copy]
         over = bool(of_copy[K])
         first = K if over else 1 + int(max(np.flatnonzero(of_copy), default=-1))
-        copies.append((begun.copy, LastEpisode(begun.start, begun.random, first, over)))
+        copies.append((begun.copy, LastEpisode(begun.start, begun.random, first, over, steps=K - first)))
     mask = () if last.mask is None else (last.mask,)
     return replace(
         LanePast.unknown(0, len(copies)),

@@ -66,7 +66,7 @@ def test_an_episode_is_how_it_began_and_the_actions_since() -> None:
     begins = EpisodeBegin(1, 0, A)
     past = folded(rollout(["...", "..."], started(0, 0)), rollout(["...", "er."], (begins,), 1)).past(7)
     assert past.lane == 7
-    assert past.copies == (LastEpisode(0, b"", 0, False), LastEpisode(0, A, 5, False))
+    assert past.copies == (LastEpisode(0, b"", 0, False, steps=6), LastEpisode(0, A, 5, False, steps=1))
     assert past.action[:, 0].tolist() == [0, 1, 2, 10, 11, 12]
     assert past.obs[0].tolist() == [[1], [1]]
     assert past.memory[0].tolist() == [[1, 1]] * 2
@@ -119,7 +119,7 @@ def test_a_worker_that_tells_nothing_cannot_be_continued() -> None:
 def test_copies_that_started_anew_are_named() -> None:
     history = folded(rollout(["..", ".."], started(0, 0)))
     assert history.add(rollout(["..", ".."], (EpisodeBegin(1, 3, b""),), 1), b"").tolist() == [False, True]
-    assert history.past(0).copies[1] == LastEpisode(3, b"", 2, False)
+    assert history.past(0).copies[1] == LastEpisode(3, b"", 2, False, steps=2)
 
 
 def test_a_worker_cannot_take_numbers_of_starts_back() -> None:
@@ -137,10 +137,10 @@ def test_the_numbers_of_starts_do_not_run_out() -> None:
 def test_an_episode_whose_state_is_no_longer_saved_cannot_be_continued_and_later_ones_are_repeated() -> None:
     first = rollout(["...", "..."], started(0, 0))
     history = folded(replace(first, saved=(0, 1)))
-    assert history.past(0).copies == (LastEpisode(0, b"", 0, False, saved=True),) * 2
+    assert history.past(0).copies == (LastEpisode(0, b"", 0, False, saved=True, steps=3),) * 2
     history.add(rollout(["...", "er."], (EpisodeBegin(1, 0, A),), 1), b"")
     past = history.past(0)
-    assert past.copies == (LastEpisode(0, None, 0, False), LastEpisode(0, A, 2, False))
+    assert past.copies == (LastEpisode(0, None, 0, False, steps=6), LastEpisode(0, A, 2, False, steps=1))
     assert (past.new_episodes, past.repeated_steps) == (1, 1)
     history.add(replace(rollout(["...", "..."], (), 2), saved=(0, 1)), b"")
     assert history.past(0).new_episodes == 0

@@ -11,7 +11,7 @@
 
 namespace millrace {
 
-constexpr std::uint64_t PROTOCOL_VERSION = 14;
+constexpr std::uint64_t PROTOCOL_VERSION = 15;
 constexpr std::size_t MAX_FRAMES = 256, MAX_HEAD_BYTES = 1 << 20, MAX_FRAME_BYTES = 1 << 30, MAX_DIMENSIONS = 8, MAX_COPIES = 1 << 16,
                       MAX_SEATS = 1 << 10;
 
