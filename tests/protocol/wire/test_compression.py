@@ -177,7 +177,7 @@ def a_rollout(obs: tuple[npt.NDArray[Any], ...] = (frame_stacks(17, 2, 4, (8, 8)
         truncated=flags,
         valid=flags,
         state=np.zeros((2, 0), np.float32),
-        memory=(np.zeros((2, 3)),),
+        memory=(np.zeros((2, 2)),),
     )
 
 
