@@ -18,7 +18,8 @@ from time import monotonic
 from types import FrameType, TracebackType
 from typing import Any, Self
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+from millrace.protocol.machine.deferred_signals import SIGNALS
+
 FOR_SAVING = 0.5  # the share of the grace time that an update must leave for saving
 SAVE_TAKES = 1.5  # the time allowed for saving, as a multiple of the longest save so far
 

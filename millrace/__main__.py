@@ -12,7 +12,8 @@ import signal
 import sys
 from typing import NoReturn
 
-from millrace.learner.interrupts import SIGNALS, stopped_by_signals
+from millrace.learner.interrupts import stopped_by_signals
+from millrace.protocol.machine.deferred_signals import SIGNALS
 
 
 def command() -> NoReturn:

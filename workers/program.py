@@ -87,10 +87,15 @@ def work(flags: WorkerFlags, token: Token | None, signals: list[int]) -> int:
     return _exit_code(left.exit_code, left.reason)
 
 
-def _say(text: str) -> None:
-    """Write to stderr, even if the environment has replaced or closed `sys.stderr`."""
+def _flush() -> None:
+    """Write what is buffered to stderr, unless the environment has replaced or closed `sys.stderr`."""
     with suppress(Exception):
         sys.stderr.flush()
+
+
+def _say(text: str) -> None:
+    """Write to stderr, even if the environment has replaced or closed `sys.stderr`."""
+    _flush()
     with suppress(OSError):
         os.write(STDERR, text.encode(errors="backslashreplace"))
 
@@ -115,8 +120,7 @@ def _kill_own_session() -> None:
     This process is ended last, because only it still holds the slots of its env copies.
     """
     if os.getpgrp() == os.getpid():
-        with suppress(Exception):  # the environment may have replaced or closed it
-            sys.stderr.flush()
+        _flush()
         give_up_at_s = time.monotonic() + KILLED_WITHIN_S
         while (others := set(live_members(os.getpid())) - {os.getpid()}) and time.monotonic() < give_up_at_s:
             kill(others)

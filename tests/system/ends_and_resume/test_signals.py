@@ -15,9 +15,9 @@ from typing import Any
 import pytest
 
 from benchmarks.program import _run
-from millrace.learner.interrupts import SIGNALS, Interrupts, Stopped, stopped_by_signals
+from millrace.learner.interrupts import Interrupts, Stopped, stopped_by_signals
 from millrace.learner.members.bound import bind
-from millrace.protocol.machine.deferred_signals import signals_deferred
+from millrace.protocol.machine.deferred_signals import SIGNALS, signals_deferred
 from millrace.protocol.wire.socket_options import set_options
 
 INTERRUPTED = """
