@@ -1,7 +1,8 @@
 """The programs that `benchmarks/wall_clock.py` compares, and the commands that train a curve or measure a rate. Pure.
 
 Rule: a rate is measured with the settings of the curve, except that steps take longer, nothing is evaluated, and gradient
-steps begin earlier (`LEARNING_STARTS`). Two workers are enough to train a curve, because its steps don't wait.
+steps begin earlier (`LEARNING_STARTS`). PPO's updates are as large as those of its preset. Two workers are enough to train a
+curve, because its steps don't wait.
 """
 
 from __future__ import annotations
@@ -45,9 +46,9 @@ class Program(NamedTuple):
 
     def steps_of_an_update(self, env: str) -> int:
         """Env steps between two updates."""
-        if self.algo != "ppo":
-            return COPIES * (4 if self.system == OURS else 1)
-        return COPIES * (resolve(env).algorithm.rollout_steps if self.system == OURS else THEIR_PPO_STEPS)
+        if self.system == THEIRS:
+            return COPIES * (THEIR_PPO_STEPS if self.algo == "ppo" else 1)
+        return COPIES * _rollout_steps(self.algo, env)
 
     def warm_up_steps(self, env: str) -> int:
         """Number of env steps at the beginning that a rate leaves out.
@@ -73,7 +74,7 @@ def training(env: str, algo: Sequence[str], seed: int, steps: str, out: str) -> 
     """The command of millrace that trains a curve. `algo`: the name of the algorithm, followed by flags of its own."""
     words = ["millrace", "train", env, "--algo", *algo, "--seed", str(seed), "--steps", steps]
     evaluations = ["--eval-every", str(EVAL_EVERY), "--eval-episodes", str(EVAL_EPISODES)]
-    return [*words, "--workers", "2", *_flags(algo[0]), *evaluations, "--run-dir", out]
+    return [*words, "--workers", "2", *_flags(algo[0], env), *evaluations, "--run-dir", out]
 
 
 def rate_command(program: Program, env: str, step_s: float, seed: int | str, threads: int, device: str) -> list[str]:
@@ -85,9 +86,18 @@ def rate_command(program: Program, env: str, step_s: float, seed: int | str, thr
     words = [sys.executable, "-m", "millrace", "train", env, "--algo", program.algo, "--seed", str(seed), *starts]
     words += ["--steps", str(10**8), "--eval-every", "0", "--eval-episodes", "1", "--run-dir", ".", "--grace-s", "4"]
     words += ["--wrappers", f"benchmarks.slow_env:StepTime(seconds={step_s})", "--workers", str(COPIES)]
-    return [*words, *_flags(program.algo), "--torch-threads", str(threads), "--device", device]
+    return [*words, *_flags(program.algo, env), "--torch-threads", str(threads), "--device", device]
 
 
-def _flags(algo: str) -> list[str]:
-    copies = ["--envs", str(COPIES), "--lanes", str(COPIES)]
-    return copies if algo == "ppo" else [*copies, "--rollout-steps", "4", "--max-lag", "1"]
+def _flags(algo: str, env: str) -> list[str]:
+    flags = ["--envs", str(COPIES), "--lanes", str(COPIES), "--rollout-steps", str(_rollout_steps(algo, env))]
+    return flags if algo == "ppo" else [*flags, "--max-lag", "1"]
+
+
+def _rollout_steps(algo: str, env: str) -> int:
+    """Steps of each env copy in a rollout: those that leave the size of PPO's updates as in the preset, or few."""
+    if algo != "ppo":
+        return 4
+    preset = resolve(env)
+    steps: int = preset.envs * preset.algorithm.rollout_steps
+    return steps // COPIES

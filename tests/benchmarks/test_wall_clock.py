@@ -99,7 +99,8 @@ def test_a_rate_has_the_settings_of_the_curve() -> None:
 
 def test_the_steps_of_an_update_are_those_of_the_settings() -> None:
     assert SAC.steps_of_an_update(ENV) == COPIES * 4
-    assert Program(OURS, "ppo").steps_of_an_update(ENV) == COPIES * resolve(ENV).algorithm.rollout_steps
+    preset = resolve(ENV)
+    assert Program(OURS, "ppo").steps_of_an_update(ENV) == preset.envs * preset.algorithm.rollout_steps
     assert THEIR_PPO.steps_of_an_update(ENV) == 2048
     assert can_be_measured(THEIR_PPO, ENV, 0.05, 30)
     assert not can_be_measured(THEIR_PPO, ENV, 1.0, 30)
