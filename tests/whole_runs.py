@@ -72,9 +72,6 @@ COMMANDS = {  # where no test of a fault or a feature runs the command
     "launch": "test_launch_kubernetes.py::test_the_commands_of_the_manifest_train",
     "dashboard": "test_page_beside.py::test_its_address_is_said_and_it_shows_the_end_of_the_run[workers]",
     "evaluate": "test_evaluation.py::test_a_run_reports_the_same_evaluation_whatever_the_number_of_workers",
-    "evaluate elsewhere": (
-        "test_play_elsewhere.py::test_an_evaluation_by_workers_from_elsewhere_is_that_of_local_ones[tcp with keys-workers]"
-    ),
     "record elsewhere": (
         "test_play_elsewhere.py::test_a_dataset_of_workers_from_elsewhere_is_that_of_local_ones[tcp with keys-workers]"
     ),
@@ -118,8 +115,5 @@ FEATURES = {
     "vector environment": "test_vector_env_faults.py::test_a_worker_killed_between_steps_comes_back_truncated[shared]",
     "vector environment elsewhere": "test_vector_env_faults.py::test_workers_elsewhere_join_by_tcp_and_come_back",
     "its learner is killed": "test_vector_env_faults.py::test_no_process_outlives_the_learner[killed]",
-    "weights shared on a machine": (
-        "test_shared_weights.py::test_each_version_comes_once_and_acts_bit_for_bit_in_one_run_after_another"
-    ),
 }
 WHOLE_RUNS = frozenset({*FAULTS.values(), *COMMANDS.values(), *FEATURES.values()})

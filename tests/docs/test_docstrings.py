@@ -15,10 +15,13 @@ import pytest
 
 import millrace
 from tests.docs.surroundings import missing_extra, variables
+from tests.support.variants import variants
 
 SMALL: dict[str, Any] = {
     "envs": 2, "lanes": 1, "rollout_steps": 16, "n_epochs": 1, "eval_episodes": 2, "workers": 1, "transport": "inproc",
 }  # fmt: skip
+OF_A_PLAN = ("plan", "RunPlan")
+"""Names whose example measures an environment for some seconds, as the whole run of `millrace plan` does."""
 CLASSES_WITH_METHODS = ("LoadedPolicy", "PolicyParameters", "RolloutService", "Run")
 """Classes whose objects a user calls. The methods of the others are called by millrace."""
 
@@ -44,7 +47,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return millrace.train("CartPole-v1", seed=1, steps=64, run_dir=str(folder), progress=False, **SMALL).path
 
 
-@pytest.mark.parametrize("name", DOCSTRINGS)
+@pytest.mark.parametrize("name", variants(DOCSTRINGS, default=DOCSTRINGS.keys() - set(OF_A_PLAN)))
 def test_its_example_works(name: str, trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     for variable, value in variables(tmp_path).items():

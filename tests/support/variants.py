@@ -9,7 +9,12 @@ import pytest
 
 
 def variants(cases: Iterable[Any], *, default: Collection[Any]) -> list[Any]:
-    """The values of a parameter. Those that are not in `default` are marked `rest`."""
+    """The values of a parameter, or tuples of the values of several. Those that are not in `default` are marked `rest`."""
     found = list(cases)
     assert all(case in found for case in default), f"{default}: expected some of {found}"
-    return [case if case in default else pytest.param(case, marks=pytest.mark.rest) for case in found]
+    return [case if case in default else _in_rest(case) for case in found]
+
+
+def _in_rest(case: Any) -> Any:
+    values = case if isinstance(case, tuple) else (case,)
+    return pytest.param(*values, marks=pytest.mark.rest)

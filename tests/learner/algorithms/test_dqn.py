@@ -397,7 +397,7 @@ def corridor(made: DQN, generator: np.random.Generator, ends: str) -> Batch:
 @pytest.mark.parametrize(
     "settings",
     [
-        {"target_every": 20},
+        pytest.param({"target_every": 20}, marks=pytest.mark.rest),
         {"target_every": 1, "tau": 0.05, "priority_alpha": 0.6, "n_step": 3, "dueling": True},
     ],
 )

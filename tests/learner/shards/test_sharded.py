@@ -30,6 +30,7 @@ from tests.support.in_process.learner_threads import in_threads
 from tests.support.numbers.batches import DISCRETE, GAUSSIAN, IMAGE, MIXED, batch, no_pulse, normal, recurrent, shared
 from tests.support.numbers.rounding import assert_within
 from tests.support.numbers.steps import only_step
+from tests.support.variants import variants
 
 SHARDS = 4
 SETTINGS: dict[str, dict[str, Any]] = {
@@ -168,14 +169,23 @@ def of_run(name: str, spec: PolicySpec, batches: Sequence[Batch], processes: int
 
 @pytest.mark.parametrize(
     ("name", "policy"),
-    [
-        *(("ppo", policy) for policy in POLICIES),
-        ("a2c", "images"),
-        ("impala", "discrete"),
-        ("impala", "lstm"),
-        ("reinforce", "gru"),
-        ("counting", "discrete"),
-    ],
+    variants(
+        [
+            *(("ppo", policy) for policy in POLICIES),
+            ("a2c", "images"),
+            ("impala", "discrete"),
+            ("impala", "lstm"),
+            ("reinforce", "gru"),
+            ("counting", "discrete"),
+        ],
+        default=[
+            ("ppo", "lstm"),
+            ("a2c", "images"),
+            ("impala", "discrete"),
+            ("reinforce", "gru"),
+            ("counting", "discrete"),
+        ],
+    ),
 )
 def test_the_bits_do_not_depend_on_the_number_of_processes(name: str, policy: str) -> None:
     spec = POLICIES[policy]

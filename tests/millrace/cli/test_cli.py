@@ -563,6 +563,7 @@ def test_a_run_without_a_best_policy_is_told_how_one_is_kept(tmp_path: Path, cap
     assert refusal(capsys, "evaluate", str(run), "--best") == f"run {run}: {why}"
 
 
+@pytest.mark.rest
 def test_evaluate_films_a_few_episodes(tmp_path: Path, capsys: Captured) -> None:
     run = a_run_that_acts(tmp_path)
     for _ in range(2):  # the same films, over again
