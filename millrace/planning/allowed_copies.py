@@ -26,6 +26,8 @@ class AllowedCopies(NamedTuple):
     why: str = "with those of evaluations"
     """the reason for `of_run`"""
     apart: bool = False
+    """whether each copy that trains has a worker of its own"""
+    failed_in_one_worker: bool = False
     """whether several copies in one worker did not work"""
 
     @classmethod
@@ -39,7 +41,7 @@ class AllowedCopies(NamedTuple):
         If more copies have failed than worked at the same time, only the latter number; if several have failed because they
         were in one worker, as few as possible there.
         """
-        allowed = self._replace(apart=bool(measured.failed_in_one_worker))
+        allowed = self._replace(apart=measured.best_apart, failed_in_one_worker=bool(measured.failed_in_one_worker))
         if not measured.copies_failed or 0 < self.here <= measured.copies_worked:
             return allowed
         return allowed._replace(here=measured.copies_worked, of_run=measured.copies_worked, why=MORE_FAILED)
@@ -56,15 +58,24 @@ class AllowedCopies(NamedTuple):
         if self.of_run > 1:  # evaluations need a second one
             found.append(ChosenSetting("max_env_copies", self.of_run, self.why))
         if self._evaluating < EVALUATION_COPIES:
-            few = "as few as possible"
-            train = f"so that {self.training} of {counted(self.here, 'copy', 'copies')} train"
-            found.append(ChosenSetting("eval_copies", self._evaluating, train if self.here > 1 else few))
+            found.append(ChosenSetting("eval_copies", self._evaluating, self._why_few_evaluate))
         return found
 
     @property
     def _evaluating(self) -> int:
         """How many copies of a worker play evaluations: the default number, or 1 if that is more than a third of the allowed
-        ones, or if several copies in one worker did not work.
+        ones, or if training copies have a worker each. Several copies in one worker would wait one after the other.
         """
-        enough = not self.here or self.here >= 3 * EVALUATION_COPIES
-        return EVALUATION_COPIES if enough and not self.apart else 1
+        return 1 if self.apart or self._is_scarce else EVALUATION_COPIES
+
+    @property
+    def _is_scarce(self) -> bool:
+        return 0 < self.here < 3 * EVALUATION_COPIES
+
+    @property
+    def _why_few_evaluate(self) -> str:
+        if self._is_scarce and self.here > 1:
+            return f"so that {self.training} of {counted(self.here, 'copy', 'copies')} train"
+        if self._is_scarce or self.failed_in_one_worker:
+            return "as few as possible"
+        return "each worker plays one episode at a time, so more workers take part in an evaluation"

@@ -19,6 +19,7 @@ from millrace.planning.measurements import Machine
 from millrace.planning.overheads import StoodFor, overheads
 from millrace.planning.probe import ProbedEnv, probe
 from millrace.planning.recommendation import (
+    LEAST_ROLLOUT,
     NEEDED_STEPS,
     ChosenSetting,
     Learning,
@@ -31,6 +32,7 @@ from millrace.planning.recommendation import (
     choose_step_timeout,
     on_machines,
     reasons,
+    why_rollout_steps,
 )
 from millrace.planning.run_plan import ExpectedSpeed, RunPlan, added_by_preset, train_command
 from millrace.protocol.env_spec import EnvLike
@@ -136,10 +138,9 @@ def _decided(
     It lists the settings in `first`, then the numbers of workers, copies and lanes, and the lag, then the settings in
     `others`.
     """
-    has_replay = isinstance(config.algorithm, OffPolicyConfig)
     default_steps = config.algorithm.rollout_steps
-    rows = config.envs * default_steps if has_replay else None
-    learning = Learning(config.envs, default_steps, rows, situation.overheads.acting_bytes)
+    least_steps = 1 if isinstance(config.algorithm, OffPolicyConfig) else min(LEAST_ROLLOUT, default_steps)
+    learning = Learning(config.envs, default_steps, least_steps, situation.overheads.acting_bytes)
 
     @cache
     def rate(sizes: Sizes) -> float:
@@ -148,8 +149,7 @@ def _decided(
     sizes = best({each: rate(each) for each in candidates(learning, situation.measured, situation.machine)})
     chosen = [*first, *reasons(sizes, learning, situation, rate)]
     if sizes.rollout_steps != default_steps:
-        why = f"the policy is updated after {counted(sizes.steps_per_round, 'env step')}"
-        chosen.append(ChosenSetting("rollout_steps", sizes.rollout_steps, why))
+        chosen.append(ChosenSetting("rollout_steps", sizes.rollout_steps, why_rollout_steps(sizes, learning)))
     chosen += others
     needed = NEEDED_STEPS[config.algo]
     advice = _advice(sizes, situation, rate(sizes))

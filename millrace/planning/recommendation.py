@@ -19,6 +19,7 @@ from millrace.planning.in_words import counted, number_in_words, time_in_words
 from millrace.planning.measurements import WORKER_BYTES, Machine, Measurements
 
 AS_GOOD = 0.95
+LEAST_ROLLOUT = 32  # steps of a rollout in PPO: in shorter ones, advantages depend more on the critic than on rewards
 SLOW_S = 0.003  # if a step takes longer, divided by the copies at once, an algorithm with a replay buffer ends sooner
 SLOW_WITH_IMAGES_S = 0.05  # the limit if actions are continuous and observations are images
 MOST_ENVS = 64  # if a step computes rather than waits, more env copies gain little
@@ -62,14 +63,22 @@ class Learning(NamedTuple):
     """the usual number of env copies"""
     rollout_steps: int
     """the usual number of steps in a rollout, with this number of copies"""
-    rows_of_update: int | None
-    """the largest number of env steps between two updates, if the algorithm learns from a replay buffer; otherwise None"""
+    least_steps: int = 1
+    """the smallest number of steps in a rollout from which the algorithm learns well"""
     acting_bytes: int = 0
     """additional memory that a worker needs to act with the policy"""
 
+    @property
+    def rows_of_update(self) -> int:
+        """The usual number of env steps between two updates."""
+        return self.envs * self.rollout_steps
+
     def steps(self, envs: int) -> int:
-        """The number of steps in a rollout with this number of env copies."""
-        return self.rollout_steps if self.rows_of_update is None else max(1, self.rows_of_update // envs)
+        """The number of steps in a rollout with this number of env copies: as many as leave the size of updates as usual.
+
+        With larger updates, an algorithm needs more env steps.
+        """
+        return max(self.least_steps, self.rows_of_update // envs)
 
 
 def copies_at_once(measured: Measurements, machine: Machine, acting_bytes: int = 0) -> Limit:
@@ -258,6 +267,16 @@ def reasons(
         ChosenSetting("lanes", sizes.lanes, _why_lanes(sizes, measured)),
         ChosenSetting("max_lag", sizes.max_lag, _why_lag(sizes, rate)),
     )
+
+
+def why_rollout_steps(sizes: Sizes, learning: Learning) -> str:
+    """Why a rollout has other than the usual number of steps."""
+    updated = f"the policy is updated after {counted(sizes.steps_per_round, 'env step')}"
+    if sizes.steps_per_round <= learning.rows_of_update:
+        return f"{updated}, as with {counted(learning.envs, 'env copy', 'env copies')} and the usual rollouts"
+    if sizes.rollout_steps == 1:
+        return f"{updated}, one of each copy"
+    return f"{updated}; with shorter rollouts, advantages would depend more on the critic"
 
 
 def _why_workers(sizes: Sizes, measured: Measurements, machine: Machine) -> str:

@@ -14,8 +14,8 @@ NO_OVERHEADS = Overheads(row_s=0, lane_row_s=0, copy_row_s=0, sent_s=0, round_s=
 OVERHEADS = Overheads(
     row_s=1e-4, lane_row_s=2e-5, copy_row_s=1e-5, sent_s=2e-4, round_s=1e-3, rollout_s=2e-4, received_s=1e-6, update_s=1e-4
 )
-PPO = Learning(envs=8, rollout_steps=128, rows_of_update=None)
-REPLAY = Learning(envs=8, rollout_steps=8, rows_of_update=64)
+PPO = Learning(envs=8, rollout_steps=128, least_steps=32)
+REPLAY = Learning(envs=8, rollout_steps=8)
 MACHINE = Machine(cores=2, free_bytes=16 << 30)
 
 

@@ -16,6 +16,7 @@ from millrace.learner.config.layers import resolve
 from millrace.learner.config.validation import check_copies
 from millrace.learner.members.failure_count import FailureCount
 from millrace.planning.allowed_copies import AllowedCopies
+from millrace.planning.expected_rate import Sizes
 from millrace.planning.measurements import ActionKind, Machine, Overheads
 from millrace.planning.recommendation import (
     ChosenSetting,
@@ -29,6 +30,7 @@ from millrace.planning.recommendation import (
     copies_at_once,
     on_machines,
     reasons,
+    why_rollout_steps,
 )
 from millrace.planning.run_plan import added_by_preset, train_command
 from millrace.protocol.env_spec import Scalar
@@ -145,6 +147,37 @@ def test_if_several_copies_failed_in_one_worker_each_copy_that_trains_has_a_work
     values = {each.name: each.value for each in settings}
     assert values["eval_copies"] == 1
     assert "worker of its own" in {each.name: each.why for each in settings}["workers"]
+
+
+@pytest.mark.parametrize(("failed_in_one_worker", "why"), [(0, "each worker plays one episode"), (2, "as few as possible")])
+def test_if_steps_wait_a_worker_plays_one_episode_at_a_time(failed_in_one_worker: int, why: str) -> None:
+    waits = measured(wait_s=0.01, failed_in_one_worker=failed_in_one_worker)
+    (eval_copies,) = AllowedCopies.of(0, 0).after(waits).settings
+    assert (eval_copies.name, eval_copies.value) == ("eval_copies", 1)
+    assert eval_copies.why.startswith(why)
+    assert AllowedCopies.of(100, 0).after(waits).training == 99
+    assert AllowedCopies.of(0, 0).after(measured(cpu_s=0.01)).settings == []
+
+
+def test_an_update_keeps_its_size_with_any_number_of_copies_unless_rollouts_became_too_short() -> None:
+    assert {envs: PPO.steps(envs) for envs in (1, 4, 8, 16, 32, 160)} == {1: 1024, 4: 256, 8: 128, 16: 64, 32: 32, 160: 32}
+    assert {envs: REPLAY.steps(envs) for envs in (1, 16, 160)} == {1: 64, 16: 4, 160: 1}
+    where = situation(measured(wait_s=0.01))
+    found = chosen(where)
+    assert (found.envs, found.steps_per_round) == (TRIED, PPO.rows_of_update)
+
+
+@pytest.mark.parametrize(
+    ("learning", "envs", "why"),
+    [
+        (PPO, 16, "after 1,024 env steps, as with 8 env copies and the usual rollouts"),
+        (PPO, 160, "after 5,120 env steps; with shorter rollouts, advantages would depend more on the critic"),
+        (REPLAY, 160, "after 160 env steps, one of each copy"),
+    ],
+)
+def test_the_number_of_steps_of_a_rollout_has_its_reason(learning: Learning, envs: int, why: str) -> None:
+    sizes = Sizes(workers=envs, envs=envs, lanes=envs, max_lag=0, rollout_steps=learning.steps(envs))
+    assert why_rollout_steps(sizes, learning) == f"the policy is updated {why}"
 
 
 def test_if_the_learner_is_the_limit_no_more_copies_are_chosen_than_it_can_use() -> None:
