@@ -107,6 +107,8 @@ class Measurements(msgspec.Struct, frozen=True, kw_only=True):
     """number of crashes, exceptions and calls that hung, without those that were due to the number of copies"""
     calls: int = 0
     """number of steps and resets in which these failures happened"""
+    calls_s: float = 0.0
+    """wall time of these steps and resets together"""
     findings: tuple[str, ...] = ()
     """problems that were found, such as a crash or a step that hung; one line each"""
 

@@ -2,8 +2,8 @@
 
 Rule: the environment's code runs in workers, never in this process. Each session has a deadline; if it isn't whole by then,
 its number of copies counts as not measured. An error before the first step is raised; a later one becomes a finding of one
-line. If all copies of a session have taken enough steps, and then a call takes as long as half of the time that is left, the
-call counts as one that hangs, so the other half is left for other numbers of copies.
+line. If all copies of a session have taken enough steps, and then a call takes as long as half of the time that is left and
+much longer than any call before, the call counts as one that hangs, so the other half is left for other numbers of copies.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from millrace.learner.vector_env.settings import VectorEnvSettings
 from millrace.planning.measurements import ActionKind, Machine, Measurements, StepCosts
 from millrace.planning.probe_sizes import SessionSize, most_each, numbers_of_workers, two_fit
 from millrace.planning.random_actions import SEED, RandomActions, SeenMasks
-from millrace.planning.sessions import MORE_TIME, TRIES, WARM_UP, Failures, SteppedCopies, Tries
+from millrace.planning.sessions import GRACE_S, MORE_TIME, TRIES, WARM_UP, Failures, SteppedCopies, Tries, hangs
 from millrace.planning.stopwatch import CopyTimes, read_notes
 from millrace.protocol.arrays import Array
 from millrace.protocol.bounds import one_line
@@ -42,7 +42,6 @@ from millrace.protocol.specs import ActionSpec
 LEAST_STEPS = 8  # number of steps that each copy takes, even if they last longer than planned
 OF_ALONE = 0.15  # share of the time in which one copy steps alone
 EACH_S = 2.0  # how long each number of workers is measured
-GRACE_S = 1.0  # how long after its deadline a session waits for the last steps
 SHORT_S = 1e-3  # shorter steps are measured in workers with several copies, because a run steps them in this way
 WORTH_WHILE = 1.1  # if more workers don't increase the env steps/s by this factor, even larger numbers aren't tried
 
@@ -121,6 +120,12 @@ class _CallHangs(Exception):
     """A call to a copy has not returned for a long time, although all copies had taken enough steps before."""
 
 
+class _NewestCall:
+    """When the newest call of a session began, or when no more were to begin, if that is later."""
+
+    at_s = math.inf
+
+
 def _tries(
     env: ProbedEnv, size: SessionSize, seconds: float, deadline_s: float, alone: SteppedCopies | None = None
 ) -> Tries:
@@ -138,14 +143,16 @@ def _session(env: ProbedEnv, size: SessionSize, seconds: float, deadline_s: floa
 
     Raises `UserFacingError` if there is only one copy and it can't be made.
     """
-    end_at_s = math.inf
+    called = _NewestCall()
 
     def check_time() -> None:
         now_s = time.monotonic()
         if now_s > deadline_s + GRACE_S:
             raise _TimeIsUp
-        if now_s > (end_at_s + deadline_s) / 2 + GRACE_S and min(map(len, traces)) > LEAST_STEPS:
-            raise _CallHangs(f"a call took longer than {now_s - end_at_s:.0f} s; unless it hangs, {MORE_TIME}")
+        if min(map(len, traces)) <= LEAST_STEPS or not hangs(now_s, called.at_s, deadline_s, 0.0):
+            return
+        if hangs(now_s, called.at_s, deadline_s, _slowest_s(notes)):  # only now, because reading notes takes time
+            raise _CallHangs(f"a call took longer than {now_s - called.at_s:.0f} s; unless it hangs, {MORE_TIME}")
 
     with TemporaryDirectory(prefix="millrace-plan-") as folder:
         notes = Path(folder, "notes")
@@ -175,17 +182,17 @@ def _session(env: ProbedEnv, size: SessionSize, seconds: float, deadline_s: floa
                 limit = None if envs.spec is None else envs.spec.max_episode_steps
                 known = (envs.single_observation_space, envs.single_action_space, envs.seats, limit)
                 random_actions = RandomActions(*known[:2], max(1, len(envs.seats)))
-                end_at_s = time.monotonic() + seconds
+                called.at_s = end_at_s = time.monotonic() + seconds
                 try:
-                    _step(envs, random_actions, traces, end_at_s, deadline_s)
+                    _step(envs, random_actions, traces, end_at_s, deadline_s, called)
                 finally:
                     masks = random_actions.masks
         except UsageError:
             raise
         except _TimeIsUp:
             cut_off = True
-        except _CallHangs as hangs:
-            wrong = str(hangs)
+        except _CallHangs as error:
+            wrong = str(error)
         except MillraceError as error:
             if size.copies == 1 and not any(notes.iterdir()):
                 raise
@@ -195,7 +202,12 @@ def _session(env: ProbedEnv, size: SessionSize, seconds: float, deadline_s: floa
 
 
 def _step(
-    envs: ZmqVectorEnv, random_actions: RandomActions, traces: list[list[int]], end_at_s: float, deadline_s: float
+    envs: ZmqVectorEnv,
+    random_actions: RandomActions,
+    traces: list[list[int]],
+    end_at_s: float,
+    deadline_s: float,
+    called: _NewestCall,
 ) -> None:
     """Step all copies until `end_at_s`, or until the deadline if they haven't taken `LEAST_STEPS` steps by `end_at_s`.
 
@@ -219,6 +231,13 @@ def _step(
             into: Any = create_empty_array(space, len(actions))
             batch = concatenate(space, actions, into)
             envs.send(batch, ready)
+            called.at_s = max(end_at_s, now_s)
+
+
+def _slowest_s(notes: Path) -> float:
+    """The longest time that a step or a reset has taken so far."""
+    calls = [each for copy in read_notes(notes) for each in (copy.steps, copy.resets)]
+    return max((float(each[:, 1].max(initial=0.0)) for each in calls), default=0.0)
 
 
 def _arrays(observation: Any) -> Iterator[Array]:
@@ -304,6 +323,7 @@ def _with_all(measured: Measurements, tried: Sequence[Tries]) -> Measurements:
         deterministic=_deterministic([trace for session in sessions for trace in session.traces]),
         failures=len(failures.sessions),
         calls=failures.calls,
+        calls_s=failures.calls_s,
         findings=tuple(line for line in (failures.finding, *(tries.finding for tries in tried)) if line),
     )
 

@@ -190,12 +190,12 @@ def choose_max_env_failures(default: int, measured: Measurements) -> ChosenSetti
     """
     if not measured.failures:
         return None
-    between_s = measured.alone.mean_s * measured.calls / measured.failures
+    between_s = measured.calls_s / measured.failures
     needed = math.ceil(OFTENER * WORK_S / max(between_s, LEAST_BETWEEN_S))
     if needed <= default or between_s < LEAST_BETWEEN_S:
         return None
     why = (
-        f"a copy failed about once in {time_in_words(between_s)} of its steps; {default} allows a failure in "
+        f"a copy failed about once in {time_in_words(between_s)} of steps and resets; {default} allows a failure in "
         f"{time_in_words(WORK_S / default)}, and {needed} in {time_in_words(WORK_S / needed)}"
     )
     return ChosenSetting("max_env_failures", needed, why)

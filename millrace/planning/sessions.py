@@ -20,6 +20,8 @@ from millrace.planning.stopwatch import CopyTimes
 WARM_UP = 2  # this many steps at the beginning of a copy aren't counted
 TRIES = 3  # how often a number of copies is tried, if they fail
 RARER = 3
+SLOWER = 3.0  # a call that hangs has taken at least this many times as long as the slowest call that returned
+GRACE_S = 1.0  # how long after its deadline a session waits for the last steps
 OF_ITS_OWN = "if a copy needs a port, a folder or a licence of its own, see docs/how-to/simulators.md"
 MORE_TIME = "allow more time with --seconds"
 STARTS_AGAIN = "a run starts a failed copy again, as docs/explanation/faults.md describes"
@@ -69,6 +71,11 @@ class SteppedCopies(NamedTuple):
     def calls(self) -> int:
         """How many steps and resets the copies have answered."""
         return sum(map(len, self.traces))
+
+    @property
+    def calls_s(self) -> float:
+        """The wall time of the steps and resets."""
+        return sum(float(each.steps[:, 1].sum() + each.resets[:, 1].sum()) for each in self.times)
 
 
 class Tries(NamedTuple):
@@ -134,6 +141,16 @@ class Tries(NamedTuple):
         return f"{copies} were not measured, because {why}; unless they hang, {MORE_TIME}"
 
 
+def hangs(now_s: float, called_s: float, deadline_s: float, slowest_s: float) -> bool:
+    """Whether a call counts as one that hangs: it has taken half of the time that was left, and much longer than others.
+
+    `called_s`: when the newest call began, or when no more were to begin, if that is later. `slowest_s`: the longest time
+    that a call has taken so far.
+    """
+    half_s = (deadline_s - called_s) / 2
+    return now_s - called_s > max(half_s + GRACE_S, SLOWER * slowest_s)
+
+
 def _copies(size: SessionSize) -> str:
     if size.copies == 1:
         return "one copy"
@@ -147,13 +164,19 @@ class Failures(NamedTuple):
     """the sessions that they ended"""
     calls: int
     """the number of steps and resets in all sessions that these or no failures ended"""
+    calls_s: float
+    """the wall time of these steps and resets"""
 
     @classmethod
     def of(cls, tried: Sequence[Tries]) -> Failures:
         """The failures in all sessions."""
         counted = [tries for tries in tried if not (tries.show_a_limit and tries.size.copies > 1)]
-        calls = sum(session.calls for tries in counted for session in tries.sessions)
-        return cls(tuple(session for tries in counted for session in tries.failed), calls)
+        sessions = [session for tries in counted for session in tries.sessions]
+        return cls(
+            tuple(session for session in sessions if session.wrong),
+            sum(session.calls for session in sessions),
+            sum(session.calls_s for session in sessions),
+        )
 
     @property
     def finding(self) -> str:

@@ -289,7 +289,7 @@ def test_a_step_timeout_is_far_above_all_measured_times_and_far_below_the_defaul
 
 
 def test_a_run_survives_failures_that_are_twice_as_frequent_as_in_the_measurement() -> None:
-    found = measured(wait_s=0.04, cpu_s=0, failures=4, calls=800)  # a failure every 8 s
+    found = measured(wait_s=0.04, cpu_s=0, failures=4, calls=800, calls_s=32.0)  # a failure every 8 s
     (more,) = [choose_max_env_failures(3, found)]
     assert more is not None
     assert (more.name, more.value) == ("max_env_failures", 8)
@@ -303,8 +303,14 @@ def test_a_run_survives_failures_that_are_twice_as_frequent_as_in_the_measuremen
 
 def test_without_failures_or_with_too_many_of_them_the_default_number_stays() -> None:
     assert choose_max_env_failures(3, measured(wait_s=0.04)) is None
-    assert choose_max_env_failures(3, measured(wait_s=0.04, failures=1, calls=2000)) is None
-    assert choose_max_env_failures(3, measured(wait_s=0.001, failures=3, calls=60)) is None
+    assert choose_max_env_failures(3, measured(wait_s=0.04, failures=1, calls=2000, calls_s=80.0)) is None
+    assert choose_max_env_failures(3, measured(wait_s=0.001, failures=3, calls=60, calls_s=0.06)) is None
+
+
+def test_the_time_between_failures_is_that_of_steps_and_resets() -> None:
+    """The run counts both as work. Here, 400 steps took 4 s and 20 resets 1,200 s."""
+    found = measured(wait_s=0.01, cpu_s=0, reset_s=60.0, failures=1, calls=420, calls_s=1204.0)
+    assert choose_max_env_failures(3, found) is None
 
 
 def test_what_sets_the_number_of_copies_is_said() -> None:

@@ -9,10 +9,11 @@ import pytest
 
 from millrace.planning.probe_sizes import SessionSize
 from millrace.planning.random_actions import SeenMasks
-from millrace.planning.sessions import Failures, SteppedCopies, Tries
+from millrace.planning.sessions import Failures, SteppedCopies, Tries, hangs
 from millrace.planning.stopwatch import CopyTimes
 
 CRASH = "worker w0 was killed"
+STEP_S, RESET_S = 0.5, 7.0
 
 
 def session(workers: int, steps: int, wrong: str = "", *, each: int = 1, cut_off: bool = False) -> SteppedCopies:
@@ -33,7 +34,7 @@ def test_copies_that_cannot_even_begin_failed_because_of_their_number(copies: in
     assert tries.show_a_limit
     assert not tries.worked
     assert tries.finding.startswith(f"{copies} copies side by side: {CRASH} (in all 3 tries); if a copy needs a port")
-    assert Failures.of([Tries((ALONE,), None), tries]) == ((), 81)
+    assert Failures.of([Tries((ALONE,), None), tries]) == ((), 81, 0.0)
 
 
 @pytest.mark.parametrize("failed", [1, 2])
@@ -65,6 +66,21 @@ def test_crashes_that_are_much_more_frequent_than_with_one_copy_are_a_limit_unle
     assert not Tries(early, session(1, 20)).show_a_limit
     assert not Tries(early, session(1, 60, CRASH)).show_a_limit
     assert Tries(early, session(1, 80, CRASH)).show_a_limit
+
+
+def test_the_time_of_failures_is_that_of_all_steps_and_resets_of_the_sessions_that_are_counted() -> None:
+    steps, resets = np.full((10, 4), STEP_S), np.full((3, 4), RESET_S)
+    timed = ALONE._replace(times=[CopyTimes(steps, resets, np.zeros((0, 3)))] * 2)
+    failures = Failures.of([Tries((timed,), None), Tries((timed._replace(wrong=CRASH),), ALONE)])
+    assert failures.calls_s == 4 * (10 * STEP_S + 3 * RESET_S)
+
+
+def test_a_call_hangs_only_if_it_takes_half_of_the_time_that_was_left_and_much_longer_than_all_others() -> None:
+    assert not hangs(now_s=119.0, called_s=100.0, deadline_s=140.0, slowest_s=0.1)
+    assert hangs(now_s=122.0, called_s=100.0, deadline_s=140.0, slowest_s=0.1)
+    assert not hangs(now_s=122.0, called_s=100.0, deadline_s=140.0, slowest_s=60.0)
+    assert hangs(now_s=122.0, called_s=100.0, deadline_s=140.0, slowest_s=7.0)
+    assert not hangs(now_s=137.0, called_s=136.0, deadline_s=140.0, slowest_s=0.1)  # the call has just begun
 
 
 def test_if_there_is_no_time_for_a_second_try_the_finding_says_so() -> None:
