@@ -10,6 +10,10 @@ COMPUTES = 0.5  # if the share of CPU time in a step is above this, the step cou
 WORKER_BYTES = 50 << 20
 """Memory of a worker without an env copy."""
 
+NoMore = Literal["", "time", "no faster", "failed"]
+"""Why no larger number of workers was measured: the time was up, a larger one was hardly faster, or it failed. Empty if all
+numbers that this machine allows were measured.
+"""
 ActionKind = Literal["box", "discrete", "other"]
 """Kind of action space; `box` means a Box with finite bounds."""
 
@@ -76,6 +80,8 @@ class Measurements(msgspec.Struct, frozen=True, kw_only=True):
     observation_bytes: int = 0
     side_by_side: tuple[StepCosts, ...]
     """costs of a step for each number of workers that was tried, in ascending order; never empty"""
+    no_more: NoMore = ""
+    """why `side_by_side` has no larger number of workers"""
     copies_worked: int = 1
     """the largest number of copies that were stepped side by side without a problem that is due to their number"""
     copies_failed: int = 0

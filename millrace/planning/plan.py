@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping, Sequence
-from functools import cache
 
 import msgspec
 
@@ -17,7 +16,7 @@ from millrace.planning.expected_rate import Situation, Sizes, steps_per_s
 from millrace.planning.in_words import counted, number_in_words, time_in_words
 from millrace.planning.measurements import Machine
 from millrace.planning.overheads import StoodFor, overheads
-from millrace.planning.probe import ProbedEnv, probe
+from millrace.planning.probe import OF_PROBE, ProbedEnv, probe
 from millrace.planning.recommendation import (
     LEAST_ROLLOUT,
     NEEDED_STEPS,
@@ -44,7 +43,6 @@ from millrace.protocol.random_streams import Purpose, generator
 from millrace.workers.machine_slots import copies_per_machine
 
 SECONDS = 30.0
-OF_PROBE = 0.7  # share of the time in which the environment is measured; millrace's own part is measured in the rest
 LEAST_S = 5.0
 MACHINES = (1, 2, 10)
 BUSY = 0.5  # if the load average per core is above this, the machine counts as busy
@@ -142,22 +140,17 @@ def _decided(
     least_steps = 1 if isinstance(config.algorithm, OffPolicyConfig) else min(LEAST_ROLLOUT, default_steps)
     learning = Learning(config.envs, default_steps, least_steps, situation.overheads.acting_bytes)
 
-    @cache
-    def rate(sizes: Sizes) -> float:
-        return steps_per_s(sizes, situation, generator(1, Purpose.ROUNDS))
-
-    sizes = best({each: rate(each) for each in candidates(learning, situation.measured, situation.machine)})
-    chosen = [*first, *reasons(sizes, learning, situation, rate)]
+    sizes = best({each: _rate(each, situation) for each in candidates(learning, situation.measured, situation.machine)})
+    chosen = [*first, *reasons(sizes, learning, situation, _rate)]
     if sizes.rollout_steps != default_steps:
         chosen.append(ChosenSetting("rollout_steps", sizes.rollout_steps, why_rollout_steps(sizes, learning)))
     chosen += others
     needed = NEEDED_STEPS[config.algo]
-    advice = _advice(sizes, situation, rate(sizes))
+    advice = _advice(sizes, situation)
     if isinstance(config.algorithm, OffPolicyConfig):
         no_updates = msgspec.structs.replace(situation.overheads, update_s=0.0)
         before = msgspec.structs.replace(situation, overheads=no_updates)
-        first_rate = steps_per_s(sizes, before, generator(1, Purpose.ROUNDS))
-        if line := about_first_steps(config.algo, config.algorithm.learning_starts, first_rate):
+        if line := about_first_steps(config.algo, config.algorithm.learning_starts, _rate(sizes, before)):
             advice.append(line)
     if line := added_by_preset(env.name, env.kwargs, config.algo):
         advice.append(line)
@@ -174,13 +167,18 @@ def _decided(
     )
 
 
+def _rate(sizes: Sizes, situation: Situation) -> float:
+    """The env steps/s to expect."""
+    return steps_per_s(sizes, situation, generator(1, Purpose.ROUNDS))
+
+
 def _expected(sizes: Sizes, learning: Learning, situation: Situation, needed: int) -> list[ExpectedSpeed]:
     found = []
     fastest = 0.0
     for machines in MACHINES:
         here = on_machines(sizes, machines, learning)
         there = msgspec.structs.replace(situation, machines=machines)
-        fastest = max(fastest, steps_per_s(here, there, generator(1, Purpose.ROUNDS)))
+        fastest = max(fastest, _rate(here, there))
         gathering_s = situation.overheads.gathering_s(here.lanes, here.steps_per_round)
         busy_s = situation.overheads.update_s + gathering_s / here.steps_per_round
         found.append(
@@ -196,7 +194,7 @@ def _expected(sizes: Sizes, learning: Learning, situation: Situation, needed: in
     return found
 
 
-def _advice(sizes: Sizes, situation: Situation, rate: float) -> list[str]:
+def _advice(sizes: Sizes, situation: Situation) -> list[str]:
     """The lines of `RunPlan.advice`."""
     measured = situation.measured
     machine = situation.machine
@@ -231,8 +229,8 @@ def _advice(sizes: Sizes, situation: Situation, rate: float) -> list[str]:
     if measured.wrong_masks:
         lines.append(f"its action masks aren't as a run needs them: {measured.wrong_masks}")
     ahead = msgspec.structs.replace(situation, resets_ahead=True)
-    faster = steps_per_s(sizes, ahead, generator(1, Purpose.ROUNDS))
-    if faster > RESETS_COUNT * rate:
+    faster = _rate(sizes, ahead)
+    if faster > RESETS_COUNT * _rate(sizes, situation):
         lines.append(
             f"resets take {time_in_words(measured.reset_s)}: with --wrappers millrace:ResetAhead, which makes them in the "
             f"background, {number_in_words(faster)} env steps/s are expected; the environment must work in a second thread, "

@@ -26,8 +26,8 @@ from millrace.launch.crew import Crew
 from millrace.launch.vector import call_timeouts_of, start_vector_env
 from millrace.learner.vector_env.env import ZmqVectorEnv
 from millrace.learner.vector_env.settings import VectorEnvSettings
-from millrace.planning.measurements import ActionKind, Machine, Measurements, StepCosts
-from millrace.planning.probe_sizes import SessionSize, most_each, numbers_of_workers, two_fit
+from millrace.planning.measurements import ActionKind, Machine, Measurements, NoMore, StepCosts
+from millrace.planning.probe_sizes import SessionSize, enough_s, most_each, numbers_of_workers, two_fit
 from millrace.planning.random_actions import SEED, RandomActions, SeenMasks
 from millrace.planning.sessions import GRACE_S, MORE_TIME, TRIES, WARM_UP, Failures, SteppedCopies, Tries, hangs
 from millrace.planning.stopwatch import CopyTimes, read_notes
@@ -39,6 +39,7 @@ from millrace.protocol.envs.wrappers import WrapperLike
 from millrace.protocol.errors import MillraceError, RunError, UsageError, first_line
 from millrace.protocol.specs import ActionSpec
 
+OF_PROBE = 0.7  # share of a plan's time in which the environment is measured; millrace's own part is measured in the rest
 LEAST_STEPS = 8  # number of steps that each copy takes, even if they last longer than planned
 OF_ALONE = 0.15  # share of the time in which one copy steps alone
 EACH_S = 2.0  # how long each number of workers is measured
@@ -93,20 +94,27 @@ def probe(env: ProbedEnv, machine: Machine, seconds: float) -> Probed:
         if several.worked:
             each = most
             measured = msgspec.structs.replace(measured, side_by_side=(_costs(1, several.longest.times),))
-    for workers in () if first.is_too_slow else numbers_of_workers(measured, machine, each):
+    no_more: NoMore = "time" if first.is_too_slow else ""
+    for workers in () if no_more else numbers_of_workers(measured, machine, each):
         tries = _tries(env, SessionSize(workers, each), EACH_S, end_s, first)
         tried.append(tries)
         if not tries.worked:
+            no_more = "failed" if tries.show_a_limit else "time"
             break
         costs = _costs(workers, tries.longest.times)
         if costs.steps_per_s < WORTH_WHILE * measured.side_by_side[-1].steps_per_s:
+            no_more = "no faster"
             break
         measured = msgspec.structs.replace(measured, side_by_side=(*measured.side_by_side, costs))
     if alone.worked and not any(tries.decide_about_two for tries in tried):
         # An evaluation makes a second copy in a worker. It also shows whether the environment is deterministic.
         two = SessionSize(each=2 if two_fit(measured, machine) else 1)
         tried.append(_tries(env, two, EACH_S, end_s, first))
-    return Probed(_with_all(measured, tried), first.observation_space, first.action_space, first.seats)
+    measured = _with_all(msgspec.structs.replace(measured, no_more=no_more), tried)
+    again_s = max(2 * seconds, enough_s(measured, machine, each, LEAST_STEPS + 1)) / OF_PROBE
+    findings = [Failures.of(tried).finding, *(tries.finding(math.ceil(again_s / 60) * 60) for tries in tried)]
+    measured = msgspec.structs.replace(measured, findings=tuple(filter(None, findings)))
+    return Probed(measured, first.observation_space, first.action_space, first.seats)
 
 
 # ------------------------------------------------------------------------------------------------------------ one session
@@ -289,7 +297,7 @@ def _measured_alone(env: ProbedEnv, session: SteppedCopies) -> Measurements:
 
 
 def _with_all(measured: Measurements, tried: Sequence[Tries]) -> Measurements:
-    """Add the measurements that need all sessions.
+    """Add the measurements that need all sessions, except the findings.
 
     The first reset of a copy may be slower than the later ones, so it isn't counted unless no copy was reset twice.
     """
@@ -324,7 +332,6 @@ def _with_all(measured: Measurements, tried: Sequence[Tries]) -> Measurements:
         failures=len(failures.sessions),
         calls=failures.calls,
         calls_s=failures.calls_s,
-        findings=tuple(line for line in (failures.finding, *(tries.finding for tries in tried)) if line),
     )
 
 

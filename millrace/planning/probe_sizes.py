@@ -46,6 +46,14 @@ def two_fit(measured: Measurements, machine: Machine) -> bool:
     return machine.free_bytes is None or WORKER_BYTES + 2 * measured.copy_bytes <= OF_MEMORY * machine.free_bytes
 
 
+def enough_s(measured: Measurements, machine: Machine, each: int, steps: int) -> float:
+    """About how long it takes to measure all numbers of copies, if each copy starts, is reset, and takes so many steps."""
+    one_s = measured.reset_s + steps * measured.step_with_reset_s
+    sizes = list(numbers_of_workers(measured, machine, each))
+    starts = sum(max(1.0, workers / machine.cores) for workers in (1, *sizes, 1))
+    return starts * measured.start_s + (len(sizes) + 3) * one_s  # one copy alone, and two that take turns in a worker
+
+
 def numbers_of_workers(measured: Measurements, machine: Machine, each: int) -> Iterator[int]:
     """The numbers of workers to try, ascending. `each`: the number of copies of each worker."""
     alone = measured.alone

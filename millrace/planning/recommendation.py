@@ -49,6 +49,10 @@ class ChosenSetting(msgspec.Struct, frozen=True):
     why: str
 
 
+Rate = Callable[[Sizes, Situation], float]
+"""The env steps/s to expect of these sizes."""
+
+
 class Limit(NamedTuple):
     """An upper limit, and the reason for it."""
 
@@ -83,17 +87,7 @@ class Learning(NamedTuple):
 
 def copies_at_once(measured: Measurements, machine: Machine, acting_bytes: int = 0) -> Limit:
     """How many env copies can be stepped at the same time on this machine."""
-    tried = measured.side_by_side[-1]
-    faster = tried.steps_per_s / measured.alone.steps_per_s
-    made = f"so many were tried side by side, and made {faster:.1f} times the env steps of one"
-    limits = [
-        Limit(
-            machine.cores,
-            f"a step computes, and there {'are' if machine.cores > 1 else 'is'} {counted(machine.cores, 'core')}",
-        )
-        if measured.alone.computes
-        else Limit(tried.workers, made if tried.workers > 1 else "no more could be tried side by side")
-    ]
+    limits: list[Limit] = []
     if machine.most_copies:
         limits.append(Limit(machine.most_copies, _at_most(machine)))
     if machine.free_bytes is not None:
@@ -102,7 +96,26 @@ def copies_at_once(measured: Measurements, machine: Machine, acting_bytes: int =
         limits.append(
             Limit(fit, f"a worker with a copy takes {size / 2**20:,.0f} MB, and no more of them fit into the memory")
         )
+    if measured.alone.computes:
+        are = "are" if machine.cores > 1 else "is"
+        limits.append(Limit(machine.cores, f"a step computes, and there {are} {counted(machine.cores, 'core')}"))
+    else:
+        limits.append(_tried(measured))
     return min(limits, key=lambda limit: limit.number)
+
+
+def _tried(measured: Measurements) -> Limit:
+    """How many env copies were stepped side by side, and why no more."""
+    tried = measured.side_by_side[-1]
+    number = tried.workers
+    why = {
+        "": "so many were tried side by side" if number > 1 else "the licences or the memory allowed no others side by side",
+        "time": "the time was up before more of them could be tried side by side",
+        "no faster": "more of them were tried side by side, and were hardly faster",
+        "failed": "more of them did not work side by side",
+    }[measured.no_more]
+    faster = tried.steps_per_s / measured.alone.steps_per_s
+    return Limit(number, f"{why}; {number} made {faster:.1f} times the env steps of one" if number > 1 else why)
 
 
 def _at_most(machine: Machine) -> str:
@@ -210,7 +223,7 @@ def candidates(learning: Learning, measured: Measurements, machine: Machine) -> 
     for envs in _numbers_of_envs(measured, machine, learning, at_once):
         # Workers that wait only take memory. They are worth it even if updates are the limit: updates begin only after many
         # env steps if there is a replay buffer, and if a copy hangs or crashes, no other copy is in its worker.
-        numbers = {envs} if measured.best_apart else {1, min(machine.cores, envs), min(at_once, envs)}
+        numbers = {envs} if measured.best_apart else {1, min(at_once, envs)}
         for workers in sorted(numbers):
             for lanes in sorted({_lanes_for(workers, envs), envs}):
                 for lag in LAGS:
@@ -226,12 +239,29 @@ def _numbers_of_envs(measured: Measurements, machine: Machine, learning: Learnin
     """The numbers of env copies to consider, ascending."""
     if measured.best_apart:
         return sorted({min(learning.envs * 2**n, at_once) for n in range(at_once.bit_length() + 1)})
-    most = machine.most_copies or max(MOST_ENVS, learning.envs)
-    if machine.free_bytes is not None:
-        of_workers = LEARNER_BYTES + at_once * (WORKER_BYTES + learning.acting_bytes)
-        most = max(1, min(most, int((OF_MEMORY * machine.free_bytes - of_workers) / measured.copy_bytes)))
-    least = -(-learning.envs // machine.cores) * machine.cores  # rounded up to a multiple of the number of cores
+    most = _most_envs(measured, machine, learning, at_once).number
+    least = _least_envs(machine, learning)
     return sorted({min(least * 2**n, most) for n in range(most.bit_length() + 1)})
+
+
+def _least_envs(machine: Machine, learning: Learning) -> int:
+    """The usual number of env copies, rounded up to a multiple of the number of cores."""
+    return -(-learning.envs // machine.cores) * machine.cores
+
+
+def _most_envs(measured: Measurements, machine: Machine, learning: Learning, at_once: int) -> Limit:
+    """The largest number of env copies to consider if a worker may have several."""
+    if machine.most_copies:
+        most = Limit(machine.most_copies, _at_most(machine))
+    else:
+        number = max(MOST_ENVS, learning.envs)
+        most = Limit(number, f"a plan recommends at most {number} copies of an environment that computes")
+    if machine.free_bytes is None:
+        return most
+    of_workers = LEARNER_BYTES + at_once * (WORKER_BYTES + learning.acting_bytes)
+    fit = max(1, int((OF_MEMORY * machine.free_bytes - of_workers) / measured.copy_bytes))
+    why = f"a copy takes {measured.copy_bytes / 2**20:,.0f} MB, and no more of them fit into the memory"
+    return min(most, Limit(fit, why), key=lambda limit: limit.number)
 
 
 def best(rates: Mapping[Sizes, float]) -> Sizes:
@@ -256,16 +286,13 @@ def on_machines(sizes: Sizes, machines: int, learning: Learning) -> Sizes:
 # -------------------------------------------------------------------------------------------------------------- the reasons
 
 
-def reasons(
-    sizes: Sizes, learning: Learning, situation: Situation, rate: Callable[[Sizes], float]
-) -> tuple[ChosenSetting, ...]:
-    """The sizes as settings, with the reason for each. `rate` returns the expected env steps/s of given sizes."""
-    measured = situation.measured
+def reasons(sizes: Sizes, learning: Learning, situation: Situation, rate: Rate) -> tuple[ChosenSetting, ...]:
+    """The sizes as settings, with the reason for each."""
     return (
-        ChosenSetting("workers", sizes.workers, _why_workers(sizes, measured, situation.machine)),
-        ChosenSetting("envs", sizes.envs, _why_envs(sizes, learning, situation)),
-        ChosenSetting("lanes", sizes.lanes, _why_lanes(sizes, measured)),
-        ChosenSetting("max_lag", sizes.max_lag, _why_lag(sizes, rate)),
+        ChosenSetting("workers", sizes.workers, _why_workers(sizes, learning, situation, rate)),
+        ChosenSetting("envs", sizes.envs, _why_envs(sizes, learning, situation, rate)),
+        ChosenSetting("lanes", sizes.lanes, _why_lanes(sizes, situation.measured)),
+        ChosenSetting("max_lag", sizes.max_lag, _why_lag(sizes, situation, rate)),
     )
 
 
@@ -279,29 +306,66 @@ def why_rollout_steps(sizes: Sizes, learning: Learning) -> str:
     return f"{updated}; with shorter rollouts, advantages would depend more on the critic"
 
 
-def _why_workers(sizes: Sizes, measured: Measurements, machine: Machine) -> str:
-    share = measured.alone.cpu_share
+def _why_workers(sizes: Sizes, learning: Learning, situation: Situation, rate: Rate) -> str:
+    measured = situation.measured
+    share = min(measured.alone.cpu_share, 1.0)
     if measured.failed_in_one_worker:
         return "several copies in one worker did not work, so each copy has a worker of its own"
-    if measured.alone.computes and sizes.workers == machine.cores:
-        return f"a step computes for {min(share, 1.0):.0%} of its time, so there is one for each core"
-    if not measured.alone.computes and sizes.workers > 1:
+    if not measured.alone.computes:
         return f"a step waits for {1 - share:.0%} of its time, so each copy waits in a worker of its own"
-    if sizes.workers == 1:
-        return "more would hardly be faster"
-    return "more would hardly be faster, because updates take most of the time"
+    if sizes.workers == situation.machine.cores:
+        return f"a step computes for {share:.0%} of its time, so there is one for each core"
+    if sizes.workers == sizes.envs:
+        return f"a step computes for {share:.0%} of its time, so each copy has a worker of its own"
+    at_once = copies_at_once(measured, situation.machine, learning.acting_bytes)
+    if sizes.workers == at_once.number:
+        return at_once.why
+    workers = min(at_once.number, sizes.envs)
+    return _hardly_faster(sizes, msgspec.structs.replace(sizes, workers=workers, lanes=sizes.envs), situation, rate)
 
 
-def _why_envs(sizes: Sizes, learning: Learning, situation: Situation) -> str:
+def _why_envs(sizes: Sizes, learning: Learning, situation: Situation, rate: Rate) -> str:
     measured = situation.measured
-    at_once = copies_at_once(measured, situation.machine, situation.overheads.acting_bytes)
-    if sizes.envs == situation.machine.most_copies:
-        return _at_most(situation.machine)
+    machine = situation.machine
+    at_once = copies_at_once(measured, machine, learning.acting_bytes)
+    if sizes.envs == machine.most_copies:
+        return _at_most(machine)
     if measured.best_apart:
-        return at_once.why if sizes.envs == at_once.number else "more would hardly be faster, because of the updates"
-    if sizes.envs > max(learning.envs, situation.machine.cores):
-        return "steps are so short that a worker should step several copies at a time"
+        if sizes.envs == at_once.number:
+            return at_once.why
+        return _hardly_faster(sizes, _apart(at_once.number, sizes, learning), situation, rate)
+    least = _least_envs(machine, learning)
+    if sizes.envs > least:
+        fewest = msgspec.structs.replace(sizes, envs=least, lanes=least, rollout_steps=learning.steps(least))
+        here, fewer = (number_in_words(rate(each, situation)) for each in (sizes, fewest))
+        return f"a worker steps several copies at a time; with {least}, {fewer} env steps/s in place of {here} are expected"
+    most = _most_envs(measured, machine, learning, at_once.number)
+    if sizes.envs == most.number < least:
+        return most.why
+    if sizes.envs > learning.envs:
+        return f"the usual number, {learning.envs}, rounded up to a multiple of the {counted(machine.cores, 'core')}"
     return "the usual number"
+
+
+def _apart(envs: int, sizes: Sizes, learning: Learning) -> Sizes:
+    """The sizes with another number of env copies, each in a worker and a lane of its own."""
+    steps = learning.steps(envs)
+    return msgspec.structs.replace(sizes, workers=envs, envs=envs, lanes=envs, rollout_steps=steps)
+
+
+def _hardly_faster(sizes: Sizes, more: Sizes, situation: Situation, rate: Rate) -> str:
+    """Why the larger sizes `more` weren't chosen. Updates or cores are the reason if `more` would be faster without it."""
+    without = {
+        "because of the updates": msgspec.structs.replace(
+            situation, overheads=msgspec.structs.replace(situation.overheads, update_s=0.0)
+        ),
+        "because the cores are busy": msgspec.structs.replace(
+            situation, machine=msgspec.structs.replace(situation.machine, cores=situation.machine.cores + more.workers)
+        ),
+    }
+    said = "more would hardly be faster"
+    because = [why for why, other in without.items() if AS_GOOD * rate(more, other) > rate(sizes, other)]
+    return f"{said}, {because[0]}" if because else said
 
 
 def _why_lanes(sizes: Sizes, measured: Measurements) -> str:
@@ -312,11 +376,11 @@ def _why_lanes(sizes: Sizes, measured: Measurements) -> str:
     return "no copy waits for another one within a rollout" + (", and their times are uneven" if uneven else "")
 
 
-def _why_lag(sizes: Sizes, rate: Callable[[Sizes], float]) -> str:
+def _why_lag(sizes: Sizes, situation: Situation, rate: Rate) -> str:
     lag = sizes.max_lag
-    here = number_in_words(rate(sizes))
+    here = number_in_words(rate(sizes, situation))
     if lag == 0:
-        other = number_in_words(rate(msgspec.structs.replace(sizes, max_lag=1)))
+        other = number_in_words(rate(msgspec.structs.replace(sizes, max_lag=1), situation))
         return f"all rollouts are of the newest policy; with 1, {other} env steps/s in place of {here} are expected"
-    other = number_in_words(rate(msgspec.structs.replace(sizes, max_lag=lag - 1)))
+    other = number_in_words(rate(msgspec.structs.replace(sizes, max_lag=lag - 1), situation))
     return f"workers collect while the learner updates; with {lag - 1}, {other} env steps/s in place of {here} are expected"

@@ -124,21 +124,28 @@ class Tries(NamedTuple):
         return self.size.copies == 2 if self.show_a_limit else self.size.each > 1
 
     @property
-    def finding(self) -> str:
-        """Why this number of copies could not be measured, as one line; empty if it was."""
+    def were_cut_off(self) -> bool:
+        """Whether this number of copies could not be measured because the time was up."""
+        return not (self.worked or self.show_a_limit) and self.sessions[-1].is_too_slow
+
+    def finding(self, enough_s: float) -> str:
+        """Why this number of copies could not be measured, as one line; empty if it was.
+
+        `enough_s`: about how long a plan has to take so that all numbers of copies can be measured.
+        """
         copies = _copies(self.size)
         last = self.sessions[-1]
         if self.show_a_limit and self.size.copies > 1:
             failed = self.failed
             tries = f"in all {len(failed)} tries" if len(failed) > 1 else "there was no time for a second try"
             return f"{copies}: {failed[-1].wrong} ({tries}); {OF_ITS_OWN}"
-        if self.worked or not last.is_too_slow:
+        if not self.were_cut_off:
             return ""
         if self.size.copies == 1:
-            why = "the time was up before another one returned"
-            return f"one copy, after {last.calls} calls: {why}; unless it hangs, {MORE_TIME}"
+            why = "the time was up before another one returned, so no more copies were tried"
+            return f"one copy, after {last.calls} calls: {why}; unless it hangs, {MORE_TIME} {enough_s:.0f}"
         why = "the time was up before all had taken a few steps"
-        return f"{copies} were not measured, because {why}; unless they hang, {MORE_TIME}"
+        return f"{copies} were not measured, because {why}; unless they hang, {MORE_TIME} {enough_s:.0f}"
 
 
 def hangs(now_s: float, called_s: float, deadline_s: float, slowest_s: float) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from millrace.planning.measurements import Machine
-from millrace.planning.probe_sizes import COPIES_OF_SHORT, OF_MEMORY, most_each, numbers_of_workers, two_fit
+from millrace.planning.probe_sizes import COPIES_OF_SHORT, OF_MEMORY, enough_s, most_each, numbers_of_workers, two_fit
 from tests.millrace.planning.made_up import measured
 
 GB = 1 << 30
@@ -35,3 +35,12 @@ def test_small_copies_are_stepped_several_in_a_worker_on_each_core() -> None:
     assert two_fit(found, machine)
     assert [*numbers_of_workers(found, machine, COPIES_OF_SHORT)] == [8]
     assert most_each(found, Machine(cores=8, most_copies=24)) == 3
+
+
+def test_enough_time_is_that_of_all_sessions_one_after_another() -> None:
+    """One copy, 8, 32 and 64 workers, and two copies that take turns in a worker; 64 workers start on 8 cores."""
+    found = measured(wait_s=20.0, start_s=3.0, reset_s=60.0)
+    assert [*numbers_of_workers(found, Machine(cores=8), 1)] == [8, 32, 64]
+    assert enough_s(found, Machine(cores=8), 1, steps=9) == pytest.approx(
+        6 * (60 + 9 * 20) + 3 * (1 + 1 + 4 + 8 + 1), rel=1e-4
+    )

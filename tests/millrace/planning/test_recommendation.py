@@ -17,7 +17,7 @@ from millrace.learner.config.validation import check_copies
 from millrace.learner.members.failure_count import FailureCount
 from millrace.planning.allowed_copies import AllowedCopies
 from millrace.planning.expected_rate import Sizes
-from millrace.planning.measurements import ActionKind, Machine, Overheads
+from millrace.planning.measurements import ActionKind, Machine, Measurements, Overheads
 from millrace.planning.recommendation import (
     ChosenSetting,
     Learning,
@@ -100,7 +100,7 @@ def test_after_a_failure_a_run_needs_no_more_copies_than_have_worked_even_when_i
     allowed = AllowedCopies.of(0, 0).after(found)
     where = situation(found, machine=Machine(cores=32, free_bytes=64 << 30, most_copies=allowed.training))
     sizes = chosen(where, learning)
-    settings = (*reasons(sizes, learning, where, lambda sizes: rate(sizes, where)), *allowed.settings)
+    settings = (*reasons(sizes, learning, where, rate), *allowed.settings)
     values: dict[str, Any] = {each.name: each.value for each in settings}
     config = resolve("CartPole-v1", algo="ppo", **values)
     check_copies(config, "worked", worked)
@@ -143,7 +143,7 @@ def test_if_several_copies_failed_in_one_worker_each_copy_that_trains_has_a_work
     sizes = chosen(where, learning)
     assert sizes.workers == sizes.lanes == sizes.envs > 1
     assert sizes.workers <= cores
-    settings = (*reasons(sizes, learning, where, lambda sizes: rate(sizes, where)), *allowed.settings)
+    settings = (*reasons(sizes, learning, where, rate), *allowed.settings)
     values = {each.name: each.value for each in settings}
     assert values["eval_copies"] == 1
     assert "worker of its own" in {each.name: each.why for each in settings}["workers"]
@@ -196,8 +196,79 @@ def test_steps_that_wait_get_a_worker_for_each_lane_even_if_updates_take_most_of
     where = situation(measured(wait_s=0.05), msgspec.structs.replace(OVERHEADS, update_s=update_s))
     found = chosen(where, learning)
     assert (found.workers, found.envs, found.lanes) == (8, 8, 8)
-    why = {each.name: each.why for each in reasons(found, learning, where, lambda sizes: rate(sizes, where))}
+    why = {each.name: each.why for each in reasons(found, learning, where, rate)}
     assert "each copy waits in a worker of its own" in why["workers"]
+
+
+@pytest.mark.parametrize(
+    ("found", "machine", "workers", "envs"),
+    [
+        (
+            measured(wait_s=20.0, tried=1, no_more="time"),
+            Machine(cores=8),
+            (1, "a step waits for 100% of its time, so each copy waits in a worker of its own"),
+            (1, "the time was up before more of them could be tried side by side"),
+        ),
+        (
+            measured(wait_s=0.05, cpu_s=0.001, tried=4, no_more="no faster"),
+            Machine(cores=2),
+            (4, "a step waits for 98% of its time, so each copy waits in a worker of its own"),
+            (4, "more of them were tried side by side, and were hardly faster; 4 made 4.0 times the env steps of one"),
+        ),
+        (
+            measured(wait_s=0.02, cpu_s=0.01),
+            Machine(cores=1),
+            (8, "a step waits for 67% of its time, so each copy waits in a worker of its own"),
+            (8, "more would hardly be faster, because the cores are busy"),
+        ),
+        (
+            measured(cpu_s=0.05, tried=7),
+            Machine(cores=64, most_copies=7),
+            (7, "a step computes for 100% of its time, so each copy has a worker of its own"),
+            (7, "at most 7 copies may train here"),
+        ),
+        (
+            measured(cpu_s=0.05, tried=16),
+            Machine(cores=16),
+            (16, "a step computes for 100% of its time, so there is one for each core"),
+            (16, "the usual number, 8, rounded up to a multiple of the 16 cores"),
+        ),
+        (
+            measured(cpu_s=0.05, tried=96),
+            Machine(cores=96),
+            (64, "a step computes for 100% of its time, so each copy has a worker of its own"),
+            (64, "a plan recommends at most 64 copies of an environment that computes"),
+        ),
+        (
+            measured(cpu_s=0.05, tried=4),
+            Machine(cores=4),
+            (4, "a step computes for 100% of its time, so there is one for each core"),
+            (8, "the usual number"),
+        ),
+        (
+            measured(cpu_s=0.05, tried=2, worker_bytes=4 << 30),
+            Machine(cores=8, free_bytes=12 << 30),
+            (2, "a step computes for 100% of its time, so each copy has a worker of its own"),
+            (2, "a copy takes 4,046 MB, and no more of them fit into the memory"),
+        ),
+    ],
+)
+def test_workers_and_copies_have_the_limit_that_binds_as_their_reason(
+    found: Measurements, machine: Machine, workers: tuple[int, str], envs: tuple[int, str]
+) -> None:
+    quick = msgspec.structs.replace(OVERHEADS, update_s=1e-6)
+    where = situation(found, quick, machine)
+    why = {each.name: (each.value, each.why) for each in reasons(chosen(where), PPO, where, rate)}
+    assert (why["workers"], why["envs"]) == (workers, envs)
+
+
+def test_updates_are_the_reason_for_few_workers_only_if_more_would_be_faster_without_them() -> None:
+    for cpu_s, of_step in itertools.product((1e-5, 1e-4, 1e-3, 1e-2), (0.0, 0.1, 100.0)):
+        overheads = msgspec.structs.replace(OVERHEADS, update_s=of_step * cpu_s)
+        where = situation(measured(cpu_s=cpu_s, tried=4), overheads, Machine(cores=4))
+        sizes = chosen(where)
+        why = {each.name: each.why for each in reasons(sizes, PPO, where, rate)}["workers"]
+        assert (sizes.workers, why.endswith("because of the updates")) == ((1, True) if of_step == 100.0 else (4, False))
 
 
 def test_lag_is_chosen_only_if_it_is_faster() -> None:
@@ -328,7 +399,7 @@ def test_what_sets_the_number_of_copies_is_said() -> None:
 def test_each_setting_has_a_reason_and_the_command_is_one_that_train_takes(wait_s: float, learning: Learning) -> None:
     where = situation(measured(wait_s=wait_s))
     found = chosen(where, learning)
-    settings = (ChosenSetting("algo", "ppo", "because"), *reasons(found, learning, where, lambda sizes: rate(sizes, where)))
+    settings = (ChosenSetting("algo", "ppo", "because"), *reasons(found, learning, where, rate))
     assert all(each.why and "\n" not in each.why for each in settings)
     env_kwargs: dict[str, Scalar] = {
         "render_mode": "rgb array",

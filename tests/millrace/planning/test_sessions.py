@@ -14,6 +14,7 @@ from millrace.planning.stopwatch import CopyTimes
 
 CRASH = "worker w0 was killed"
 STEP_S, RESET_S = 0.5, 7.0
+ENOUGH_S = 1620.0
 
 
 def session(workers: int, steps: int, wrong: str = "", *, each: int = 1, cut_off: bool = False) -> SteppedCopies:
@@ -33,7 +34,8 @@ def test_copies_that_cannot_even_begin_failed_because_of_their_number(copies: in
     tries = Tries((session(copies, 0, CRASH),) * 3, ALONE)
     assert tries.show_a_limit
     assert not tries.worked
-    assert tries.finding.startswith(f"{copies} copies side by side: {CRASH} (in all 3 tries); if a copy needs a port")
+    failed = f"{copies} copies side by side: {CRASH} (in all 3 tries)"
+    assert tries.finding(ENOUGH_S).startswith(f"{failed}; if a copy needs a port")
     assert Failures.of([Tries((ALONE,), None), tries]) == ((), 81, 0.0)
 
 
@@ -43,7 +45,7 @@ def test_if_there_is_one_more_try_and_it_works_the_number_of_copies_is_no_limit(
     assert tries.worked
     assert not tries.show_a_limit
     assert tries.longest.wrong == ""
-    assert tries.finding == ""
+    assert tries.finding(ENOUGH_S) == ""
     assert len(Failures.of([tries]).sessions) == failed
 
 
@@ -51,7 +53,7 @@ def test_if_there_is_one_more_try_and_it_works_the_number_of_copies_is_no_limit(
 def test_crashes_that_are_about_as_frequent_as_they_may_be_with_one_copy_limit_nothing(copies: int, steps: int) -> None:
     tries = Tries((session(copies, steps, CRASH),), ALONE)
     assert tries.worked
-    assert tries.finding == ""
+    assert tries.finding(ENOUGH_S) == ""
     failures = Failures.of([Tries((ALONE,), None), tries])
     calls = 81 + copies * (steps + 1)
     assert (failures.sessions, failures.calls) == ((tries.longest,), calls)
@@ -86,14 +88,16 @@ def test_a_call_hangs_only_if_it_takes_half_of_the_time_that_was_left_and_much_l
 def test_if_there_is_no_time_for_a_second_try_the_finding_says_so() -> None:
     tries = Tries((session(4, 0, CRASH), session(4, 0, cut_off=True)), ALONE)
     assert tries.show_a_limit
-    assert "(there was no time for a second try)" in tries.finding
+    assert "(there was no time for a second try)" in tries.finding(ENOUGH_S)
 
 
 def test_copies_for_which_the_time_is_up_neither_worked_nor_failed() -> None:
     tries = Tries((session(4, 1, cut_off=True),), ALONE)
     assert not tries.show_a_limit
     assert not tries.worked
-    assert tries.finding.startswith("4 copies side by side were not measured")
+    assert tries.were_cut_off
+    assert tries.finding(ENOUGH_S).startswith("4 copies side by side were not measured")
+    assert tries.finding(ENOUGH_S).endswith("allow more time with --seconds 1620")
     assert Failures.of([tries]).finding == ""
 
 

@@ -333,6 +333,8 @@ def test_if_steps_take_so_long_that_only_one_copy_is_measured_a_line_says_so() -
     measured = probe(ProbedEnv(Slow, {"step_s": 1.0}, ()), Machine(cores=2), seconds=2 * BRIEF_S).measured
     reported = [match[1] for line in measured.findings if (match := re.fullmatch(rf"2 {NOT_MEASURED}", line))]
     assert reported == ["side by side"] * (2 - measured.copies_worked) + ["in one worker"]
+    assert measured.no_more == "time"
+    assert all(re.search(r"--seconds \d+$", line) for line in measured.findings)
 
 
 class FewInEachProcess(gymnasium.Env[Any, Any]):
