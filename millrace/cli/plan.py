@@ -18,8 +18,8 @@ from millrace.protocol.env_spec import Scalar
 
 
 class PlanFlags(msgspec.Struct, frozen=True, kw_only=True):
-    """Measure an environment on this machine, which takes about a minute, then say what to choose and what to expect, with
-    reasons.
+    """Measure an environment on this machine for about as long as --seconds, then say what to choose and what to expect,
+    with reasons.
     """
 
     env: Annotated[str, Flag(positional=True)]

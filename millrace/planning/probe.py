@@ -82,8 +82,7 @@ def probe(env: ProbedEnv, machine: Machine, seconds: float) -> Probed:
     alone = _tries(env, SessionSize(), OF_ALONE * seconds, end_s)
     first = alone.longest
     if not first.times or not len(first.times[0].steps):
-        why = first.wrong or "the start of a copy, a reset or a step takes longer"
-        raise RunError(f"plan: {env.name}: no step could be made within {seconds:g} s: {why}")
+        raise RunError(f"plan: {env.name}: {_why_no_step(first.wrong, seconds / OF_PROBE)}")
     tried = [alone]
     measured = _measured_alone(env, first)
     each = 1
@@ -115,6 +114,17 @@ def probe(env: ProbedEnv, machine: Machine, seconds: float) -> Probed:
     findings = [Failures.of(tried).finding, *(tries.finding(math.ceil(again_s / 60) * 60) for tries in tried)]
     measured = msgspec.structs.replace(measured, findings=tuple(filter(None, findings)))
     return Probed(measured, first.observation_space, first.action_space, first.seats)
+
+
+def _why_no_step(wrong: str, plan_s: float) -> str:
+    """Why a plan that was to take `plan_s` could not make a step, and what to do unless something was wrong."""
+    if wrong:
+        return f"no step could be made: {wrong}"
+    why = "the start of a copy, a reset or a step takes longer"
+    return (
+        f"no step could be made in the {plan_s * OF_PROBE:g} s that a plan with --seconds {plan_s:g} has for steps: {why}; "
+        f"unless it hangs, {MORE_TIME} {4 * plan_s:g}"
+    )
 
 
 # ------------------------------------------------------------------------------------------------------------ one session
