@@ -11,9 +11,9 @@ from millrace.arguments import checked
 from millrace.learner.config.config import Config
 from millrace.learner.config.hyperparameters import OffPolicyConfig
 from millrace.learner.config.layers import resolve
+from millrace.planning.advice import about_measurements
 from millrace.planning.allowed_copies import AllowedCopies
 from millrace.planning.expected_rate import Situation, Sizes, steps_per_s
-from millrace.planning.in_words import counted, number_in_words, time_in_words
 from millrace.planning.measurements import Machine
 from millrace.planning.overheads import StoodFor, overheads
 from millrace.planning.probe import OF_PROBE, ProbedEnv, probe
@@ -45,9 +45,6 @@ from millrace.workers.machine_slots import copies_per_machine
 SECONDS = 30.0
 LEAST_S = 5.0
 MACHINES = (1, 2, 10)
-BUSY = 0.5  # if the load average per core is above this, the machine counts as busy
-RESETS_COUNT = 1.1  # resets in the background are advised if they make a run faster by at least this factor
-SLOW_START_S = 10.0
 
 
 @checked
@@ -146,7 +143,7 @@ def _decided(
         chosen.append(ChosenSetting("rollout_steps", sizes.rollout_steps, why_rollout_steps(sizes, learning)))
     chosen += others
     needed = NEEDED_STEPS[config.algo]
-    advice = _advice(sizes, situation)
+    advice = about_measurements(sizes, situation, _rate)
     if isinstance(config.algorithm, OffPolicyConfig):
         no_updates = msgspec.structs.replace(situation.overheads, update_s=0.0)
         before = msgspec.structs.replace(situation, overheads=no_updates)
@@ -192,56 +189,3 @@ def _expected(sizes: Sizes, learning: Learning, situation: Situation, needed: in
             )
         )
     return found
-
-
-def _advice(sizes: Sizes, situation: Situation) -> list[str]:
-    """The lines of `RunPlan.advice`."""
-    measured = situation.measured
-    machine = situation.machine
-    lines = list(measured.findings)
-    if sizes.envs > measured.copies_worked:
-        lines.append(
-            f"this command has {sizes.envs} env copies, but the plan measured at most "
-            f"{counted(measured.copies_worked, 'copy', 'copies')} at the same time: the speed of {sizes.envs} is computed, "
-            "and they may not work together"
-        )
-    if measured.copies_failed and measured.copies_worked == 1:
-        lines.append(
-            f"evaluations need a second copy, but {measured.copies_failed} did not work side by side: the evaluation of "
-            "this command fails unless a second copy works"
-        )
-    elif measured.failed_in_one_worker and measured.worked_in_one_worker == 1:
-        lines.append(
-            f"evaluations need a second copy in a worker, but {measured.failed_in_one_worker} in one worker did not work: "
-            "the evaluation of this command fails unless 2 work. If the environment allows only one copy in each process, "
-            "use OwnProcess, as in docs/how-to/named_simulators.md"
-        )
-    if machine.load > BUSY * machine.cores:
-        lines.append(
-            f"other programs use the {counted(machine.cores, 'core')} (load average {number_in_words(machine.load)}): "
-            "beside them, runs are slower than expected here"
-        )
-    if measured.deterministic is False:
-        lines.append(
-            "it isn't deterministic: the same seed and actions gave other results; so if a worker is lost, new episodes "
-            "begin, and two runs with the same seed differ"
-        )
-    if measured.wrong_masks:
-        lines.append(f"its action masks aren't as a run needs them: {measured.wrong_masks}")
-    ahead = msgspec.structs.replace(situation, resets_ahead=True)
-    faster = _rate(sizes, ahead)
-    if faster > RESETS_COUNT * _rate(sizes, situation):
-        lines.append(
-            f"resets take {time_in_words(measured.reset_s)}: with --wrappers millrace:ResetAhead, which makes them in the "
-            f"background, {number_in_words(faster)} env steps/s are expected; the environment must work in a second thread, "
-            "and two of them for each copy fit into the memory"
-        )
-    if measured.goals:
-        lines.append(
-            "its observations have goals: an algorithm with a replay buffer can learn in hindsight (--hindsight 0.8)"
-        )
-    if measured.start_s > SLOW_START_S:
-        lines.append(
-            f"a worker with a copy takes {time_in_words(measured.start_s)} to start: after this time a lost one is replaced"
-        )
-    return lines

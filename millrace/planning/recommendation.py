@@ -139,9 +139,8 @@ def choose_algorithm(measured: Measurements, machine: Machine) -> ChosenSetting:
             "algo", "ppo", f"{takes}; below {time_in_words(slow_s)}, PPO is done sooner, although it takes more of them"
         )
     if measured.agents > 1:
-        return ChosenSetting(
-            "algo", "ppo", f"its {measured.agents} agents share a policy, which those with a replay buffer do not learn"
-        )
+        why = "but the settings of algorithms with a replay buffer were not measured with several"
+        return ChosenSetting("algo", "ppo", f"{takes}; it has {measured.agents} agents, {why}")
     match measured.action:
         case "box":
             algo = "sac" if measured.images else "xqc"

@@ -1,0 +1,18 @@
+"""What a plan says apart from its settings, by measurements that nobody made."""
+
+from __future__ import annotations
+
+from millrace.planning.advice import about_measurements
+from tests.millrace.planning.made_up import chosen, measured, rate, situation
+
+
+def lines(agents: int) -> list[str]:
+    where = situation(measured(wait_s=0.01, reset_s=5.0, episode_steps=100.0, goals=True, copies_worked=16, agents=agents))
+    return about_measurements(chosen(where), where, rate)
+
+
+def test_a_wrapper_of_gymnasium_and_hindsight_are_advised_only_for_one_agent() -> None:
+    resets, goals = lines(agents=1)
+    assert "--wrappers millrace:ResetAhead" in resets
+    assert "--hindsight" in goals
+    assert lines(agents=2) == []
