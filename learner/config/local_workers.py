@@ -6,7 +6,9 @@ the number of lanes, so a better number of lanes is only suggested. Pure, except
 
 from __future__ import annotations
 
+from millrace.learner.config.config import Config
 from millrace.learner.config.rollout_config import RolloutConfig
+from millrace.learner.config.update_size import least_rollout, rollout_with
 from millrace.protocol.machine.cpu_cores import usable_cores
 
 
@@ -27,7 +29,7 @@ def local_workers(config: RolloutConfig, cores: int | None = None) -> int:
     return enough_workers(config.lanes, most)
 
 
-def chosen_workers(config: RolloutConfig, cores: int) -> str:
+def chosen_workers(config: Config, cores: int) -> str:
     """A clause that tells the user how many workers were chosen and why; empty if the settings give the number."""
     if config.workers is not None:
         return ""
@@ -42,7 +44,7 @@ def chosen_workers(config: RolloutConfig, cores: int) -> str:
     return said
 
 
-def uneven_lanes(config: RolloutConfig) -> str:
+def uneven_lanes(config: Config) -> str:
     """A line for the user if the number of workers in the settings doesn't divide the number of lanes; otherwise empty."""
     workers = config.workers
     if workers is None or config.lanes % workers == 0:
@@ -64,7 +66,17 @@ def uneven_lanes(config: RolloutConfig) -> str:
     )
 
 
-def _envs(config: RolloutConfig, lanes: int) -> str:
-    """The `--envs` flag to use with this many lanes, if the number of env copies isn't a multiple of them; else empty."""
+def _envs(config: Config, lanes: int) -> str:
+    """The `--envs` flag to use with this many lanes, if the number of env copies isn't a multiple of them; else empty.
+
+    With it, the flag that keeps the size of an update, or the new size if it must be larger.
+    """
     envs = -(-config.envs // lanes) * lanes
-    return f" --envs {envs}" if envs != config.envs else ""
+    if envs == config.envs:
+        return ""
+    steps = config.algorithm.rollout_steps
+    size = config.envs * steps
+    kept = rollout_with(envs, size, least_rollout(config.algorithm))
+    shorter = f" --rollout-steps {kept}" if kept != steps else ""
+    larger = f" (updates of {envs * kept:,} env steps instead of {size:,})" if envs * kept > size else ""
+    return f" --envs {envs}{shorter}{larger}"

@@ -11,6 +11,7 @@ from millrace.arguments import checked
 from millrace.learner.config.config import Config
 from millrace.learner.config.hyperparameters import OffPolicyConfig
 from millrace.learner.config.layers import resolve
+from millrace.learner.config.update_size import least_rollout
 from millrace.planning.advice import about_measurements
 from millrace.planning.allowed_copies import AllowedCopies
 from millrace.planning.expected_rate import Situation, Sizes, steps_per_s
@@ -18,7 +19,6 @@ from millrace.planning.measurements import Machine
 from millrace.planning.overheads import StoodFor, overheads
 from millrace.planning.probe import OF_PROBE, ProbedEnv, probe
 from millrace.planning.recommendation import (
-    LEAST_ROLLOUT,
     NEEDED_STEPS,
     ChosenSetting,
     Learning,
@@ -134,8 +134,8 @@ def _decided(
     `others`.
     """
     default_steps = config.algorithm.rollout_steps
-    least_steps = 1 if isinstance(config.algorithm, OffPolicyConfig) else min(LEAST_ROLLOUT, default_steps)
-    learning = Learning(config.envs, default_steps, least_steps, situation.overheads.acting_bytes)
+    acting_bytes = situation.overheads.acting_bytes
+    learning = Learning(config.envs, default_steps, least_rollout(config.algorithm), acting_bytes)
 
     sizes = best({each: _rate(each, situation) for each in candidates(learning, situation.measured, situation.machine)})
     chosen = [*first, *reasons(sizes, learning, situation, _rate)]

@@ -13,13 +13,13 @@ from typing import NamedTuple
 
 import msgspec
 
+from millrace.learner.config.update_size import rollout_with
 from millrace.learner.members.failure_count import WORK_S
 from millrace.planning.expected_rate import Situation, Sizes
 from millrace.planning.in_words import counted, number_in_words, time_in_words
 from millrace.planning.measurements import WORKER_BYTES, Machine, Measurements
 
 AS_GOOD = 0.95
-LEAST_ROLLOUT = 32  # steps of a rollout in PPO: in shorter ones, advantages depend more on the critic than on rewards
 SLOW_S = 0.003  # if a step takes longer, divided by the copies at once, an algorithm with a replay buffer ends sooner
 SLOW_WITH_IMAGES_S = 0.05  # the limit if actions are continuous and observations are images
 MOST_ENVS = 64  # if a step computes rather than waits, more env copies gain little
@@ -78,11 +78,8 @@ class Learning(NamedTuple):
         return self.envs * self.rollout_steps
 
     def steps(self, envs: int) -> int:
-        """The number of steps in a rollout with this number of env copies: as many as leave the size of updates as usual.
-
-        With larger updates, an algorithm needs more env steps.
-        """
-        return max(self.least_steps, self.rows_of_update // envs)
+        """The number of steps in a rollout with this number of env copies: as many as leave the size of updates as usual."""
+        return rollout_with(envs, self.rows_of_update, self.least_steps)
 
 
 def copies_at_once(measured: Measurements, machine: Machine, acting_bytes: int = 0) -> Limit:

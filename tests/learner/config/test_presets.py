@@ -30,6 +30,11 @@ from millrace.learner.config.presets import origin
             "2,048",
         ),
         (
+            {"env": "Hopper-v5", "envs": 128},
+            "settings: preset of ppo for Hopper-v5, except envs; an update has 32,768 env steps instead of the preset's "
+            "2,048",
+        ),
+        (
             {"env": "Hopper-v5", "envs": 16, "rollout_steps": 128},
             "settings: preset of ppo for Hopper-v5, except envs, rollout_steps",
         ),
