@@ -42,7 +42,8 @@ class OwnPolicy:
 
     Each worker calls `factory(**kwargs)`, which returns such an object. `act` is called once for each step of a lane, with
     the observations of all its copies. If copies have several agents, these are the observations of all agents, including
-    those that wait or have left. `state` [N, state_size] float32 is the policy's memory, which is zero when an episode
+    those that wait or have left. If a worker continues a lane from states that the environment has saved, it calls `act`
+    once more, as a check. `state` [N, state_size] float32 is the policy's memory, which is zero when an episode
     begins. If the object stores nothing else between calls, results do not depend on the number of workers. An action
     consists of whole numbers that count from 0, or of float32 numbers, which are clipped to the space after they were
     stored. If the environment has action masks, `act` also gets `mask=` [N, choices] bool, and must choose an allowed

@@ -12,7 +12,8 @@ copies. `action` [N, *action] is stored as it is returned: whole numbers that co
 evaluations call it in place of `act`. In a run with action masks, `act` and `act_greedy` are called with `mask=`
 [N, choices] bool, which is True where a choice is allowed.
 
-Rule: `act` is called once for each lane and step, with exactly the copies of that lane. Therefore, if the policy keeps
+Rule: `act` is called once for each lane and step, with exactly the copies of that lane, and once more, before the first
+step, if the lane's saved states come from another worker (`workers/lanes/bring_back.py`). Therefore, if the policy keeps
 nothing but `state` between calls, a rollout is the same, bit for bit, whatever else the worker does.
 """
 

@@ -5,7 +5,8 @@ together. Then the copies' observations, returns and lengths are compared with t
 is not deterministic, and the copy begins a new episode, with the next start number. Replayed steps are subject to the
 environment's usual timeouts, but don't count as env steps. If an environment has saved its state, the state is loaded
 instead, and nothing is replayed. The history comes from another worker, which may be hostile, so what can't be compared is
-checked: it must be possible in the run. Otherwise the lane's next rollouts could be refused, or the policy could fail.
+checked: it must be possible in the run, and the policy must be able to act on observations that aren't replayed. Otherwise
+the lane's next rollouts could be refused, or the policy could fail.
 """
 
 from __future__ import annotations
@@ -20,8 +21,10 @@ from millrace.protocol.arrays import Array, Doubles
 from millrace.protocol.bounds import INVALID
 from millrace.protocol.envs.env_actions import action_converter_of
 from millrace.protocol.envs.seats import columns_of
+from millrace.protocol.errors import PolicyFailed
 from millrace.protocol.lane_past import LanePast
 from millrace.protocol.policy.masks import not_allowed, stored_leaves
+from millrace.protocol.policy.recurrent import is_possible
 from millrace.protocol.rows.array_checks import wrong_values
 from millrace.protocol.specs import RunSpec
 from millrace.workers.acting import RolloutActions
@@ -47,8 +50,8 @@ def bring_back(
 ) -> str:
     """Continue a lane from its history (`past`) on a new `Lane`. The copies of the new lane must not have been reset yet.
 
-    At the end, the copies have these `attributes` (packed). With seats, `actions` are the policy's for one lane; what they
-    have written is overwritten. If the history doesn't fit the lane, it is not continued, and new episodes begin instead.
+    At the end, the copies have these `attributes` (packed). `actions` are the policy's for one lane; what they have written
+    is overwritten. If the history doesn't fit the lane, it is not continued, and new episodes begin instead.
     Returns a line for the user, or an empty string if there is nothing to report. Raises `EnvironmentFailed` if a copy
     raises.
     """
@@ -59,7 +62,7 @@ def bring_back(
     memory = past.memory[:-1] if saved else past.memory
     why = ""
     if isinstance(copies, LoopedCopies) and lane.remembers and any(last.goes_on for last in past.copies):
-        if _fits(past, memory, lane, run, actions):
+        if _fits(past, memory, lane, run, actions) and (not saved or _can_act(past, memory, lane, run, actions)):
             continued = [n for n, last in enumerate(past.copies) if last.goes_on]
             states = _states(past.memory[-1], lane) if saved else []
         else:
@@ -307,4 +310,24 @@ def _held_fits(past: LanePast, held: Sequence[Array], run: RunSpec, actions: Rol
         return False
     with np.errstate(all="ignore"):
         acted = actions.columns(0)
+    return not any(wrong_values(array) for array in (acted.log_prob, *acted.extras))
+
+
+def _can_act(past: LanePast, memory: Sequence[Array], lane: Lane, run: RunSpec, actions: RolloutActions | None) -> bool:
+    """Whether the policy returns valid rows for the last observations. Nothing else checks them if states are loaded: any
+    finite numbers may come from an environment, but from some of them, the policy computes infinite ones.
+    """
+    if actions is None:
+        return True
+    state = (memory[1] if lane.state.size else lane.state).copy()
+    try:
+        with np.errstate(all="ignore"):
+            actions.act(0, [leaf[None].copy() for leaf in past.obs], state[None])
+            for array in actions.written(0):
+                array[:] = array[:1]
+            acted = actions.columns(0)
+    except PolicyFailed:
+        return False
+    if wrong_values(acted.action, run.policy.action) or not is_possible(run.policy, state):
+        return False
     return not any(wrong_values(array) for array in (acted.log_prob, *acted.extras))

@@ -20,16 +20,18 @@ from millrace.learner.rollouts.lane_history import LaneHistory
 from millrace.protocol.bounds import LARGEST
 from millrace.protocol.lane_past import EpisodeBegin
 from millrace.protocol.messages import LanePast, Permit, Rollout
+from millrace.protocol.policy.called_policy import CalledPolicy
 from millrace.protocol.rows.rollout_checks import validate
-from millrace.protocol.specs import RunSpec
+from millrace.protocol.specs import OwnPolicySpec, RunSpec
 from millrace.protocol.wire.codec import decode_to_learner, encode
-from millrace.workers.collect.collector import Collector
+from millrace.workers.collect.collector import Collector, OpenEnvCopies
 from millrace.workers.copies.saved_state import SavedCopy, packed, unpacked
 from millrace.workers.lanes.bring_back import IMPOSSIBLE
 from tests.support.in_process.collectors import (
     SESSION,
     TOY,
     VERSION,
+    bits,
     loop_over,
     no_pulse,
     random_collector,
@@ -45,17 +47,17 @@ HERS, MORE = 5, 20  # how many rollouts the hostile worker collects, and then th
 class Saves(gymnasium.Env[Any, Any]):
     """A walk that saves its place. Only the wrapper `TimeLimit` ends its episodes."""
 
-    observation_space = spaces.Box(-np.inf, np.inf, (1,))
+    observation_space = spaces.Box(-np.inf, np.inf, (8,))
     action_space = spaces.Discrete(2)
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
         super().reset(seed=seed)
         self.place = 0.0
-        return np.zeros(1, np.float32), {}
+        return np.zeros(8, np.float32), {}
 
     def step(self, action: Any) -> Any:
         self.place += float(self.np_random.normal())
-        return np.array([self.place], np.float32), 1.0, False, False, {}
+        return np.full(8, self.place, np.float32), 1.0, False, False, {}
 
     def save_state(self) -> bytes:
         return struct.pack("d", self.place)
@@ -68,6 +70,10 @@ def saving() -> Any:
     return TimeLimit(Saves(), 30)
 
 
+def with_policy(run: RunSpec, **changed: Any) -> RunSpec:
+    return replace(run, policy=replace(run.policy, **changed))
+
+
 RUNS: dict[str, Callable[[], RunSpec]] = {
     "plain": lambda: run_of("CartPole-v1", T, 2),
     "over": lambda: run_of(f"{TOY}Identity-v0", 10 // HERS, 2),  # all its episodes have 10 steps
@@ -75,7 +81,24 @@ RUNS: dict[str, Callable[[], RunSpec]] = {
     "gru": lambda: run_of("CartPole-v1", T, 2, core="gru", core_size=5),
     "seats": lambda: seated_run(MaskedGame, T, 2, core="gru", core_size=3),
     "saves": lambda: replace(run_around(saving(), T), copies=2),
+    "saves, relu": lambda: with_policy(RUNS["saves"](), activation="relu"),
+    "saves, own": lambda: with_own_policy(RUNS["saves"]()),
+    "saves, gru": lambda: with_policy(RUNS["saves"](), activation="relu", core="gru", core_size=5),
 }
+
+
+class Cautious:
+    """A policy of the user's own, which raises if observations are large."""
+
+    def act(self, obs: Any, state: Any, rng: np.random.Generator) -> Any:
+        assert np.abs(obs).max() < 1e30
+        return rng.integers(2, size=len(obs)), state, {}
+
+
+def with_own_policy(run: RunSpec) -> RunSpec:
+    return with_policy(run, own=OwnPolicySpec(f"{__name__}:Cautious", ()))
+
+
 Lie = Callable[[Rollout], dict[str, Any]]
 
 
@@ -102,6 +125,13 @@ def nested(rollout: Rollout) -> dict[str, Any]:
     """More levels of lists than can be decoded, after the three fields of a state."""
     deep = b"\x91\x94\xc4\x00\xc0\x90" + b"\x91" * 100_000 + b"\x90"
     return {"memory": (*rollout.memory[:-1], np.frombuffer(deep, np.uint8))}
+
+
+def large_observation(rollout: Rollout) -> dict[str, Any]:
+    """In the last row, finite numbers from which a policy computes infinite ones."""
+    obs = rollout.obs[0].copy()
+    obs[-1] = np.resize([3e38, -3e38], 8)
+    return {"obs": (obs,)}
 
 
 def forbidden(rollout: Rollout) -> dict[str, Any]:
@@ -151,12 +181,20 @@ CASES: dict[str, tuple[str, Lie, str]] = {
         states(lambda each: replace(each, elapsed=each.elapsed * 2)),
         "load_state raised ValueError",
     ),
+    "an observation from which the policy can act": ("saves", large_observation, NO_LINE),
+    "a large observation": ("saves, relu", large_observation, IMPOSSIBLE),
+    "a large observation of a user's policy": ("saves, own", large_observation, IMPOSSIBLE),
+    "a large observation with a core": ("saves, gru", large_observation, NO_LINE),
     "a generator": ("saves", states(lambda each: replace(each, random=bytes(5))), NO_LINE),
 }
 
 
 def last_starts(rollout: Rollout) -> tuple[EpisodeBegin, ...]:
     return tuple(EpisodeBegin(n, LARGEST // 2 + rollout.ticket, None) for n in range(2))
+
+
+def own_collector(run: RunSpec, open_copies: OpenEnvCopies) -> Collector:
+    return Collector(run, CalledPolicy(run.policy, ()), open_copies)
 
 
 def collected(collector: Collector, run: RunSpec, number: int, past: LanePast | None = None) -> Rollout:
@@ -176,8 +214,9 @@ def accepted(rollout: Rollout, run: RunSpec, number: int) -> None:
 def test_the_next_owner_is_not_harmed(case: str) -> None:
     kind, lie, line = CASES[case]
     run = RUNS[kind]()
-    made = (loop_over([saving] * 2),) if kind == "saves" else ()
-    hostile, honest = (random_collector(run, *made) for _ in range(2))
+    collector_of = own_collector if run.policy.own else random_collector
+    made = (loop_over([saving] * 2),) if kind.startswith("saves") else ()
+    hostile, honest = (collector_of(run, *made) for _ in range(2))
     history = LaneHistory.of_nothing(run.copies, 10_000)
     for number in range(HERS):
         rollout = collected(hostile, run, number)
@@ -189,12 +228,25 @@ def test_the_next_owner_is_not_harmed(case: str) -> None:
         rollout = collected(honest, run, number, history.past(0))
         accepted(rollout, run, number)
         assert all(episode.reward < 1_000 and episode.seconds < 1_000 for episode in rollout.episodes)
-        if kind == "saves":
+        if kind.startswith("saves"):
             assert {episode.length for episode in rollout.episodes} <= {30}
         ended += len(rollout.episodes)
         if number == HERS:
             assert (line in honest.note) if line else not honest.note
     assert ended
+
+
+@pytest.mark.parametrize("kind", [kind for kind in RUNS if kind.startswith("saves")])
+def test_a_lane_from_saved_states_continues_with_the_same_bits_as_if_it_had_not_moved(kind: str) -> None:
+    run = RUNS[kind]()
+    collector_of = own_collector if run.policy.own else random_collector
+    stays, leaves, comes = (collector_of(run, loop_over([saving] * 2)) for _ in range(3))
+    history = LaneHistory.of_nothing(run.copies, 10_000)
+    for number in range(HERS):
+        collected(stays, run, number)
+        history.add(collected(leaves, run, number), b"")
+    for number in range(HERS, HERS + MORE):
+        assert bits(collected(comes, run, number, history.past(0))) == bits(collected(stays, run, number))
 
 
 def test_what_seats_that_do_not_act_repeat_is_checked_even_if_every_episode_is_over() -> None:
