@@ -332,8 +332,10 @@ def _why_envs(sizes: Sizes, learning: Learning, situation: Situation, rate: Rate
         return _hardly_faster(sizes, _apart(at_once.number, sizes, learning), situation, rate)
     least = _least_envs(machine, learning)
     if sizes.envs > least:
-        fewest = msgspec.structs.replace(sizes, envs=least, lanes=least, rollout_steps=learning.steps(least))
-        here, fewer = (number_in_words(rate(each, situation)) for each in (sizes, fewest))
+        fewest = msgspec.structs.replace(sizes, envs=least, rollout_steps=learning.steps(least))
+        in_lanes = [msgspec.structs.replace(fewest, lanes=n) for n in (_lanes_for(sizes.workers, least), least)]
+        fewer = number_in_words(max(rate(each, situation) for each in in_lanes))
+        here = number_in_words(rate(sizes, situation))
         return f"a worker steps several copies at a time; with {least}, {fewer} env steps/s in place of {here} are expected"
     most = _most_envs(measured, machine, learning, at_once.number)
     if sizes.envs == most.number < least:

@@ -17,6 +17,7 @@ from millrace.learner.config.validation import check_copies
 from millrace.learner.members.failure_count import FailureCount
 from millrace.planning.allowed_copies import AllowedCopies
 from millrace.planning.expected_rate import Sizes
+from millrace.planning.in_words import number_in_words
 from millrace.planning.measurements import ActionKind, Machine, Measurements, Overheads
 from millrace.planning.recommendation import (
     ChosenSetting,
@@ -260,6 +261,16 @@ def test_workers_and_copies_have_the_limit_that_binds_as_their_reason(
     where = situation(found, quick, machine)
     why = {each.name: (each.value, each.why) for each in reasons(chosen(where), PPO, where, rate)}
     assert (why["workers"], why["envs"]) == (workers, envs)
+
+
+def test_more_copies_than_usual_are_compared_with_the_best_run_of_the_usual_number() -> None:
+    quick = msgspec.structs.replace(OVERHEADS, update_s=1e-6)
+    where = situation(measured(cpu_s=1e-5, tried=2), quick)
+    sizes = chosen(where)
+    assert (sizes.envs, sizes.lanes) == (64, 2)
+    usual = msgspec.structs.replace(sizes, envs=8, rollout_steps=PPO.steps(8))
+    why = {each.name: each.why for each in reasons(sizes, PPO, where, rate)}["envs"]
+    assert f"with 8, {number_in_words(rate(usual, where))} env steps/s in place of" in why
 
 
 def test_updates_are_the_reason_for_few_workers_only_if_more_would_be_faster_without_them() -> None:
