@@ -133,7 +133,7 @@ class OrderCoordinator(Coordinator):
         """Give a lane an order, for `send_waiting` to send. It replaces an order whose answer nobody wants."""
         record = self.lanes[lane]
         if isinstance(record.order, SentOrder) and (member := self.owner(lane)) is not None:
-            del member.tickets[record.order.order.ticket]
+            member.tickets.pop(record.order.order.ticket, None)  # an interrupt may have left an order without its ticket
         record.order = WaitingOrder(make_order, now)
 
     def send_waiting(self, lanes: Iterable[int], now: float, patience_s: float) -> list[Outgoing]:

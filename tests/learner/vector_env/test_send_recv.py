@@ -19,7 +19,7 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 import millrace
-from millrace.learner.vector_env import calls, send_recv, sent_lanes, shared_steps, step_hub
+from millrace.learner.vector_env import calls, order_coordinator, send_recv, sent_lanes, shared_steps, step_hub
 from millrace.learner.vector_env import env as env_module
 from millrace.learner.vector_env.batch_layout import BatchLayout
 from millrace.learner.vector_env.env import ZmqVectorEnv
@@ -1103,7 +1103,8 @@ def interrupted(call: Callable[[], object], at: int) -> bool:
     return False
 
 
-FILES = {module.__file__ for module in (calls, env_module, send_recv, sent_lanes, step_hub, shared_steps)}
+CALLER_SIDE = calls, env_module, order_coordinator, send_recv, sent_lanes, step_hub, shared_steps
+FILES = {module.__file__ for module in CALLER_SIDE}
 
 
 def step_in_two_calls(env: ZmqVectorEnv) -> None:

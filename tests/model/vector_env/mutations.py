@@ -36,7 +36,7 @@ MUTATIONS = {
     "an answer leaves its order open": Mutation(None, COORDINATOR, "del member.tickets[message.ticket]", "pass"),
     "an order that was sent waits on": Mutation(None, COORDINATOR, "lane.order = SentOrder(order)", "pass"),
     "an order that was replaced stays with its worker": Mutation(
-        None, COORDINATOR, "del member.tickets[record.order.order.ticket]", "pass"
+        None, COORDINATOR, "member.tickets.pop(record.order.order.ticket, None)", "pass"
     ),
     "a lane is stepped before its loss is reported": Mutation(None, SEND_RECV, "if lane in unreported:", "if False:"),
     "new copies are stepped before they are reset": Mutation(None, SEND_RECV, "if lane in awaiting_reset:", "if False:"),
