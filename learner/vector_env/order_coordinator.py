@@ -77,9 +77,13 @@ class OrderedLane(PlacedLane):
     """The newest infos of a step through shared memory that arrived as a message, because they were too long."""
 
     @property
-    def is_ordered(self) -> bool:
-        """Whether the lane has an order that waits for a worker, or for its answer."""
-        return self.order is not None and not isinstance(self.order, AnsweredOrder)
+    def is_awaited(self) -> bool:
+        """Whether the caller wants the answer to an order that waits for a worker, or that the worker has not answered."""
+        match self.order:
+            case SentOrder(wanted=wanted):
+                return wanted
+            case waiting:
+                return isinstance(waiting, WaitingOrder)
 
     def restart(self) -> None:
         """Record that the lane left its worker. Its next incarnation has new env copies."""

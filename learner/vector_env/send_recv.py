@@ -354,7 +354,7 @@ class SendRecv:
         self._lost_lanes.add(self._hub.coordinator.take_lost())
         unreported = self._lost_lanes.unreported
         under_way = sent.under_way if unreported else ()
-        for lane in [lane for lane in unreported if lane in under_way and not self._hub.is_ordered(lane)]:
+        for lane in [lane for lane in unreported if lane in under_way and not self._hub.is_awaited(lane)]:
             copies = self._layout.copies(lane)
             asked = sent.sent[lane].asked
             match after_loss(sent.sent[lane], self._autoreset, self._on_worker_loss):

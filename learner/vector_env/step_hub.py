@@ -137,10 +137,12 @@ class StepHub:
             return bytes(arrived.infos.data)
         return None if record.started else b""  # if its worker is gone, `OrderCoordinator.take_lost` returns the lane
 
-    def is_ordered(self, lane: int) -> bool:
-        """Whether the lane has an order that waits for a worker or for its answer, or a step through shared memory."""
+    def is_awaited(self, lane: int) -> bool:
+        """Whether the caller wants the result of an order to the lane that has no result yet: a message, or a step through
+        shared memory.
+        """
         shared = self.shared
-        return self.coordinator.lanes[lane].is_ordered or (shared is not None and lane in shared.under_way)
+        return self.coordinator.lanes[lane].is_awaited or (shared is not None and lane in shared.under_way)
 
     def forget(self, lanes: Iterable[int]) -> None:
         """Forget the last orders of these lanes, because their results are no longer wanted."""

@@ -35,6 +35,7 @@ SMALL: list[Conversation] = [
     Evaluating(workers=1, lanes=1, updates=1, faults=1, evaluated=(0, 1), evaluators=0),
     Stepping(workers=1, lanes=1, calls=("reset", "step", "call", "step"), faults=1),
     Stepping(workers=1, lanes=1, calls=("reset", "interrupted reset", "reset", "step"), faults=1),
+    Stepping(workers=1, lanes=1, calls=("reset", "abandoned reset", "step"), faults=1),
 ]
 LARGE: list[Conversation] = [
     Training(workers=2, lanes=1, updates=2, faults=2),

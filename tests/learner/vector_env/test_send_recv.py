@@ -847,6 +847,23 @@ def test_a_loss_is_reported_if_its_reset_was_interrupted_while_it_waited_for_ano
         assert (reward.tolist(), truncated.tolist()) == ([0.0, 1.0], [True, False])
 
 
+@BOTH_WAYS
+def test_a_step_reports_a_loss_at_once_although_the_worker_still_executes_the_reset_that_was_interrupted(
+    shared: bool,
+) -> None:
+    with one_lost_copy_of_two(shared=shared, timeout_s=10.0) as (env, link):
+        link.frozen = {"w2"}  # its simulator starts slowly
+        with interrupted_after(env, lambda: None, lambda: None):
+            env.reset(seed=2)
+        began_s = link.now
+        _, reward, _, truncated, _ = env.step(zeros([0, 1]))
+        assert (reward.tolist(), truncated.tolist()) == ([0.0, 1.0], [True, False])
+        assert link.now - began_s < 1.0
+        link.frozen = set()
+        observation, _, _, truncated, _ = env.step(zeros([0, 1]))
+        assert (observation[0].tolist(), truncated.tolist()) == ([1.0], [False, False]), "w2 still has the lane"
+
+
 @pytest.mark.parametrize("why", ["interrupt", "another loss"])
 def test_with_raise_it_is_raised_if_its_reset_was_not_returned(why: str) -> None:
     with one_lost_copy_of_two(on_worker_loss="raise") as (env, link):

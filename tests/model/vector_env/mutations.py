@@ -38,6 +38,9 @@ MUTATIONS = {
     "an order that was replaced stays with its worker": Mutation(
         None, COORDINATOR, "member.tickets.pop(record.order.order.ticket, None)", "pass"
     ),
+    "a loss is reported only after the answer to an earlier order": Mutation(
+        None, COORDINATOR, "return wanted", "return True"
+    ),
     "a lane is stepped before its loss is reported": Mutation(None, SEND_RECV, "if lane in unreported:", "if False:"),
     "new copies are stepped before they are reset": Mutation(None, SEND_RECV, "if lane in awaiting_reset:", "if False:"),
     "a reset that lost its worker is not sent again": Mutation(
@@ -74,6 +77,7 @@ def runs() -> list[Conversation]:
         Stepping(workers=2, lanes=1, calls=("reset", "step", "step"), faults=1),
         Stepping(workers=1, lanes=1, calls=("reset", "step"), faults=2),
         Stepping(workers=1, lanes=1, calls=("reset", "interrupted reset", "reset", "step"), faults=1),
+        Stepping(workers=1, lanes=1, calls=("reset", "abandoned reset", "step"), faults=1),
     ]
 
 

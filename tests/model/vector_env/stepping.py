@@ -31,7 +31,7 @@ class Stepping:
     workers: int
     lanes: int
     calls: tuple[str, ...]
-    """each "reset", "interrupted reset" (a reset must follow), "step" or "call" """
+    """each "reset", "interrupted reset" (a reset must follow), "abandoned reset" (after an error), "step" or "call" """
     faults: int
     only: tuple[str, ...] = ()
     few_losses = False
