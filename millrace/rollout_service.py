@@ -173,7 +173,7 @@ class RolloutService:
         if restore is not None:
             state, self.restored = read(Path(restore))
             past = state.rollouts
-            self._version = max(state.version - 1, -1)
+            self._version = state.version - 1
             self.env_steps = state.env_steps
         self.config: RolloutConfig = config
         """All settings of the service."""
@@ -354,12 +354,13 @@ class RolloutService:
         0
         """
         self._check_open()
+        newest = self._version if self._published else self._version + 1  # a restored service publishes this version first
         with self._lock:
-            rollouts = self._hub.past()
+            rollouts = self._hub.past(newest)
         state = ServiceState(
             env=self.run.env.id,
             policy=digest(self.run.policy),
-            version=self._version,
+            version=newest,
             env_steps=self.env_steps,
             rollouts=rollouts,
             normalizer=None if self._normalizer is None else self._normalizer.state(),

@@ -7,18 +7,17 @@ import os
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import msgspec
 import numpy as np
-from msgspec import Meta
 
 from millrace.learner.rollouts.ledger import Past
 from millrace.learner.rollouts.past_rollouts import PastRollouts, packed, unpacked
 from millrace.learner.run_folder.atomic_write import write_file
 from millrace.learner.run_folder.regular_files import open_regular, reason
 from millrace.protocol.arrays import Array, Bytes
-from millrace.protocol.bounds import LARGEST, one_line
+from millrace.protocol.bounds import one_line
 from millrace.protocol.errors import CheckpointError, UsageError
 from millrace.protocol.specs import PolicySpec
 
@@ -34,8 +33,8 @@ class ServiceState(msgspec.Struct, frozen=True, kw_only=True):
     """id or name of the environment"""
     policy: str
     """digest of the policy's specification"""
-    version: Annotated[int, Meta(ge=-1, le=LARGEST >> 2)]
-    """version of the newest published weights"""
+    version: Past
+    """the version that a restored service publishes first"""
     env_steps: Past
     rollouts: PastRollouts
     normalizer: dict[str, Any] | None = None

@@ -191,7 +191,7 @@ class RunFiles:
         times = self._hub.stage_times()
         content = SavedRun(
             state=self._state,
-            rollouts=self._hub.past(),
+            rollouts=self._hub.past(self._state.version),
             wall_s=self._tally.wall_s(times),
             stages=self._tally.stages(times),
             episodes=self._tally.window.state(),

@@ -170,9 +170,9 @@ class Hub:
         found = [kept[version] for version in pool.versions]
         return np.stack([to_float32(each.parameters) for each in found]), np.stack([each.buffers for each in found])
 
-    def past(self) -> PastRollouts:
-        """The state from which a resumed run continues after the last update."""
-        return self.coordinator.past()
+    def past(self, first: int) -> PastRollouts:
+        """The state from which a resumed run, which publishes version `first` first, continues after the last update."""
+        return self.coordinator.past(first)
 
     def gather(self, watch: Callable[[], None] = lambda: None) -> list[AcceptedRollout]:
         """Wait for the rollouts of the next update. Raises `NoWorkers`, `Stalled`, `EnvironmentFailed` or `PolicyFailed`.

@@ -39,7 +39,7 @@ class PastRollouts(msgspec.Struct, frozen=True):
     lanes: Sequence[LanePast] = ()
     """the past of each lane from which rollouts were taken"""
     acting: Sequence[Weights] = ()
-    """the weights that act in open rounds, except the newest"""
+    """the weights that act in open rounds, except those that the new learner publishes first"""
 
 
 def packed(record: msgspec.Struct) -> Bytes:

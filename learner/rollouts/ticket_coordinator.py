@@ -112,16 +112,19 @@ class TicketCoordinator(Coordinator):
         """Store weights that act in an open round of a resumed run."""
         self.weights.kept[weights.version] = weights
 
-    def past(self) -> PastRollouts:
-        """The state from which another learner continues after the last round that was taken."""
+    def past(self, first: int) -> PastRollouts:
+        """The state from which another learner continues after the last round that was taken.
+
+        `first` is the version that the other learner publishes first, so its weights are left out. It may differ from the
+        version that was published last here, because weights are also published to be evaluated.
+        """
         rounds = self.rollouts.rounds
-        older = sorted(rounds.acting() - {self.version})
         return PastRollouts(
             ledger=self.rollouts.ledger.copy(),
             incarnations=self.rollouts.incarnations(),
             rounds=RoundsState(rounds.next, dict(rounds.versions)),
             lanes=self.rollouts.pasts(),
-            acting=[self.weights.kept[version] for version in older if version in self.weights.kept],
+            acting=[self.weights.kept[version] for version in sorted(rounds.acting() - {first})],
         )
 
     def begin_update(self) -> list[Outgoing]:

@@ -211,6 +211,26 @@ def test_a_saved_service_goes_on(tmp_path: Path) -> None:
         assert np.array_equal(batch.obs[0], before.obs[-1]), "lanes go on where they were"
 
 
+def test_a_restored_service_that_is_saved_before_it_publishes_goes_on_like_the_first(tmp_path: Path) -> None:
+    file, again = tmp_path / "state.npz", tmp_path / "again.npz"
+
+    def batch_after(restored: millrace.RolloutService) -> millrace.RolloutBatch:
+        assert restored.publish(restored.policy.initial(seed=4)) == 1
+        return restored.gather()
+
+    with service(max_lag=1) as made:
+        made.publish(made.policy.initial(seed=3))
+        made.gather()
+        made.publish(made.policy.initial(seed=4))
+        made.save(file)
+    with service(restore=file, max_lag=1) as made:
+        made.save(again)
+        batch = batch_after(made)
+    assert batch.version.tolist() == [0] * 4
+    with service(restore=again, max_lag=1) as made:
+        assert same(batch_after(made), batch)
+
+
 def test_a_service_that_was_saved_before_it_published_goes_on(tmp_path: Path) -> None:
     with service() as made:
         made.save(tmp_path / "state.npz")

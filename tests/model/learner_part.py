@@ -199,7 +199,7 @@ class Learner:
         coordinator = self.coordinator
         incarnations = tuple(incarnation(lane, number) for lane, number in enumerate(coordinator.rollouts.incarnations()))
         accepted = tuple(_accepted(lane, number) for lane, (number, _, _) in enumerate(self.accepted))
-        past = coordinator.past()
+        past = coordinator.past(coordinator.version)
         rounds = past.rounds.next, tuple(past.rounds.versions.items())
         places = tuple(map(_place, coordinator.rollouts.lanes))
         issued = ticket(coordinator.rollouts.ledger.issued)

@@ -1197,7 +1197,7 @@ def test_a_worker_that_continues_no_lane_is_sent_no_past_and_its_first_rollout_i
 
 def saved(learner: Learner) -> object:
     """What a checkpoint has of rounds and lanes."""
-    past = learner.coordinator.past()
+    past = learner.coordinator.past(learner.coordinator.version)
     return packed(msgspec.structs.replace(past, ledger=Ledger(), incarnations=[])).tobytes()
 
 
@@ -1222,6 +1222,21 @@ def test_weights_that_still_act_keep_their_attributes_when_they_are_published_ag
     assert [past.attributes.by_row() for past in coordinator.rollouts.pasts()] == [{0: bytes([7, 0]), 1: bytes([8, 0])}] * 2
     one, other = ([rows.attributes for rows in lane.history.rows] for lane in coordinator.rollouts.lanes if lane.history)
     assert list(map(id, one)) == list(map(id, other)), "they may be long, and are stored once for all lanes"
+
+
+def test_a_checkpoint_has_all_weights_of_open_rounds_but_those_that_the_next_learner_publishes_first() -> None:
+    """Also while others are the newest, because they are evaluated."""
+    learner = Learner(publish=False, rounds=Rounds(1, 3, {3: 2}))
+    coordinator = learner.coordinator
+    coordinator.keep(Weights(2, PARAMETERS, BUFFERS, np.array([7, 0], np.uint8)))
+    for published in (None, 2, 3, 4):
+        if published is not None:
+            coordinator.publish(published, PARAMETERS, BUFFERS)
+        if published == 3:
+            coordinator.begin_update()
+            assert [weights.version for weights in coordinator.past(4).acting] == [2, 3]
+        (weights,) = coordinator.past(3).acting
+        assert (weights.version, weights.env_attributes is not None) == (2, True)
 
 
 def test_incarnations_for_a_checkpoint_name_no_life_that_was_dealt_a_ticket() -> None:

@@ -498,7 +498,7 @@ class World:
             if self.due and self.plan is None:
                 self._begin_evaluation()
             if self.random.random() < 0.3:
-                self.checkpoint = coordinator.past()
+                self.checkpoint = coordinator.past(self.updates)
             self._learn()
 
         self.at(self.random.uniform(0.0, 0.3), publish)

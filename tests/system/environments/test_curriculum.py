@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +12,10 @@ import pytest
 
 import millrace
 from millrace import Callback, Progress
+from millrace.learner.rollouts.hub import Hub
+from millrace.learner.run_folder import checkpoint
 from tests.system.stage.preloaded import command_line
-from tests.system.stage.run_folders import policy_of
+from tests.system.stage.run_folders import folder_of, policy_of, saved_rollouts
 
 ENV = "tests.support.users_code.fact_envs:Facts-v0"
 SMALL: dict[str, Any] = {
@@ -86,6 +89,55 @@ def test_a_resumed_run_goes_on_with_the_attributes(tmp_path: Path, inference: st
     assert after.at_start == {"level": 4.0}, "as it was set last"
     # Version 4 was sent with the level that was set after update 3, and is sent with it again.
     assert after.seen == {n: {n - 2.0} for n in range(5, 10)}
+
+
+BESIDE: dict[str, Any] = {"max_lag": 1, "eval_every": 400, "eval_workers": 1}
+
+
+class NewLevel(Callback):
+    """The level is new from version 4 on. Interrupts the run after update `until`, or after an evaluation."""
+
+    def __init__(self, until: int = 0, *, after_evaluation: bool = False) -> None:
+        self._until = until
+        self._after_evaluation = after_evaluation
+
+    def on_start(self, progress: Progress) -> None:
+        progress.set_env_attr("level", progress.env_attrs.get("level", 7.0))  # so that there is something to save
+
+    def on_update(self, progress: Progress) -> None:
+        if progress.updates == 3:
+            progress.set_env_attr("level", 9.0)
+        if progress.updates == self._until:
+            raise KeyboardInterrupt
+
+    def on_evaluation(self, progress: Progress) -> None:
+        if self._after_evaluation:
+            raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("again", ["while it is awaited", "once it has ended"])
+def test_weights_that_act_in_a_round_keep_their_attributes_if_their_evaluation_is_interrupted_again(
+    tmp_path: Path, again: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After update 5, version 4 acts in the next round, and is evaluated first in a run without workers for that."""
+
+    def interrupted(hub: Hub, watch: object) -> None:
+        raise KeyboardInterrupt
+
+    waits = {**BESIDE, "eval_workers": 0}
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path, NewLevel(until=5), **BESIDE)
+    folder = folder_of(tmp_path / "runs")
+    once = Path(shutil.copytree(folder, tmp_path / "once"))
+    run(tmp_path, NewLevel(), resume=once, **waits)
+    assert checkpoint.newest(folder)[0].state["past"]["state"]["pending"]["version"] == 4
+    assert saved_rollouts(folder).rounds.versions[5] == 4
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        if again == "while it is awaited":
+            patch.setattr(Hub, "end_evaluation", interrupted)
+        run(tmp_path, NewLevel(after_evaluation=True), resume=folder, **waits)
+    run(tmp_path, NewLevel(), resume=folder, **waits)
+    assert policy_of(folder) == policy_of(once)
 
 
 def test_a_run_without_callbacks_goes_on_with_the_attributes_too(tmp_path: Path) -> None:
