@@ -56,8 +56,12 @@ class RunProgress(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def env_steps_made(self) -> int:
-        """Env steps that updates have used, plus those already collected for the next update."""
-        return self.env_steps + self.collected
+        """Env steps that updates have used, plus those already collected for the next update.
+
+        At the end of a run, workers may collect more than `total_steps`. The rest doesn't count, because no update uses it.
+        """
+        made = self.env_steps + self.collected
+        return max(self.env_steps, min(made, self.total_steps)) if self.total_steps else made
 
     @property
     def share(self) -> float:

@@ -35,13 +35,9 @@ WRONG = {
 
 
 def steps_in_words(progress: RunProgress) -> str:
-    """How many env steps have been made, and how many there will be in all.
-
-    At the end of a run, workers may make more than that, but no update will use them.
-    """
-    if not (total := progress.total_steps):
-        return f"{progress.env_steps_made:,}"
-    return f"{max(progress.env_steps, min(progress.env_steps_made, total)):,} of {total:,}"
+    """How many env steps have been made, and how many the run has in total."""
+    made = f"{progress.env_steps_made:,}"
+    return f"{made} of {progress.total_steps:,}" if progress.total_steps else made
 
 
 def percent(progress: RunProgress) -> str:

@@ -171,6 +171,9 @@ def test_runs_are_listed_in_a_table(tmp_path: Path, capsys: pytest.CaptureFixtur
         assert main(["list", str(tmp_path / "runs")]) == 0
     row = capsys.readouterr().out.splitlines()[1]
     assert re.split(r"  +", row)[1:8] == ["training", "CartPole-v1", "PPO", "-", "-", "before its first update", "-"]
+    write_progress(run, RunProgress(env_steps=99_900, collected=512, total_steps=100_000))
+    assert main(["list", str(tmp_path / "runs")]) == 0
+    assert re.split(r"  +", capsys.readouterr().out.splitlines()[1])[5] == "100,000", "no update uses more"
     (tmp_path / "empty").mkdir()
     assert main(["list", str(tmp_path / "empty")]) == 0
     assert capsys.readouterr().out == "no run is here\n"

@@ -197,6 +197,12 @@ def test_before_the_first_update_it_shows_what_workers_have_made(tmp_path: Path)
     assert "Env steps of 100,000 45 Env steps per second 1.9 Updates 0 Time of training 23.4 s" in said
 
 
+def test_it_shows_no_more_env_steps_than_the_run_has(tmp_path: Path) -> None:
+    run = a_run(tmp_path, finished=False)
+    write_progress(run, RunProgress(env_steps=99_900, collected=512, total_steps=100_000))
+    assert "Env steps of 100,000 100,000 Env steps per second" in Pages(tmp_path).said(f"run/{key_of(run)}")
+
+
 def test_where_nobody_waits_long_the_slowest_part_is_named(tmp_path: Path) -> None:
     run = a_run(tmp_path, finished=False)
     with RunLock(run):
