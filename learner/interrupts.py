@@ -12,19 +12,19 @@ from __future__ import annotations
 
 import math
 import signal
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+import threading
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from time import monotonic
 from types import FrameType, TracebackType
-from typing import Any, Self
+from typing import Self
 
-from millrace.protocol.machine.deferred_signals import SIGNALS
+from millrace.protocol.machine.deferred_signals import SIGNALS, Handler, heeded, known_handlers, put_back_late
 
 FOR_SAVING = 0.5  # the share of the grace time that an update must leave for saving
 SAVE_TAKES = 1.5  # the time allowed for saving, as a multiple of the longest save so far
 
 _stopped = False  # whether `Stopped` was raised; other code, such as an import or a finalizer, may have swallowed it
-Handler = Callable[[int, FrameType | None], None] | signal.Handlers
 
 
 class Stopped(KeyboardInterrupt):
@@ -50,19 +50,18 @@ def stopped_by_signals() -> Iterator[None]:
             _stopped = True
             raise Stopped
 
-    _set(stop)
+    _set(stop, heeded())
     try:
         signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
         yield
     finally:
-        _set(signal.SIG_IGN)
+        _set(signal.SIG_IGN, heeded())
         _stopped = False
 
 
-def _set(handler: Handler) -> dict[int, Any]:
-    """Set the handler for the signals, except for SIGHUP if it is ignored. Returns the previous handlers."""
-    heeded = [each for each in SIGNALS if each != signal.SIGHUP or signal.getsignal(each) != signal.SIG_IGN]
-    return {each: signal.signal(each, handler) for each in heeded}
+def _set(handler: Handler, signals: Iterable[int]) -> None:
+    for each in signals:
+        signal.signal(each, handler)
 
 
 class Interrupts:
@@ -73,16 +72,20 @@ class Interrupts:
         self._grace_s = grace_s or math.inf
         self._end_s = math.inf
         self.received = False
-        self._handlers_before: dict[int, Any] = {}
+        self._handlers_before: dict[int, Handler] = {}
+        self._left = False  # whether the context was left, so that signals must go to the previous handlers
 
     def __enter__(self) -> Self:
-        with suppress(ValueError):  # raised outside the main thread, where no handler can be set
-            self._handlers_before = _set(self._note)
+        self._left = False
+        is_main = threading.current_thread() is threading.main_thread()  # no other thread can set a handler
+        self._handlers_before = known_handlers(heeded()) if is_main else {}
+        _set(self._note, self._handlers_before)
         if _stopped:
             self._note(0, None)
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self._left = True
         for number, handler in self._handlers_before.items():
             signal.signal(number, handler)
 
@@ -96,7 +99,9 @@ class Interrupts:
         return self.received and self._end_s < math.inf and monotonic() > self._end_s - for_saving_s
 
     def _note(self, number: int, frame: FrameType | None) -> None:
-        if not self.received:
+        if self._left:
+            put_back_late(number, self._handlers_before[number])
+        elif not self.received:
             self.received = True
             self._end_s = monotonic() + self._grace_s
             for each, handler in self._handlers_before.items():

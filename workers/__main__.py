@@ -19,6 +19,7 @@ from millrace.protocol.bounds import MAX_NAME, one_line
 from millrace.protocol.errors import UsageError, UserFacingError
 from millrace.protocol.keys.keys import Token
 from millrace.protocol.keys.worker_token import read_token
+from millrace.protocol.machine.deferred_signals import heeded
 from millrace.workers.conversation.connection_rules import checked_token
 from millrace.workers.flags import WorkerFlags
 from millrace.workers.shared_weights import SUPPORTED, SharedWeights
@@ -90,15 +91,13 @@ def _supervise(flags: WorkerFlags, token: Token | None, signals: list[int]) -> i
 
 
 def _count_signals() -> list[int]:
-    """Install handlers that append each SIGTERM, SIGINT and SIGHUP to the returned list.
+    """Install handlers that append each signal that ends the program to the returned list.
 
-    The first signal asks the program to leave after the rollout in progress, the second to leave immediately. A SIGHUP that
-    is ignored (`nohup`) stays ignored.
+    The first signal asks the program to leave after the rollout in progress, the second to leave immediately.
     """
     received: list[int] = []
-    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
-        if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
-            signal.signal(number, lambda signum, frame: received.append(signum))
+    for number in heeded():
+        signal.signal(number, lambda signum, frame: received.append(signum))
     return received
 
 

@@ -7,8 +7,8 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -70,6 +70,73 @@ def test_a_deferred_signal_interrupts_after_the_block() -> None:
             done.append("block")
         done.append("after it")
     assert done == ["block"]
+
+
+BOTH_CONTEXTS = pytest.mark.parametrize("context", [signals_deferred, Interrupts])
+
+
+@BOTH_CONTEXTS
+def test_a_handler_that_is_not_pythons_stays(
+    context: Callable[[], AbstractContextManager[Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A program that embeds Python, or a preloaded library, has set it. Python can't put it back."""
+    known = signal.getsignal
+    heard: list[int] = []
+    signal.signal(signal.SIGTERM, lambda number, frame: heard.append(number))
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    before = [known(each) for each in SIGNALS]
+    monkeypatch.setattr(signal, "getsignal", lambda number: None if number == signal.SIGTERM else known(number))
+    with context():
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert heard == [signal.SIGTERM]
+        assert known(signal.SIGINT) != before[0]
+    assert [known(each) for each in SIGNALS] == before
+
+
+@BOTH_CONTEXTS
+def test_a_signal_that_interrupts_the_end_of_the_block_swallows_no_later_one(
+    context: Callable[[], AbstractContextManager[Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ctrl-C raises as soon as its handler is back, before those of the others are."""
+    heard: list[int] = []
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    for each in (signal.SIGTERM, signal.SIGHUP):
+        signal.signal(each, lambda number, frame: heard.append(number))
+    set_handler = signal.signal
+
+    def interrupted(number: int, handler: Any) -> Any:
+        found = set_handler(number, handler)
+        if handler is signal.default_int_handler:
+            os.kill(os.getpid(), signal.SIGINT)
+        return found
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(signal, "signal", interrupted)
+        with context():
+            pass
+    for each in (signal.SIGTERM, signal.SIGHUP, signal.SIGTERM):
+        os.kill(os.getpid(), each)
+    assert heard == [signal.SIGTERM, signal.SIGHUP, signal.SIGTERM]
+
+
+def test_a_deferred_signal_arrives_although_another_interrupts_the_end_of_the_block(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    heard: list[int] = []
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGTERM, lambda number, frame: heard.append(number))
+    set_handler = signal.signal
+
+    def interrupted(number: int, handler: Any) -> Any:
+        if handler is signal.default_int_handler:
+            raise KeyboardInterrupt
+        return set_handler(number, handler)
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(signal, "signal", interrupted)
+        with signals_deferred():
+            os.kill(os.getpid(), signal.SIGTERM)
+    assert heard == [signal.SIGTERM]
 
 
 def test_a_signal_while_the_address_is_bound_leaves_no_socket(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
