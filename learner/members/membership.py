@@ -319,9 +319,10 @@ class Membership:
 
     def remove(self, member: Member, gone: Gone) -> None:
         """Remove a member. Nothing is sent to it."""
+        # First, so that the end of its process removes it only once, even if an interrupt comes before the next line.
+        self._of_process.pop((member.hello.worker, member.hello.process_nonce), None)
         del self.members[member.peer]
         _add(self._stages_of_left, member.stages())
-        self._of_process.pop((member.hello.worker, member.hello.process_nonce), None)
         worker = member.hello.worker
         tickets = len(member.tickets)
         left = WorkerLeft(worker, gone.why, tickets, gone.on_purpose)

@@ -87,11 +87,11 @@ class OrderedLane(PlacedLane):
 
     def restart(self) -> None:
         """Record that the lane left its worker. Its next incarnation has new env copies."""
-        super().restart()
         self.started = False
         self.incarnation += 1
         if isinstance(self.order, SentOrder):
             self.order = None
+        super().restart()  # last, because `begin_anew` repeats a restart that was interrupted before this line
 
 
 class OrderCoordinator(Coordinator):
@@ -172,6 +172,18 @@ class OrderCoordinator(Coordinator):
                 record.order = replace(record.order, wanted=False)
             case _:
                 record.order = None
+
+    def begin_anew(self) -> None:
+        """Forget all orders after a call that was cut short.
+
+        The call may have removed a worker without taking its lanes away, or may have assigned only half of a lane.
+        """
+        for lane in self.lanes:
+            self.forget(lane.number)
+            if lane.owner is not None:
+                member = self.members.get(lane.owner)
+                if member is None or lane.number not in member.lanes:
+                    lane.restart()
 
     def owner(self, lane: int) -> Member | None:
         """The worker to which the lane is assigned, or None."""

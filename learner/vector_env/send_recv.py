@@ -73,7 +73,7 @@ class SendRecv:
 
     def begin_anew(self) -> None:
         """Forget everything that was sent, after a call that was cut short. All copies must be reset next."""
-        self._hub.forget(self._layout.lanes)
+        self._hub.begin_anew()
         self._sent = SentLanes(self._layout)
         self._to_raise = {}
         self._reset_lanes = {}

@@ -152,6 +152,14 @@ class StepHub:
             if self.shared is not None:
                 self.shared.under_way.pop(lane, None)
 
+    def begin_anew(self) -> None:
+        """Forget all orders after a call that was cut short, which may have noticed a loss but not recorded all of it."""
+        self._infos_to_come = False
+        self.coordinator.begin_anew()
+        if self.shared is not None:
+            self.shared.under_way.clear()
+            self._forget_pipes(self.shared)
+
     # ---------------------------------------------------------------- waiting
 
     def listen_if_due(self) -> None:
@@ -242,9 +250,7 @@ class StepHub:
             case Failed(spare=False):
                 self._failure = self._failure or event
             case WorkerLeft() | WorkerRefused() if self.shared is not None:
-                for lane in self.coordinator.lanes:
-                    if lane.owner is None:
-                        self.shared.worker_left(lane.number)
+                self._forget_pipes(self.shared)
             case _:
                 pass
 
@@ -254,6 +260,12 @@ class StepHub:
             self.shared.wake_for_message(peer)
 
     # ---------------------------------------------------------------- inside
+
+    def _forget_pipes(self, shared: SharedSteps) -> None:
+        """Forget which pipes woke the workers of lanes that have no worker now."""
+        for lane in self.coordinator.lanes:
+            if lane.owner is None:
+                shared.worker_left(lane.number)
 
     def _turn(self, timeout_s: float) -> None:
         """Listen, remove the workers that are gone, and send the orders that can be sent.

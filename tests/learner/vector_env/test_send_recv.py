@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import inspect
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
-from types import FrameType
+from types import CodeType, FrameType
 from typing import Any
 
 import gymnasium
@@ -19,16 +19,20 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 import millrace
+from millrace.learner.members.lane_placement import LanePlacement, PlacedLane
+from millrace.learner.members.membership import Membership
 from millrace.learner.vector_env import calls, order_coordinator, send_recv, sent_lanes, shared_steps, step_hub
 from millrace.learner.vector_env import env as env_module
 from millrace.learner.vector_env.batch_layout import BatchLayout
 from millrace.learner.vector_env.env import ZmqVectorEnv
 from millrace.learner.vector_env.lane_orders import packed, step_order
-from millrace.learner.vector_env.order_coordinator import MakeOrder
+from millrace.learner.vector_env.order_coordinator import MakeOrder, OrderCoordinator, OrderedLane
 from millrace.learner.vector_env.sent_lanes import LONGEST_GAP_S, Asked, AskedReset, Sent, SentLanes, WatchedTime
 from millrace.learner.vector_env.settings import VectorEnvSettings
+from millrace.learner.vector_env.shared_steps import SharedSteps
+from millrace.learner.vector_env.step_hub import StepHub
 from millrace.protocol.errors import EnvironmentFailed, NoWorkers, UsageError, WorkerLost
-from millrace.protocol.messages import LaneIncarnation, Reset, Step, Stepped
+from millrace.protocol.messages import LaneIncarnation, Reset, Step, Stepped, WorkerExit
 from millrace.protocol.wire.plain_values import unpack
 from millrace.protocol.wire.wake_up import WakeReason
 from tests.support.conversation.example_messages import example
@@ -1095,15 +1099,26 @@ def test_an_order_whose_answer_nobody_wants_is_over_with_the_next_one(shared: bo
         assert env.hub.can_share(0) == shared
 
 
-def interrupted(call: Callable[[], object], at: int) -> bool:
-    """Call this, and raise KeyboardInterrupt before line number `at` that it executes in the files of the caller's side.
+CALLER_SIDE = calls, env_module, order_coordinator, send_recv, sent_lanes, step_hub, shared_steps
+FILES = {module.__file__ for module in CALLER_SIDE}
+MOVES = {
+    function.__code__
+    for function in (
+        *(Membership.remove, OrderCoordinator._removed, LanePlacement.removed, OrderedLane.restart, PlacedLane.restart),
+        *(StepHub.happened, SharedSteps.worker_left, LanePlacement.assign, LanePlacement._give),
+    )
+}
+"""What takes the lanes of a lost worker away, and gives them to another."""
 
-    Returns whether there was such a line.
+
+def interrupted(call: Callable[[], object], at: int, only: Collection[CodeType] = ()) -> bool:
+    """Call this, and raise KeyboardInterrupt before line number `at` that it executes in `only` these functions, or anywhere
+    in the files of the caller's side. Returns whether there was such a line.
     """
     lines = iter(range(at))
 
     def trace(frame: FrameType, event: str, _: object) -> Any:
-        if frame.f_code.co_filename not in FILES:
+        if frame.f_code not in only if only else frame.f_code.co_filename not in FILES:
             return None
         if event == "line" and next(lines, None) is None:
             raise KeyboardInterrupt
@@ -1118,10 +1133,6 @@ def interrupted(call: Callable[[], object], at: int) -> bool:
     finally:
         sys.settrace(before)
     return False
-
-
-CALLER_SIDE = calls, env_module, order_coordinator, send_recv, sent_lanes, step_hub, shared_steps
-FILES = {module.__file__ for module in CALLER_SIDE}
 
 
 def step_in_two_calls(env: ZmqVectorEnv) -> None:
@@ -1184,6 +1195,26 @@ def test_after_an_interrupt_at_any_line_only_a_reset_of_all_copies_is_possible_a
             assert observation[:, 0].tolist() == [pytest.approx(0.8)] * 4
             assert (reward.tolist(), truncated.tolist(), infos) == ([1.0] * 4, [False] * 4, {})
         assert cut_short > 20
+
+
+@BOTH_WAYS
+def test_after_an_interrupt_while_the_lanes_of_a_lost_worker_go_to_another_all_copies_can_be_reset(shared: bool) -> None:
+    lines = 0
+    interrupts = True
+    while interrupts:
+        with made(copies=2, lanes=2, workers=2, shared=shared, timeout_s=5.0) as (env, link):
+            env.reset(seed=1), env.step(zeros([0, 1]))
+            link.leave("w1")
+            link.join("w2")
+            interrupts = interrupted(lambda: env.reset(seed=2), lines, MOVES)
+            env.hub.coordinator.process_ended(WorkerExit("w1", 2, "killed", False))
+            assert env.reset(seed=3)[0].tolist() == [[1.0], [1.0]]
+            began_s = link.now
+            assert env.step(zeros([0, 1]))[1].tolist() == [1.0, 1.0]
+            assert link.now == began_s, "no worker waited in vain to be woken"
+            assert env.incarnations()[1] > 0, "its copies are new"
+            lines += 1
+    assert lines > 20
 
 
 @pytest.mark.parametrize(
