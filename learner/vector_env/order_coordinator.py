@@ -82,8 +82,9 @@ class OrderedLane(PlacedLane):
         match self.order:
             case SentOrder(wanted=wanted):
                 return wanted
-            case waiting:
-                return isinstance(waiting, WaitingOrder)
+            case WaitingOrder():
+                return True
+        return False
 
     def restart(self) -> None:
         """Record that the lane left its worker. Its next incarnation has new env copies."""
