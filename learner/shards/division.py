@@ -14,6 +14,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
+from millrace.protocol.arrays import Array
 from millrace.protocol.rollout import Batch
 
 Columns = npt.NDArray[np.int64]
@@ -79,6 +80,22 @@ def part_of(batch: Batch, columns: Columns) -> Batch:
         mask=None if batch.mask is None else batch.mask[:, columns],
         resets=None if batch.resets is None else batch.resets[:, columns[::of_copy] // of_copy],
     )
+
+
+def narrowed(batch: Batch, columns: Columns) -> Batch:
+    """The batch with the observations of some columns only, and without the list of its episodes."""
+    return msgspec.structs.replace(batch, obs=tuple(leaf.take(columns, axis=1) for leaf in batch.obs), episodes=())
+
+
+def widened(batch: Batch, columns: Columns) -> Batch:
+    """The reverse of `narrowed`. Other columns get zeros, for which the operating system allocates no memory."""
+
+    def wide(leaf: Array) -> Array:
+        every = np.zeros((leaf.shape[0], len(batch.lane), *leaf.shape[2:]), leaf.dtype)
+        every[:, columns] = leaf
+        return every
+
+    return msgspec.structs.replace(batch, obs=tuple(map(wide, batch.obs)))
 
 
 def pairwise_sum(terms: Sequence[Term]) -> Term:

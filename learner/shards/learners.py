@@ -13,12 +13,11 @@ import math
 import os
 import socket
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from datetime import timedelta
 from typing import NamedTuple
 
-import msgspec
 import numpy as np
 import torch
 from torch import Tensor, distributed
@@ -31,7 +30,7 @@ from torch.distributed import (  # type: ignore[attr-defined]
 )
 
 from millrace.learner.shards.division import Division
-from millrace.learner.shards.messages import End, FromRankZero, StillThere
+from millrace.learner.shards.messages import HEAD, End, FromRankZero, StillThere, encode
 from millrace.learner.shards.place import Place
 from millrace.learner.shards.reports import Report
 from millrace.protocol.arrays import Array
@@ -54,16 +53,6 @@ class Timeouts(NamedTuple):
     """until all processes have connected"""
     reply_s: float
     """in a collective operation, or for the next message from rank 0"""
-
-
-class Header(msgspec.Struct, frozen=True):
-    """A message, and the dtype and shape of each array that follows it."""
-
-    message: FromRankZero
-    arrays: tuple[tuple[str, tuple[int, ...]], ...]
-
-
-HEADER = msgspec.msgpack.Decoder(Header)
 
 
 class Learners:
@@ -118,36 +107,34 @@ class Learners:
             self.others_wait = False
 
     def tell_all(self, message: FromRankZero) -> None:
-        """Send a message without arrays to all other processes. After a failure, no further message can be sent."""
+        """Send a message to all other processes. After a failure, no further message can be sent."""
         self.others_wait = False
         for rank in self.others:
             self.tell(rank, message)
         self.others_wait = True
 
-    def tell(self, rank: int, message: FromRankZero, arrays: Sequence[Array] = ()) -> None:
-        """Send a message and its arrays to another process."""
+    def tell(self, rank: int, message: FromRankZero) -> None:
+        """Send a message to another process."""
         self._told_s = time.monotonic()
-        told = Header(message, tuple((array.dtype.str, array.shape) for array in arrays))
-        header = np.frombuffer(bytearray(msgspec.msgpack.encode(told)), np.uint8)
+        head, arrays = encode(message)
         with _lost():
-            distributed.send(torch.tensor([len(header)]), rank)
-            for array in (header, *arrays):
+            distributed.send(torch.tensor([len(head)]), rank)
+            for array in (np.frombuffer(bytearray(head), np.uint8), *arrays):
                 if array.size:
                     distributed.send(_bytes_of(array), rank)
 
-    def hear(self) -> tuple[FromRankZero, list[Array]]:
-        """Wait for the next message from rank 0. Returns it and its arrays."""
+    def hear(self) -> FromRankZero:
+        """Wait for the next message from rank 0."""
         with _lost():
             size = torch.zeros(1, dtype=torch.int64)
             distributed.recv(size, 0)
-            header = np.empty(int(size), np.uint8)
-            distributed.recv(_bytes_of(header), 0)
-            told = HEADER.decode(header.data)
-            arrays = [np.empty(shape, dtype) for dtype, shape in told.arrays]
-            for array in arrays:
+            head = np.empty(int(size), np.uint8)
+            distributed.recv(_bytes_of(head), 0)
+            message: FromRankZero = HEAD.decode(head.data)
+            for array in encode(message)[1]:  # in the order in which they are sent
                 if array.size:
                     distributed.recv(_bytes_of(array), 0)
-        return told.message, arrays
+        return message
 
 
 @contextmanager

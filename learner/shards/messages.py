@@ -2,22 +2,18 @@
 
     Begin → (Learn | StillThere)* → End
 
-Each message may carry arrays, which follow it as bytes. Nothing is unpickled.
+A message is sent as its head, which is msgpack, followed by the bytes of its arrays. In place of an array, the head has the
+array's shape and dtype. Nothing is unpickled.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import msgspec
 import numpy as np
 
-from millrace.protocol.arrays import Array
+from millrace.protocol.arrays import Array, Bytes
 from millrace.protocol.rollout import Batch
 from millrace.protocol.specs import PolicySpec
-
-SMALL = ("action", "log_prob", "reward", "terminated", "truncated", "valid", "state", "lane", "fresh")
-"""The arrays of a `Batch` that every process gets with all their columns."""
 
 
 class Begin(msgspec.Struct, frozen=True, tag=True):
@@ -35,16 +31,14 @@ class Begin(msgspec.Struct, frozen=True, tag=True):
 
 
 class Learn(msgspec.Struct, frozen=True, tag=True):
-    """Learn from a batch. The statistics, the arrays of the batch, and perhaps a state follow as arrays."""
+    """Learn from a batch."""
 
-    columns_per_rollout: int
-    leaves: int
-    """the number of arrays of an observation; they have only the columns of the receiver's shards"""
-    extras: int
-    masked: bool
-    seats: bool
-    state: bool
-    """whether the whole state of rank 0's algorithm follows, because the receiver does not have it"""
+    batch: Batch
+    """the batch, `narrowed` to the columns of the receiver's shards"""
+    statistics: Array
+    """rank 0's statistics of observations"""
+    state: Bytes | None
+    """the whole state of rank 0's algorithm, if the receiver does not have it"""
     digest: str
     """the digest of rank 0's state, for the receiver to compare with its own; empty if it need not compare"""
 
@@ -64,40 +58,16 @@ class End(msgspec.Struct, frozen=True, tag=True):
 FromRankZero = Begin | Learn | StillThere | End
 
 
-def arrays_of(batch: Batch, columns: Array) -> list[Array]:
-    """The arrays of a batch that are sent to a process. Observations have only `columns`; other arrays have all columns."""
-    optional = [array for array in (batch.mask, batch.resets) if array is not None]
-    return [
-        *(getattr(batch, name) for name in SMALL),
-        *batch.extras,
-        *optional,
-        *(leaf.take(columns, axis=1) for leaf in batch.obs),
-    ]
+HEAD = msgspec.msgpack.Decoder(FromRankZero, dec_hook=lambda kind, described: np.empty(*described))
+"""Decodes the head of a message. The values in the message's arrays are undefined until the receiver writes them."""
 
 
-def batch_of(learn: Learn, arrays: Sequence[Array], columns: Array) -> Batch:
-    """Make the batch, without episodes, from the result of `arrays_of`. The observations of other columns are zeros.
+def encode(message: FromRankZero) -> tuple[bytes, list[Array]]:
+    """The head of a message, and the message's arrays in the order in which the head describes them."""
+    arrays: list[Array] = []
 
-    The operating system allocates no memory for these zeros.
-    """
-    rest = iter(arrays)
-    small = {name: next(rest) for name in SMALL}
-    extras = tuple(next(rest) for _ in range(learn.extras))
-    mask = next(rest) if learn.masked else None
-    resets = next(rest) if learn.seats else None
-    obs = tuple(_widened(next(rest), columns, len(small["lane"])) for _ in range(learn.leaves))
-    return Batch(
-        **small,
-        obs=obs,
-        columns_per_rollout=learn.columns_per_rollout,
-        episodes=(),
-        extras=extras,
-        mask=mask,
-        resets=resets,
-    )
+    def described(array: Array) -> tuple[tuple[int, ...], str]:
+        arrays.append(array)
+        return array.shape, array.dtype.str
 
-
-def _widened(leaf: Array, columns: Array, total: int) -> Array:
-    wide = np.zeros((leaf.shape[0], total, *leaf.shape[2:]), leaf.dtype)
-    wide[:, columns] = leaf
-    return wide
+    return msgspec.msgpack.encode(message, enc_hook=described), arrays

@@ -65,29 +65,29 @@ def follow(config: Config, place: Place) -> Path:
         connected(place, config.shards, torch_device(config), timeouts(config), poll) as learners,
     ):
         match learners.hear():
-            case Begin() as begin, _:
+            case Begin() as begin:
                 algorithm = algorithm_of(begin, learners)
-            case End(reason, failed=False), _:
+            case End(reason, failed=False):
                 log_notice(log, f"rank {place.rank}: {reason}")
                 return Path(config.run_dir)
-            case End(reason), _:
+            case End(reason):
                 raise RunError(f"learner: rank {place.rank}: {reason}")
-            case other, _:
+            case other:
                 raise RunError(f"learner: rank {place.rank}: expected the run from rank 0, got {type(other).__name__}")
         log_notice(log, f"rank {place.rank} of {place.processes} takes part in the updates of run {begin.run}")
         while True:
             match learners.hear():
-                case Learn() as learn, arrays:
-                    algorithm.follow(learn, arrays)
-                    del arrays  # free their memory before the next ones arrive
-                case StillThere(), _:
+                case Learn() as learn:
+                    algorithm.follow(learn)
+                    del learn  # free its memory before the next batch arrives
+                case StillThere():
                     pass
-                case End(reason, failed=True), _:
+                case End(reason, failed=True):
                     raise RunError(f"learner: rank {place.rank}: {reason}")
-                case End(reason), _:
+                case End(reason):
                     log_notice(log, f"rank {place.rank}: {reason}")
                     return Path(begin.run)
-                case other, _:
+                case other:
                     raise RunError(f"learner: rank {place.rank}: expected a batch, got {type(other).__name__}")
 
 

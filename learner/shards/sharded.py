@@ -27,18 +27,17 @@ from millrace.learner.algorithms.algorithm import Start
 from millrace.learner.algorithms.gradient_descent import ADVICE, UpdateMetrics, check_finite
 from millrace.learner.algorithms.minibatches import Minibatch, Observations, UpdateRows, WholeBatch
 from millrace.learner.config.config import Config
-from millrace.learner.shards.division import pairwise_sum, part_of
+from millrace.learner.shards.division import narrowed, pairwise_sum, part_of, widened
 from millrace.learner.shards.learners import Learners
-from millrace.learner.shards.messages import SMALL, Learn, arrays_of, batch_of
+from millrace.learner.shards.messages import Learn
 from millrace.learner.shards.reports import Report, averaged
 from millrace.learner.shards.rows import ShardObservations, ShardRows
-from millrace.protocol.arrays import Array, Floats
+from millrace.protocol.arrays import Bytes, Floats
 from millrace.protocol.errors import RunError, UsageError, first_line
 from millrace.protocol.rollout import Batch
 from millrace.protocol.specs import PolicySpec
 
 COMPARE_EVERY = 50  # number of updates after which all processes compare their states
-LANE = SMALL.index("lane")
 
 
 class Sharded(ActorCritic):
@@ -75,36 +74,27 @@ class Sharded(ActorCritic):
         return metrics
 
     def _tell(self, batch: Batch) -> None:
-        state = [] if self._others_know_state else [_packed(self.state_dict())]
-        compares = not state and self.version % COMPARE_EVERY == 0
-        learn = Learn(
-            columns_per_rollout=batch.columns_per_rollout,
-            leaves=len(batch.obs),
-            extras=len(batch.extras),
-            masked=batch.mask is not None,
-            seats=batch.resets is not None,
-            state=bool(state),
-            digest=self.digest() if compares and self.learners.others else "",
-        )
+        state = None if self._others_know_state else _packed(self.state_dict())
+        compares = state is None and self.version % COMPARE_EVERY == 0
+        digest = self.digest() if compares and self.learners.others else ""
         for rank in self.learners.others:
             columns = self.learners.division.columns_of_process(batch.lane, rank)
-            self.learners.tell(rank, learn, [self.statistics, *arrays_of(batch, columns), *state])
+            self.learners.tell(rank, Learn(narrowed(batch, columns), self.statistics, state, digest))
         self._others_know_state = True
 
-    def follow(self, learn: Learn, arrays: Sequence[Array]) -> None:
-        """Do the same update that rank 0 is doing now, from rank 0's message and arrays."""
-        statistics, *rest = arrays
+    def follow(self, learn: Learn) -> None:
+        """Do the same update that rank 0 is doing now, from rank 0's message."""
         division = self.learners.division
-        if learn.state:
-            self.load_state_dict(_unpacked(rest.pop()))
+        if learn.state is not None:
+            self.load_state_dict(_unpacked(learn.state))
         elif learn.digest and learn.digest != self.digest():
             self._failed = RunError(
                 f"learner: rank {division.rank}: its state differs from that of rank 0 after update {self.version}; use "
                 "machines with the same processors and the same packages, and a loss that changes nothing"
             )
-        self.statistics = statistics
-        columns = division.columns_of_process(rest[LANE], division.rank)
-        self.update(batch_of(learn, rest, columns), lambda: None)
+        self.statistics = learn.statistics
+        columns = division.columns_of_process(learn.batch.lane, division.rank)
+        self.update(widened(learn.batch, columns), lambda: None)
 
     def digest(self) -> str:
         """SHA-256 of the state without the observation statistics, which only rank 0 maintains."""
@@ -235,14 +225,14 @@ def _contents(state: object) -> Iterator[bytes]:
             yield repr(state).encode()
 
 
-def _packed(state: dict[str, Any]) -> Array:
+def _packed(state: dict[str, Any]) -> Bytes:
     """Encode a state as bytes."""
     file = io.BytesIO()
     torch.save(state, file)
     return np.frombuffer(bytearray(file.getvalue()), np.uint8)
 
 
-def _unpacked(content: Array) -> dict[str, Any]:
+def _unpacked(content: Bytes) -> dict[str, Any]:
     """Read the state from these bytes, without executing any code in them."""
     state: dict[str, Any] = torch.load(io.BytesIO(content.tobytes()), map_location="cpu", weights_only=True)
     return state

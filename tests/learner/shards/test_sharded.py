@@ -147,9 +147,9 @@ def train(
         change(algorithm)
     for number, each in enumerate([*batches, None]):
         if not learners.leads:
-            heard, arrays = learners.hear()
+            heard = learners.hear()
             if isinstance(heard, Learn):
-                algorithm.follow(heard, arrays)
+                algorithm.follow(heard)
         elif each is not None:
             metrics += [algorithm.update(each, pulse)]
         else:
@@ -196,6 +196,29 @@ def test_the_bits_do_not_depend_on_the_number_of_processes(name: str, policy: st
         assert first_difference(alone.state, first.state) is None
         assert alone.metrics == first.metrics
         assert {each.digest for each in others} == {alone.digest}
+
+
+def test_a_batch_arrives_with_its_masks_its_resets_and_its_extras() -> None:
+    algorithm = make("ppo", IMAGE, None)
+    rows = wide(algorithm, 0)
+    T, N = rows.valid.shape
+    random = np.random.default_rng(1)
+    rows = msgspec.structs.replace(
+        rows,
+        mask=random.random((T + 1, N, 4)) < 0.5,
+        resets=random.random((T + 1, N // 2)) < 0.5,
+        extras=(random.random((T, N, 2)), random.integers(0, 9, (T, N), np.uint8)),
+    )
+    sent = Learn(rows, algorithm.statistics, None, "")
+
+    def body(learners: Learners) -> FromRankZero:
+        if learners.leads:
+            learners.tell(1, sent)
+        return sent if learners.leads else learners.hear()
+
+    _, heard = in_threads(SHARDS, 2, body)
+    assert isinstance(heard, Learn)
+    assert first_difference(msgspec.structs.asdict(rows), msgspec.structs.asdict(heard.batch)) is None
 
 
 ONE_STEP: dict[str, dict[str, Any]] = {
@@ -379,7 +402,7 @@ class OneIsGone(Learners):
         super().__init__(Division(3, 3, 0), reply_s=0.0)
         self.told: list[FromRankZero] = []
 
-    def tell(self, rank: int, message: FromRankZero, arrays: Sequence[Array] = ()) -> None:
+    def tell(self, rank: int, message: FromRankZero) -> None:
         if rank == 2:
             raise LearnerLost("rank 2 is gone")
         self.told.append(message)

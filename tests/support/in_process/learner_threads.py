@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import queue
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
 
@@ -13,8 +13,7 @@ from torch import Tensor
 
 from millrace.learner.shards.division import Division
 from millrace.learner.shards.learners import Learners
-from millrace.learner.shards.messages import FromRankZero
-from millrace.protocol.arrays import Array
+from millrace.learner.shards.messages import HEAD, FromRankZero, encode
 from millrace.protocol.errors import LearnerLost
 
 TIMEOUT_S = 60.0
@@ -61,12 +60,16 @@ class LearnerThread(Learners):
         self._gathers += 1
         return self._meeting.gather(self._gathers, self.division.rank, own)
 
-    def tell(self, rank: int, message: FromRankZero, arrays: Sequence[Array] = ()) -> None:
-        self._meeting.told[rank].put((message, [array.copy() for array in arrays]))
+    def tell(self, rank: int, message: FromRankZero) -> None:
+        head, arrays = encode(message)
+        self._meeting.told[rank].put((head, [array.copy() for array in arrays]))
 
-    def hear(self) -> tuple[FromRankZero, list[Array]]:
-        message, arrays = self._meeting.told[self.division.rank].get(timeout=TIMEOUT_S)
-        return message, arrays
+    def hear(self) -> FromRankZero:
+        head, arrays = self._meeting.told[self.division.rank].get(timeout=TIMEOUT_S)
+        message: FromRankZero = HEAD.decode(head)
+        for array, values in zip(encode(message)[1], arrays, strict=True):
+            array[...] = values
+        return message
 
 
 def in_threads(shards: int, processes: int, body: Callable[[Learners], T]) -> list[T | BaseException]:
