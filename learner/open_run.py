@@ -24,7 +24,7 @@ from millrace.learner.between_updates.tally import Tally
 from millrace.learner.callbacks.callbacks import Callbacks, Watch
 from millrace.learner.config.algorithm_names import FOR_PRIOR
 from millrace.learner.config.config import Config
-from millrace.learner.config.costs import large_observations, minibatch_rows
+from millrace.learner.config.costs import large_observations
 from millrace.learner.config.validation import unused_setting
 from millrace.learner.extras import started_by
 from millrace.learner.members.lobby import Lobby
@@ -156,7 +156,7 @@ def _use_threads(setup: RunSetup, policy: PolicySpec, processes: WorkerProcesses
         config = msgspec.structs.replace(config, torch_threads=1)  # because several processes share a machine's cores
     elif config.torch_threads is None:
         # Another number of threads changes the last bits of results, so the run keeps this one wherever it is resumed.
-        chosen = threads(policy, minibatch_rows(config), config.max_lag, processes.expected)
+        chosen = threads(policy, config.algorithm.minibatch_rows(config.envs), config.max_lag, processes.expected)
         config = msgspec.structs.replace(config, torch_threads=chosen.number)
         if chosen.line:
             log_notice(log, chosen.line)

@@ -15,7 +15,6 @@ import msgspec
 
 from millrace.learner.between_updates.stop_rules import BY_THE_POLICY_OF, reason_to_stop
 from millrace.learner.config.config import Config
-from millrace.learner.config.hyperparameters import OffPolicyConfig, QLearningConfig
 from millrace.learner.config.layers import config_of_run
 from millrace.learner.config.resume_rules import Change, OnResume, changes, refusal
 from millrace.learner.env_spaces import EnvSpaces
@@ -66,12 +65,13 @@ def check_settings(config: Config, run: Path) -> list[str]:
         changed += changes(before.algorithm, config.algorithm)
     if why := refusal(changed):
         raise UsageError(f"run {run}: {why}; a run keeps this setting: resume it without the setting, or start a new run")
-    match before.algorithm, config.algorithm:
-        case OffPolicyConfig(core=str()) as had, OffPolicyConfig() as has if had.rollout_steps != has.rollout_steps:
-            raise UsageError(
-                f"run {run}: rollout_steps: expected {had.rollout_steps}, the length of the sequences in its replay buffer, "
-                f"got {has.rollout_steps}; resume it without this setting, or start a new run"
-            )
+    had = before.algorithm
+    has = config.algorithm
+    if had.replays and had.core is not None and had.rollout_steps != has.rollout_steps:
+        raise UsageError(
+            f"run {run}: rollout_steps: expected {had.rollout_steps}, the length of the sequences in its replay buffer, "
+            f"got {has.rollout_steps}; resume it without this setting, or start a new run"
+        )
     return [f"run {run}: {line}" for line in _differences(before, config, changed)]
 
 
@@ -139,14 +139,13 @@ def _differences(before: Config, config: Config, changed: Sequence[Change]) -> l
         for name, on_resume, had, given in changed
         if on_resume is OnResume.ADAPTABLE
     ]
-    match before.algorithm, config.algorithm:
-        case QLearningConfig() as had, QLearningConfig() as has if has.gradient_steps == had.gradient_steps:
-            was, now = (one.envs * one.algorithm.rollout_steps for one in (before, config))
-            if was != now:
-                lines.append(
-                    f"an update of {has.gradient_steps} gradient steps now follows {now} env steps, {was} before; "
-                    f"--gradient-steps {max(1, round(has.gradient_steps * now / was))} keeps the replay ratio"
-                )
+    was, now = (one.envs * one.algorithm.rollout_steps for one in (before, config))
+    steps = config.algorithm.gradient_steps
+    if steps and steps == before.algorithm.gradient_steps and was != now:
+        lines.append(
+            f"an update of {steps} gradient steps now follows {now} env steps, {was} before; "
+            f"--gradient-steps {max(1, round(steps * now / was))} keeps the replay ratio"
+        )
     return lines
 
 

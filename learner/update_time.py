@@ -16,7 +16,6 @@ import msgspec
 from millrace.learner.algorithms import algorithm_class
 from millrace.learner.algorithms.algorithm import acting_weights
 from millrace.learner.config.config import Config
-from millrace.learner.config.costs import minibatch_rows
 from millrace.learner.config.hyperparameters import AlgorithmConfig, OffPolicyConfig
 from millrace.learner.torch_setup import one_thread, threads, torch_device
 from millrace.protocol.arrays import Floats
@@ -51,9 +50,8 @@ def update_time(
     with one_thread():
         import torch
 
-        torch.set_num_threads(
-            config.torch_threads or threads(policy, minibatch_rows(config), config.max_lag, workers).number
-        )
+        rows = config.algorithm.minibatch_rows(config.envs)
+        torch.set_num_threads(config.torch_threads or threads(policy, rows, config.max_lag, workers).number)
         algorithm = algorithm_class(config.algo)(
             algorithm_config, policy, total_steps=config.steps, seed=config.seed, device=torch_device(config)
         )

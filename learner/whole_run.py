@@ -67,7 +67,7 @@ def _learn_from_prior(run: OpenRun, prior: PriorData) -> None:
         run.setup.check_running()
 
     try:
-        if getattr(run.setup.config.algorithm, "clone_epochs", 0):
+        if run.setup.config.algorithm.clone_epochs:
             if metrics := started_by("clone_epochs")(algorithm, prior.batches(), pulse):
                 run.audience.cloned(metrics)
             state = run.parts.tally.state

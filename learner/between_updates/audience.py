@@ -56,8 +56,7 @@ class Audience:
     def cloned(self, metrics: Mapping[str, float]) -> None:
         """Report that the policy was cloned, with these metrics."""
         found = ", ".join(f"{name.rpartition('/')[2].replace('_', ' ')} {number:.3g}" for name, number in metrics.items())
-        epochs: int = getattr(self._config.algorithm, "clone_epochs", 0)
-        log_notice(log, f"cloned {self._config.prior} in {epochs} epochs: {found}")
+        log_notice(log, f"cloned {self._config.prior} in {self._config.algorithm.clone_epochs} epochs: {found}")
         self._update = {"metrics": named(metrics)}
         self._files.write_row(self.progress(), metrics)
 

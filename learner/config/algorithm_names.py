@@ -10,6 +10,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping
 from functools import cache
+from inspect import isdatadescriptor
 from typing import Any
 
 import msgspec
@@ -48,6 +49,9 @@ FOR_PRIOR = ("add_prior", "learn_from_prior")
 
 NOT_SETTINGS = {"config", "preset", "resume", "log_json", "debug", "progress"}
 """Flags and arguments of `millrace train` and `millrace.train` that are not settings."""
+
+ASKED = {name for name, value in vars(AlgorithmConfig).items() if not isdatadescriptor(value)}
+"""Names of what millrace asks of every record of settings, which no setting may have."""
 
 _given: dict[str, type] = {}
 """The classes that were passed in Python and can't be imported, by name. A newer class replaces one with the same name."""
@@ -163,6 +167,8 @@ def _what_is_wrong_with_settings(record: type[AlgorithmConfig]) -> str:
     own = set(record.__struct_fields__) - set(AlgorithmConfig.__struct_fields__)
     if shadows := own & ({*Config.__struct_fields__} | NOT_SETTINGS):
         return f"its setting {min(shadows)} has the name of a setting of the run; give it another name"
+    if shadows := own & ASKED:
+        return f"its setting {min(shadows)} has the name of an attribute of AlgorithmConfig; give it another name"
     try:
         declared(record, by_type=True)
         required = [field.name for field in msgspec.structs.fields(record) if field.required]

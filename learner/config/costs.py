@@ -19,21 +19,12 @@ MANY_MULTIPLY_ADDS = 1 << 24  # per observation; Atari's four frames of 84 x 84 
 PASSES = 3  # the cost of a forward and a backward pass, in forward passes; a backward pass costs as much as two
 
 
-def minibatch_rows(config: Config) -> int:
-    """The number of rows in a minibatch. Without a setting that divides updates into minibatches, all rows of an update."""
-    batch_size = getattr(config.algorithm, "batch_size", None)
-    if isinstance(batch_size, int):
-        return batch_size
-    minibatches = getattr(config.algorithm, "minibatches", 1)
-    return config.envs * config.algorithm.rollout_steps // (minibatches if isinstance(minibatches, int) else 1)
-
-
 def large_observations(config: Config, policy: PolicySpec) -> str:
     """A warning about the cost of a minibatch, if observations are large; otherwise empty."""
     if (of_one := multiply_adds(policy)) < MANY_MULTIPLY_ADDS:
         return ""
     numbers = sum(math.prod(leaf.shape) for leaf in policy.observation)
-    rows = minibatch_rows(config)
+    rows = config.algorithm.minibatch_rows(config.envs)
     smaller = (
         '--wrappers "gymnasium.wrappers:ResizeObservation(shape=(84, 84))"'
         if any(leaf.is_image for leaf in policy.observation)

@@ -2,17 +2,22 @@
 
 The settings are plain data, separate from the algorithms, so reading a command line needs no torch. Your own algorithm names
 its record in its attribute `Config` (learner/config/algorithm_names.py).
+
+Rule: other files ask an algorithm's record what the algorithm can do, through `AlgorithmConfig`. If they need a setting that
+only some algorithms have, `AlgorithmConfig` has a property of the same name: its value for algorithms without the setting.
 """
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import msgspec
 
 from millrace.flags.fields import Flag, NotNegative, Positive
 from millrace.learner.config.resume_rules import Fixed, Free
 from millrace.protocol.bounds import Count, Natural
+from millrace.protocol.errors import UsageError
+from millrace.protocol.own_module import is_name
 
 Fraction = Annotated[float, msgspec.Meta(ge=0, le=1)]
 Schedule = Literal["constant", "linear"]
@@ -43,9 +48,55 @@ class AlgorithmConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
     gamma: Fixed[Fraction] = 0.99
     """Discount factor."""
 
+    replays: ClassVar[bool] = False
+    """Whether the algorithm learns from a replay buffer."""
+    only_clones: ClassVar[bool] = False
+    """Whether the algorithm can do nothing with prior data but clone it."""
+
+    @property
+    def core(self) -> str | None:
+        """The kind of recurrent layer."""
+        return None
+
+    @property
+    def gradient_steps(self) -> int | None:
+        """The number of gradient steps in an update; None if it depends on the number of rows."""
+        return None
+
+    @property
+    def replay_size(self) -> int:
+        """The capacity of the replay buffer."""
+        return 0
+
+    @property
+    def learning_starts(self) -> int:
+        """The number of env steps before the first gradient step."""
+        return 0
+
+    @property
+    def clone_epochs(self) -> int:
+        """The number of epochs of cloning before the first rollouts."""
+        return 0
+
+    @property
+    def prior_steps(self) -> int:
+        """The number of gradient steps on only prior data before the first rollouts."""
+        return 0
+
+    def minibatch_rows(self, envs: int) -> int:
+        """The number of rows in a minibatch of an update, which has the rollouts of this number of env copies."""
+        return envs * self.rollout_steps
+
+    def check(self) -> None:
+        """Raise `UsageError` if these settings, each valid on its own, aren't valid together."""
+        if self.encoder is not None and not is_name(self.encoder):
+            raise UsageError(f"encoder {self.encoder}: expected module:factory, as in my_package.networks:encoder")
+
 
 class PolicyGradientConfig(AlgorithmConfig, frozen=True):
     """Settings of every algorithm with an actor and a critic."""
+
+    only_clones: ClassVar[bool] = True
 
     shared_net: Fixed[bool] = False
     """Let actor and critic share their hidden layers."""
@@ -81,6 +132,12 @@ class RecurrentConfig(PolicyGradientConfig, frozen=True):
     core_size: Fixed[Count] = 64
     """Number of units of the recurrent layer."""
 
+    def check(self) -> None:
+        """See `AlgorithmConfig`."""
+        if self.core is not None and self.clone_epochs:
+            raise UsageError(f"clone_epochs: expected 0 with a recurrent core, got {self.clone_epochs}; take --core none")
+        super().check()
+
 
 class ActorCriticConfig(RecurrentConfig, frozen=True):
     """Settings of an actor-critic with generalized advantage estimation and several epochs of minibatches."""
@@ -93,6 +150,10 @@ class ActorCriticConfig(RecurrentConfig, frozen=True):
     """λ of generalized advantage estimation. 1: Monte Carlo return. 0: one-step TD error."""
     normalize_advantage: Free[bool] = True
     """Normalize the advantages of each minibatch to mean 0 and standard deviation 1, unless the policy was cloned."""
+
+    def minibatch_rows(self, envs: int) -> int:
+        """See `AlgorithmConfig`."""
+        return self.batch_size
 
 
 class PPOConfig(ActorCriticConfig, frozen=True):
@@ -153,6 +214,10 @@ class IMPALAConfig(RecurrentConfig, frozen=True):
     reaches.
     """
 
+    def minibatch_rows(self, envs: int) -> int:
+        """See `AlgorithmConfig`."""
+        return envs * self.rollout_steps // self.minibatches
+
 
 class REINFORCEConfig(PolicyGradientConfig, frozen=True):
     """Monte Carlo policy gradient on whole episodes (Williams 1992)."""
@@ -173,6 +238,8 @@ class REINFORCEConfig(PolicyGradientConfig, frozen=True):
 
 class OffPolicyConfig(AlgorithmConfig, frozen=True):
     """Settings of every algorithm that learns from a replay buffer."""
+
+    replays: ClassVar[bool] = True
 
     rollout_steps: Free[Count] = 32
     """T, the number of steps of each env copy in a rollout."""
@@ -227,6 +294,10 @@ class OffPolicyConfig(AlgorithmConfig, frozen=True):
     """When rewards are drawn from the buffer, divide them by the running standard deviation of the discounted return, and
     clip them to ±10. With n_step, the sum of n rewards is clipped.
     """
+
+    def minibatch_rows(self, envs: int) -> int:
+        """See `AlgorithmConfig`."""
+        return self.batch_size
 
 
 class QLearningConfig(OffPolicyConfig, frozen=True):
@@ -306,6 +377,12 @@ class RainbowConfig(QLearningConfig, frozen=True):
     """Final probability ε of a random action."""
     max_grad_norm: Free[Positive | None] = 10.0
     """Clip the norm of the gradient to this. none: no clipping."""
+
+    def check(self) -> None:
+        """See `AlgorithmConfig`."""
+        if self.core is not None:
+            raise UsageError(f"core: rainbow has no memory: expected none, got {self.core}; take --algo dqn")
+        super().check()
 
 
 class ContinuousConfig(OffPolicyConfig, frozen=True):

@@ -11,7 +11,6 @@ import msgspec
 from millrace.flags.values import convert
 from millrace.learner.config.config import TABLES, Config
 from millrace.learner.config.evaluation_size import evaluation_size
-from millrace.learner.config.hyperparameters import OffPolicyConfig, PolicyGradientConfig, RainbowConfig, RecurrentConfig
 from millrace.learner.config.rollout_config import RolloutConfig
 from millrace.learner.run_folder.results import METRICS_BESIDE_FACTS
 from millrace.protocol.address import advertised_address, check_address
@@ -20,7 +19,6 @@ from millrace.protocol.env_spec import check_arguments
 from millrace.protocol.envs.kinds_of_copies import check_kind
 from millrace.protocol.envs.wrappers import wrapper_name
 from millrace.protocol.errors import UsageError, safe_repr
-from millrace.protocol.own_module import is_name
 
 MOST_TICKETS = 1 << 15  # limit on outstanding tickets, because one worker may get them all in one message
 LARGEST_SEED = 2**64 - 1  # the largest seed that PyTorch accepts
@@ -32,21 +30,13 @@ def validate(config: Config) -> None:
         raise UsageError("which environment? expected one that gymnasium.make takes, as in: millrace train CartPole-v1")
     check_rollout_settings(config)
     _check_env_arguments(config)
-    match config.algorithm:
-        case OffPolicyConfig(replay_size=size, rollout_steps=steps) if size < (
-            most := (steps + 1) * config.envs // config.lanes
-        ):
-            raise UsageError(f"replay_size {size}: a rollout takes up to {most}; take --replay-size {most} or more")
-        case RainbowConfig(core=str(core)):
-            raise UsageError(f"core: rainbow has no memory: expected none, got {core}; take --algo dqn")
+    config.algorithm.check()
+    _check_replay_size(config)
     if config.inference == "learner":
         _check_learner_inference(config)
     _check_prior(config)
     _check_shards(config)
     check_copies(config, "max_env_copies", config.max_env_copies)
-    encoder = getattr(config.algorithm, "encoder", None)
-    if encoder is not None and not is_name(encoder):
-        raise UsageError(f"encoder {encoder}: expected module:factory, as in my_package.networks:encoder")
 
 
 def check_table(value: object, origin: str) -> None:
@@ -121,7 +111,7 @@ def unused_setting(config: Config) -> str:
     A setting has no effect if the run ends before the first gradient step, or if the setting needs evaluations during
     training and there are none.
     """
-    if isinstance(config.algorithm, OffPolicyConfig) and config.steps <= config.algorithm.learning_starts:
+    if config.steps <= config.algorithm.learning_starts:
         return (
             f"learning_starts {config.algorithm.learning_starts:,}: nothing is learned in the {config.steps:,} env steps of "
             f"this run; take --learning-starts {config.steps // 10} or more --steps"
@@ -203,6 +193,13 @@ def _check_env_arguments(config: Config) -> None:
                 raise UsageError(f"{table} {name}: {expected}, got {value}; leave it out, or take a large one")
 
 
+def _check_replay_size(config: Config) -> None:
+    size = config.algorithm.replay_size
+    most = (config.algorithm.rollout_steps + 1) * config.envs // config.lanes
+    if 0 < size < most:
+        raise UsageError(f"replay_size {size}: a rollout takes up to {most}; take --replay-size {most} or more")
+
+
 def _check_learner_inference(config: Config) -> None:
     if config.vector != "loop":
         wrong = f"vector: expected loop, got {config.vector}; its workers step copies one by one"
@@ -218,24 +215,19 @@ def _check_learner_inference(config: Config) -> None:
 def _check_shards(config: Config) -> None:
     if config.lanes % config.shards:
         raise UsageError(f"shards: expected a divisor of lanes {config.lanes}, got {config.shards}")
-    match config.algorithm:
-        case OffPolicyConfig() if config.shards > 1:
-            raise UsageError(
-                f"shards {config.shards}: {config.algo} learns in one process; expected ppo, a2c, impala or reinforce"
-            )
+    if config.algorithm.replays and config.shards > 1:
+        raise UsageError(
+            f"shards {config.shards}: {config.algo} learns in one process; expected ppo, a2c, impala or reinforce"
+        )
 
 
 def _check_prior(config: Config) -> None:
-    match config.algorithm:
-        case PolicyGradientConfig(clone_epochs=0) if config.prior:
-            raise UsageError(f"prior {config.prior}: {config.algo} can only clone it; add --clone-epochs 50")
-        case RecurrentConfig(core=str(), clone_epochs=epochs) if epochs:
-            raise UsageError(f"clone_epochs: expected 0 with a recurrent core, got {epochs}; take --core none")
-        case OffPolicyConfig(core=str()) if config.prior:
-            raise UsageError(
-                f"prior {config.prior}: expected core none, because datasets have no states of a core; drop --core"
-            )
-    for name in ("prior_steps", "clone_epochs"):
-        number: int = getattr(config.algorithm, name, 0)
-        if number and not config.prior:
-            raise UsageError(f"{name}: expected 0 without prior data, got {number}; name it by --prior")
+    algorithm = config.algorithm
+    if not config.prior:
+        for name, number in (("prior_steps", algorithm.prior_steps), ("clone_epochs", algorithm.clone_epochs)):
+            if number:
+                raise UsageError(f"{name}: expected 0 without prior data, got {number}; name it by --prior")
+    elif algorithm.only_clones and not algorithm.clone_epochs:
+        raise UsageError(f"prior {config.prior}: {config.algo} can only clone it; add --clone-epochs 50")
+    elif algorithm.replays and algorithm.core is not None:
+        raise UsageError(f"prior {config.prior}: expected core none, because datasets have no states of a core; drop --core")

@@ -19,7 +19,7 @@ def field_texts(record: type) -> dict[str, str]:
         body = _class_body(base)
         for statement, following in itertools.pairwise(body):
             match statement, following:
-                case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(value=ast.Constant(value=str(text))):
+                case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(value=ast.Constant(value=str(text))) if name in texts:
                     texts[name] = " ".join(text.split())
     return texts
 

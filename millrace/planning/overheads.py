@@ -19,8 +19,6 @@ import msgspec
 
 from millrace.learner.algorithms import algorithm_class
 from millrace.learner.config.config import Config
-from millrace.learner.config.costs import minibatch_rows
-from millrace.learner.config.hyperparameters import OffPolicyConfig, QLearningConfig
 from millrace.learner.config.local_workers import local_workers
 from millrace.learner.update_time import UpdateTime, update_time
 from millrace.planning.measurements import Overheads
@@ -173,12 +171,11 @@ def _update(config: Config, env: StoodFor) -> tuple[UpdateTime, bool]:
 def _steps_of_update(config: Config) -> int:
     """Number of steps in a measured rollout. It is smaller than in a run if an update's time is proportional to it."""
     steps = config.algorithm.rollout_steps
-    match config.algorithm:
-        case QLearningConfig():  # a setting determines the number of gradient steps in an update
-            return steps
-        case OffPolicyConfig():
-            return max(1, steps // 4)
-    of_minibatches = -(-MINIBATCHES * minibatch_rows(config) // config.envs)
+    if config.algorithm.gradient_steps is not None:  # a setting determines their number in an update
+        return steps
+    if config.algorithm.replays:
+        return max(1, steps // 4)
+    of_minibatches = -(-MINIBATCHES * config.algorithm.minibatch_rows(config.envs) // config.envs)
     return min(steps, max(SHORT, of_minibatches))
 
 

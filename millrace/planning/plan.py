@@ -9,7 +9,6 @@ import msgspec
 
 from millrace.arguments import checked
 from millrace.learner.config.config import Config
-from millrace.learner.config.hyperparameters import OffPolicyConfig
 from millrace.learner.config.layers import resolve
 from millrace.learner.config.update_size import least_rollout
 from millrace.planning.advice import about_measurements
@@ -109,7 +108,7 @@ def plan_of(env: ProbedEnv, *, max_env_copies: int, seconds: float, say: Callabl
     others = allowed.settings
     if measured.masks_in_info:
         others.append(ChosenSetting("action_masks", "info", "the infos contain masks of the allowed actions"))
-    if isinstance(config.algorithm, OffPolicyConfig):
+    if config.algorithm.replays:
         replay_size = choose_replay_size(config.algorithm.replay_size, measured, machine)
         others += [] if replay_size is None else [replay_size]
     step_timeout = choose_step_timeout(config.step_timeout_s, measured)
@@ -144,7 +143,7 @@ def _decided(
     chosen += others
     needed = NEEDED_STEPS[config.algo]
     advice = about_measurements(sizes, situation, _rate)
-    if isinstance(config.algorithm, OffPolicyConfig):
+    if config.algorithm.learning_starts:
         no_updates = msgspec.structs.replace(situation.overheads, update_s=0.0)
         before = msgspec.structs.replace(situation, overheads=no_updates)
         if line := about_first_steps(config.algo, config.algorithm.learning_starts, _rate(sizes, before)):

@@ -18,7 +18,6 @@ import millrace
 from millrace.launch.crew import crew_of_run, worker_cores
 from millrace.learner import torch_setup
 from millrace.learner.between_updates.crowded_cores import CrowdedCores
-from millrace.learner.config.costs import minibatch_rows
 from millrace.learner.config.layers import resolve
 from millrace.learner.run_folder.run_format import POLICY_ARRAYS
 from millrace.learner.torch_setup import one_thread, threads
@@ -140,10 +139,10 @@ def test_an_encoder_has_the_threads_that_its_work_is_worth(
 
 def test_the_rows_of_a_minibatch_follow_from_the_settings() -> None:
     settings: dict[str, Any] = {"envs": 8, "rollout_steps": 16, "preset": "none"}
-    assert minibatch_rows(resolve("CartPole-v1", algo="ppo", batch_size=32, **settings)) == 32
-    assert minibatch_rows(resolve("CartPole-v1", algo="a2c", **settings)) == 8 * 16
-    assert minibatch_rows(resolve("CartPole-v1", algo="impala", minibatches=4, **settings)) == 8 * 4
-    assert minibatch_rows(resolve("CartPole-v1", algo="dqn", batch_size=128, **settings)) == 128
+    assert resolve("CartPole-v1", algo="ppo", batch_size=32, **settings).algorithm.minibatch_rows(8) == 32
+    assert resolve("CartPole-v1", algo="a2c", **settings).algorithm.minibatch_rows(8) == 8 * 16
+    assert resolve("CartPole-v1", algo="impala", minibatches=4, **settings).algorithm.minibatch_rows(8) == 8 * 4
+    assert resolve("CartPole-v1", algo="dqn", batch_size=128, **settings).algorithm.minibatch_rows(8) == 128
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ import re
 import sys
 import tomllib
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from types import FunctionType, ModuleType
 from typing import Annotated, Any
@@ -20,6 +21,7 @@ from millrace.learner.config.config import Config
 from millrace.learner.config.hyperparameters import HYPERPARAMETERS, AlgorithmConfig
 from millrace.learner.config.layers import config_from_toml, config_of_run, resolve
 from millrace.learner.config.resume_rules import Free, OnResume, declared
+from millrace.learner.config.validation import unused_setting
 from millrace.learner.resume_checks import check_settings
 from millrace.learner.run_folder.newest_run import newest_run
 from millrace.learner.run_folder.run_folder import RunFolder
@@ -81,6 +83,19 @@ class Shadowing(Base):
         eval_every: int = 3
 
 
+class Misleading(Base):
+    class Config(AlgorithmConfig, frozen=True):
+        check: float = 0.5
+
+
+class Replaying(Base):
+    class Config(AlgorithmConfig, frozen=True):
+        replays = True
+        replay_size: int = 200
+        learning_starts: int = 1000
+        core: str = "mine"
+
+
 class Required(Base):
     class Config(AlgorithmConfig, frozen=True):
         needed: int
@@ -140,6 +155,17 @@ def test_each_algorithm_of_ours_has_the_record_of_its_settings_as_a_user_s_has()
         assert algorithm_class(name).Config is HYPERPARAMETERS[name]
         assert name_of(algorithm_class(name)) == name
         assert settings_record(name) is HYPERPARAMETERS[name]
+
+
+def test_what_it_can_do_is_asked_of_its_record_whose_base_does_not_matter() -> None:
+    replaying = partial(resolve, "CartPole-v1", algo="own_module:Replaying", preset="none")
+    assert refusal(partial(replaying, envs=8)).startswith("replay_size 200: a rollout takes up to 258; take")
+    assert refusal(partial(replaying, envs=4, shards=2)).startswith("shards 2: own_module:Replaying learns in one process")
+    assert refusal(partial(replaying, envs=4, prior="a/b-v0")).startswith("prior a/b-v0: expected core none")
+    assert unused_setting(replaying(envs=4, steps=1000)).startswith("learning_starts 1,000: nothing is learned")
+    others = resolve("CartPole-v1", algo="own_module:Mine", preset="none", envs=4, prior="a/b-v0", shards=2)
+    assert others.algorithm.minibatch_rows(others.envs) == 4 * 16
+    assert not unused_setting(others)
 
 
 def test_its_settings_are_flags_keys_and_keywords(tmp_path: Path) -> None:
@@ -215,6 +241,7 @@ def test_a_setting_in_the_wrong_table_is_refused(tmp_path: Path) -> None:
         ),
         ("own_module:NoConfig", "Config: expected a class derived from ActorCriticConfig or .*, got <class 'dict'>"),
         ("own_module:Shadowing", "its setting eval_every has the name of a setting of the run; give it another name"),
+        ("own_module:Misleading", "its setting check has the name of an attribute of AlgorithmConfig; give it another name"),
         ("own_module:Required", "its setting needed: expected a default value, got none"),
         ("own_module:BadDefault", "its setting level: its default does not fit its type: Expected `int`, got `str`.*"),
         ("own_module:NotPlain", "its setting what: expected a default of numbers, text, .*, got <object .*>"),
