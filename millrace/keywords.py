@@ -159,8 +159,8 @@ class TrainKeywords(RolloutKeywords, total=False):
     from_parts: Literal["auto", "policy", "best", "critic", "all"]
     """What `--from` loads. policy: the newest policy and the statistics. best: the policy with the best evaluation.
     critic: also the critic, the target networks and the temperature. all: also the optimizers. The replay buffer is
-    never loaded. auto: critic for sac, td3, tqc, crossq and xqc if that run has a checkpoint, because their actors
-    follow the critic from the first update on; otherwise policy.
+    never loaded. auto: critic for sac and the other algorithms for continuous actions with a replay buffer, because
+    their actors follow the critic from the first update on; policy for all others, and if that run has no checkpoint.
     """
     device: Literal["auto", "cpu", "cuda"]
     """Device of the learner. auto: cuda if PyTorch finds a GPU, else cpu."""

@@ -12,6 +12,7 @@ from importlib import import_module
 from typing import NamedTuple
 
 from benchmarks.markdown_tables import table
+from millrace.learner.config.hyperparameters import HYPERPARAMETERS
 from website.tables import anchored
 
 HEAD = """# Python
@@ -31,6 +32,8 @@ class Group(NamedTuple):
     """names from `millrace` and its public modules, separated by spaces"""
 
 
+BUILT_IN = [record.__name__.removesuffix("Config") for record in HYPERPARAMETERS.values()]
+"""The classes of the built-in algorithms"""
 GROUPS = {
     "training": Group(
         "Train and look at runs",
@@ -63,17 +66,15 @@ GROUPS = {
         "Algorithms",
         "What an algorithm of your own derives from. Importing `millrace.algorithms` imports PyTorch.",
         "algorithms.Algorithm algorithms.GradientDescent algorithms.ActorCritic algorithms.OffPolicy algorithms.Continuous "
-        "algorithms.PPO algorithms.A2C algorithms.IMPALA algorithms.REINFORCE algorithms.DQN "
-        "algorithms.Rainbow algorithms.SAC algorithms.TD3 algorithms.TQC algorithms.CrossQ algorithms.XQC "
+        f"{' '.join(f'algorithms.{name}' for name in BUILT_IN)} "
         "testing.check_algorithm testing.AlgorithmMistakes",
     ),
     "algorithm_settings": Group(
         "Settings of algorithms",
         "The records to derive `Config` from. [Settings](../settings.md) lists what they hold.",
         "algorithms.AlgorithmConfig algorithms.ActorCriticConfig algorithms.OffPolicyConfig algorithms.ContinuousConfig "
-        "algorithms.PPOConfig algorithms.A2CConfig algorithms.IMPALAConfig algorithms.REINFORCEConfig algorithms.DQNConfig "
-        "algorithms.RainbowConfig algorithms.SACConfig algorithms.TD3Config algorithms.TQCConfig algorithms.CrossQConfig "
-        "algorithms.XQCConfig algorithms.Free algorithms.Adaptable algorithms.Fixed",
+        f"{' '.join(f'algorithms.{name}Config' for name in BUILT_IN)} "
+        "algorithms.Free algorithms.Adaptable algorithms.Fixed",
     ),
     "algorithm_data": Group(
         "What algorithms learn from",
@@ -103,9 +104,7 @@ GROUPS = {
     ),
 }
 """The groups, by the names of their pages"""
-WITHOUT_MEMBERS = (
-    "Config", ".PPO", ".A2C", ".IMPALA", ".REINFORCE", ".DQN", ".Rainbow", ".SAC", ".TD3", ".TQC", ".CrossQ", ".XQC",
-)  # fmt: skip
+WITHOUT_MEMBERS = ("Config", *(f".{name}" for name in BUILT_IN))
 """Endings of names whose members are on another page, or are those of a base class"""
 WITH_INHERITED_MEMBERS = {"millrace.Progress"}
 """Names whose base class isn't public"""

@@ -25,19 +25,10 @@ from millrace.protocol.errors import UsageError, did_you_mean, first_line, safe_
 from millrace.protocol.own_module import import_own, is_name
 
 ALGORITHMS = {
-    "ppo": "millrace.learner.algorithms.ppo:PPO",
-    "a2c": "millrace.learner.algorithms.a2c:A2C",
-    "dqn": "millrace.learner.algorithms.dqn:DQN",
-    "rainbow": "millrace.learner.algorithms.rainbow:Rainbow",
-    "impala": "millrace.learner.algorithms.impala:IMPALA",
-    "reinforce": "millrace.learner.algorithms.reinforce:REINFORCE",
-    "sac": "millrace.learner.algorithms.sac:SAC",
-    "td3": "millrace.learner.algorithms.td3:TD3",
-    "tqc": "millrace.learner.algorithms.tqc:TQC",
-    "crossq": "millrace.learner.algorithms.crossq:CrossQ",
-    "xqc": "millrace.learner.algorithms.xqc:XQC",
+    name: f"millrace.learner.algorithms.{name}:{record.__name__.removesuffix('Config')}"
+    for name, record in HYPERPARAMETERS.items()
 }
-"""The `module:Class` of each built-in algorithm. It is imported when it is used."""
+"""The `module:Class` of each built-in algorithm, named like its record. It is imported when it is used."""
 
 NEEDED = (
     "__init__", "policy_spec", "update", "weights", "is_finite", "state_dict", "load_state_dict", "remember", "roll_back",

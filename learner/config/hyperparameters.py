@@ -497,6 +497,7 @@ HYPERPARAMETERS: dict[str, type[AlgorithmConfig]] = {
     "crossq": CrossQConfig,
     "xqc": XQCConfig,
 }
+"""The settings of each built-in algorithm, by its name. Other tables of the algorithms follow from this one."""
 
 
 def algorithms_with(name: str) -> str:

@@ -20,6 +20,7 @@ import millrace
 from millrace.arguments import plain
 from millrace.launch import policy_workers, rollouts, training, vector
 from millrace.launch.private_address import private_address
+from millrace.learner.config.hyperparameters import HYPERPARAMETERS
 from millrace.learner.members.bound import bind
 from tests.support.users_code import own_policies
 
@@ -213,8 +214,7 @@ SURROGATE = "CartPole-v1\ud800"
         (
             millrace.train,
             {"env": "CartPole-v1", "algo": 2},
-            "train: algo: expected one of ppo, a2c, dqn, rainbow, impala, reinforce, sac, td3, tqc, crossq, xqc, "
-            "module:Class or a class, got 2",
+            f"train: algo: expected one of {', '.join(HYPERPARAMETERS)}, module:Class or a class, got 2",
         ),
         (millrace.train, {"resume": 2}, "train: resume: expected text or a path or None, got 2"),
         (millrace.load, {"run": 2}, "load: run: expected text or a path, got 2"),

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from millrace.learner.config.config import Config
-from millrace.learner.config.hyperparameters import HYPERPARAMETERS
+from millrace.learner.config.hyperparameters import HYPERPARAMETERS, algorithms_with
 from millrace.learner.config.layers import resolve
 from millrace.learner.config.other_names import OUR_NAME, in_place_of
 
@@ -59,11 +59,7 @@ def test_the_values_that_the_manual_shows_can_be_written() -> None:
         ("n_envs", True, "; millrace calls it --envs"),
         ("n_steps", True, "; millrace calls it --rollout-steps"),
         ("n_steps", False, "; millrace calls it rollout_steps"),
-        (
-            "buffer_size",
-            True,
-            "; millrace calls it --replay-size; it is one of dqn, rainbow, sac, td3, tqc, crossq, xqc alone",
-        ),
+        ("buffer_size", True, f"; millrace calls it --replay-size{algorithms_with('replay_size')}"),
         ("gradient_steps", True, "; it is one of dqn, rainbow alone"),
         ("stepz", True, ""),
     ],

@@ -20,7 +20,7 @@ from millrace.cli.main import main
 from millrace.cli.train_output import next_commands, result
 from millrace.learner.callbacks.callbacks import Callbacks
 from millrace.learner.config.config import Config
-from millrace.learner.config.hyperparameters import HYPERPARAMETERS
+from millrace.learner.config.hyperparameters import HYPERPARAMETERS, algorithms_with
 from millrace.learner.config.layers import resolve
 from millrace.learner.policy_player import PolicyPlayer
 from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan
@@ -87,7 +87,7 @@ def asked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[Any]:
         (["train", "CartPole-v1", "--zzz"], "train: unknown flag --zzz"),
         (
             ["train", "CartPole-v1", "--algo", "reinforce", "--core", "lstm"],
-            "train: unknown flag --core; it is one of ppo, a2c, dqn, rainbow, impala, sac, td3, tqc, crossq, xqc alone",
+            f"train: unknown flag --core{algorithms_with('core')}",
         ),
         (["train", "--env", "CartPole-v1"], "train: ENV has no flag; expected it as in: millrace train ENV"),
         (["train", "CartPole-v1", "more"], "train: unexpected argument more"),
@@ -120,7 +120,7 @@ def asked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[Any]:
         ),
         (
             ["train", "--preset", "cartpole-dqn", "--algo", "ppo"],
-            "preset cartpole-dqn: unknown setting n_step; it is one of dqn, rainbow, sac, td3, tqc, crossq, xqc alone",
+            f"preset cartpole-dqn: unknown setting n_step{algorithms_with('n_step')}",
         ),
         (["train", "--config", "/no.toml"], "config file /no.toml cannot be read: No such file or directory"),
         (["plot"], "plot: which runs? expected run folders, as in: millrace plot runs/*"),

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from millrace.launch.training import train
+from millrace.learner.config.hyperparameters import algorithms_with
 from millrace.learner.config.layers import resolve
 from millrace.protocol.errors import UsageError
 from tests.system.stage.run_folders import policy_of
@@ -94,7 +95,7 @@ def test_a_run_that_cannot_have_hindsight_is_refused_before_it_begins(tmp_path: 
         run(tmp_path, "no goals", "Pendulum-v1", workers=1)
     with pytest.raises(UsageError, match=r"^hindsight 0.8: expected the reward of a goal, got none; name it, as in "):
         run(tmp_path, "no reward", workers=1, goal_reward=None)
-    with pytest.raises(UsageError, match=r"hindsight.*; it is one of dqn, rainbow, sac, td3, tqc, crossq, xqc alone"):
+    with pytest.raises(UsageError, match=f"hindsight.*{algorithms_with('hindsight')}"):
         resolve(REACH, algo="ppo", hindsight=0.8)
     assert not [*tmp_path.glob("*/*")]
 
