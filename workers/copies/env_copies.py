@@ -36,12 +36,6 @@ from millrace.workers.copies.saved_state import CannotSave, SavedCopy, load, sav
 Leaves = Sequence[Any]
 
 
-CANNOT_RESTART = (
-    "restart_episodes: the env copies of training are not made anew, because nobody could go on with the random numbers of "
-    "their environment; expected a reset that calls super().reset(seed=seed), and no ResetAhead"
-)
-
-
 class SeatColumns(NamedTuple):
     """The part of a step's result that exists only with seats, for N copies with A seats each."""
 
@@ -200,7 +194,6 @@ class LoopedCopies:
         autoreset: Autoreset = "Disabled" if evaluates else "NextStep"
         stepping = EVALUATING if evaluates else STEPPING
         self._attributes: dict[str, bytes] = {}  # attributes that were set on every copy, by name; the values are packed
-        self._restart_episodes = settings.restart_episodes
         self._loop = EnvLoop(
             makes,
             pulse,
@@ -231,7 +224,7 @@ class LoopedCopies:
         copies = range(len(seeds))
         infos = self._loop.reset(copies, seeds, self._observations, pulse)
         leaves = self._after_reset(copies, infos).leaves
-        self.note = self._never_anew()
+        self.note = self._loop.never_anew()
         if self._masks is None:
             self.note = self.note or unused_mask((info for _, info in infos), self.action_space)
         return leaves
@@ -264,12 +257,6 @@ class LoopedCopies:
         for name, packed in self._attributes.items():
             set_attribute(which.copy, env, name, unpack(packed))
         return env
-
-    def _never_anew(self) -> str:
-        """Why copies are never recreated although the run asks for that; empty if they are, or if the run doesn't ask."""
-        if not self._restart_episodes or self._loop.random_state(0) is not None:
-            return ""
-        return CANNOT_RESTART
 
     def _fill_in(self, copies: Sequence[int]) -> None:
         """Fill the row of each copy that was never reset with the observation of another copy, because no row

@@ -50,6 +50,10 @@ Pulse = Callable[[], None]
 
 CHECKED_STEPS = 2  # in how many of the first steps numbers are checked; two, because one may be a reset
 PULSE_S = 0.05  # a loop over slow copies calls `pulse` at this interval
+CANNOT_RESTART = (
+    "restart_episodes: the env copies of training are not made anew, because nobody could go on with the random numbers of "
+    "their environment; expected a reset that calls super().reset(seed=seed), and no ResetAhead"
+)
 
 
 class EnvLoop:
@@ -249,6 +253,10 @@ class EnvLoop:
             else:
                 with self._activity.during(self.stepping):
                     load(env, saved)
+
+    def never_anew(self) -> str:
+        """Why no copy can be recreated although the run asks for that; empty if copies can be, or if the run doesn't ask."""
+        return CANNOT_RESTART if self._restart_episodes and self.random_state(0) is None else ""
 
     def _saved(self, n: int) -> SavedCopy | None:
         """The saved state of copy n; None if its environment can't save it."""

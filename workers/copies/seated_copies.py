@@ -47,7 +47,7 @@ class SeatedCopies(LoopedCopies):
         copies = range(len(seeds))
         self._allowed = [None] * (self.count * self._seats)
         self._loop.reset(copies, seeds, self._observations, pulse)
-        self.note = self._never_anew()
+        self.note = self._loop.never_anew()
         if self._masks is None:
             infos = [info for step in self._observations if step is not None for info in step.infos]
             self.note = self.note or unused_mask(infos, self.action_space)

@@ -16,8 +16,9 @@ from millrace.protocol.envs.tuple_of_agents import TupleOfAgents
 from millrace.protocol.errors import UsageError
 from millrace.protocol.random_streams import Purpose, env_seed
 from millrace.protocol.wire.plain_values import pack
-from millrace.workers.copies.env_copies import CANNOT_RESTART, CopySettings, LoopedCopies
+from millrace.workers.copies.env_copies import CopySettings, LoopedCopies
 from millrace.workers.copies.env_errors import CopyFailed
+from millrace.workers.copies.env_loop import CANNOT_RESTART
 from millrace.workers.copies.reset_ahead import ResetAhead
 from millrace.workers.copies.seated_copies import SeatedCopies
 from tests.support.in_process.collectors import no_pulse
