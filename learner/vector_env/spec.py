@@ -41,9 +41,8 @@ class VectorEnvDescription:
     """gymnasium's `EnvSpec` if all copies have the same registered id; otherwise None"""
 
 
-@dataclass(frozen=True)
-class RequestedCopies:
-    """The env copies that the settings ask for, before their spaces are known."""
+class RequestedCopies(SessionTerms, frozen=True, kw_only=True):
+    """The env copies that the settings ask for, before their spaces are known: the part of a `StepSpec` without them."""
 
     envs: tuple[EnvSpec, ...]
     """the different environments, each listed once"""
@@ -53,7 +52,6 @@ class RequestedCopies:
     """the number of copies of each lane"""
     autoreset: Literal["NextStep", "SameStep", "Disabled"]
     render_mode: str | None
-    terms: SessionTerms
     learner_timeout_s: float
     evaluation_copies: int
     """the number of evaluation copies, which are the last ones"""
@@ -66,22 +64,15 @@ class RequestedCopies:
     @property
     def wait(self) -> WaitSpec:
         """The spec that is sent to workers that join before the spaces of the copies are known."""
-        return WaitSpec(learner_timeout_s=self.learner_timeout_s, **asdict(self.terms))
+        return WaitSpec(**{name: getattr(self, name) for name in WaitSpec.__struct_fields__})
 
     def description(self, env: DescribedEnv) -> VectorEnvDescription:
         """The vector environment of these copies. Raises `UsageError` for spaces that are not supported."""
         step = StepSpec(
-            envs=self.envs,
-            copies=self.copies,
-            lanes=self.lanes,
             observation=leaves_with_own_dtype(env.observation_space),
             action=_action_leaves(env.action_space),
-            autoreset=self.autoreset,
-            render_mode=self.render_mode,
-            learner_timeout_s=self.learner_timeout_s,
-            evaluation_copies=self.evaluation_copies,
             seats=env.seats,
-            **asdict(self.terms),
+            **asdict(self),
         )
         check_can_be_sent(self.envs[0].id, step)
         metadata = {**env.metadata, "autoreset_mode": AutoresetMode(step.autoreset)}
@@ -121,9 +112,9 @@ def requested_copies(settings: VectorEnvSettings, learner_timeout_s: float = mat
         lanes=settings.lane_sizes,
         autoreset=_autoreset_mode(settings.autoreset_mode),
         render_mode=settings.render_mode,
-        terms=settings.terms,
         learner_timeout_s=learner_timeout_s,
         evaluation_copies=N if settings.evaluates else settings.single_lanes,
+        **asdict(settings.terms),
     )
 
 
