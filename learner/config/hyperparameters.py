@@ -499,6 +499,9 @@ HYPERPARAMETERS: dict[str, type[AlgorithmConfig]] = {
 }
 """The settings of each built-in algorithm, by its name. Other tables of the algorithms follow from this one."""
 
+WITHOUT_REPLAY = [name for name, record in HYPERPARAMETERS.items() if not record.replays]
+"""The names of the built-in algorithms without a replay buffer."""
+
 
 def algorithms_with(name: str) -> str:
     """The end of an error: which algorithms have a setting of this name; empty if none of them has one."""

@@ -11,6 +11,7 @@ import msgspec
 from millrace.flags.values import convert
 from millrace.learner.config.config import TABLES, Config
 from millrace.learner.config.evaluation_size import evaluation_size
+from millrace.learner.config.hyperparameters import WITHOUT_REPLAY
 from millrace.learner.config.rollout_config import RolloutConfig
 from millrace.learner.run_folder.results import METRICS_BESIDE_FACTS
 from millrace.protocol.address import advertised_address, check_address
@@ -216,9 +217,9 @@ def _check_shards(config: Config) -> None:
     if config.lanes % config.shards:
         raise UsageError(f"shards: expected a divisor of lanes {config.lanes}, got {config.shards}")
     if config.algorithm.replays and config.shards > 1:
-        raise UsageError(
-            f"shards {config.shards}: {config.algo} learns in one process; expected ppo, a2c, impala or reinforce"
-        )
+        *names, last = WITHOUT_REPLAY
+        expected = f"expected {', '.join(names)} or {last}"
+        raise UsageError(f"shards {config.shards}: {config.algo} learns in one process; {expected}")
 
 
 def _check_prior(config: Config) -> None:

@@ -27,6 +27,7 @@ from millrace.learner.algorithms.algorithm import Start
 from millrace.learner.algorithms.gradient_descent import ADVICE, UpdateMetrics, check_finite
 from millrace.learner.algorithms.minibatches import Minibatch, Observations, UpdateRows, WholeBatch
 from millrace.learner.config.config import Config
+from millrace.learner.config.hyperparameters import WITHOUT_REPLAY
 from millrace.learner.shards.division import narrowed, pairwise_sum, part_of, widened
 from millrace.learner.shards.learners import Learners
 from millrace.learner.shards.messages import Learn
@@ -184,7 +185,7 @@ def sharded(algorithm: type[Algorithm], shards: int) -> type[Sharded]:
     """Make the class of an algorithm with shards. Raises `UsageError` if it can't have shards."""
     if not issubclass(algorithm, ActorCritic):
         raise UsageError(
-            f"shards {shards}: {algorithm.__name__} learns in one process; expected ppo, a2c, impala, reinforce or a "
+            f"shards {shards}: {algorithm.__name__} learns in one process; expected {', '.join(WITHOUT_REPLAY)} or a "
             "subclass of millrace.algorithms.ActorCritic"
         )
     for name in ("step", "gradient", "rows"):
