@@ -44,8 +44,8 @@ class SavedPolicy(NamedTuple):
     env: EnvSpec
     parameters: Floats
     buffers: Floats
-    facts: tuple[str, ...] = ()
-    """the names of the values that the run logs for each episode"""
+    info_keys: tuple[str, ...] = ()
+    """names of numbers that the environment reports in `info` when an episode ends"""
     masked: bool = False
     """whether the environment says which actions are allowed"""
     seats: tuple[str, ...] = ()
@@ -70,7 +70,7 @@ def saved_policy(
     of_settings = [wrapper for wrapper in card.wrappers if wrapper in (SEAT_ID, WITH_STATE)]
     outer = card.wrappers if wrappers is None else [*wrappers, *of_settings]
     spec = EnvSpec.of(card.env if env is None else env, card.env_kwargs, outer, card.eval_env_kwargs)
-    return SavedPolicy(card.policy, spec, parameters, buffers, card.facts, card.masked, card.seats, card.teams)
+    return SavedPolicy(card.policy, spec, parameters, buffers, card.info_keys, card.masked, card.seats, card.teams)
 
 
 class PolicyPlayer:
@@ -92,25 +92,15 @@ class PolicyPlayer:
         description, if a worker has already made one. Raises `UsageError` if one policy cannot play against the other.
         """
         self.policy = policy
-        if policy.against is not None:
-            _check_rival(policy, policy.against)
+        # One lane for each worker of this program, because the failures of a worker without a lane don't count.
+        settings = msgspec.structs.replace(settings, lanes=max(1, lobby.processes.expected))
+        self.run = _run_to_play(policy, settings)
         self._lobby = lobby
         self._check_interrupt = check_interrupt
         self._watch = watch
         self._settings = settings
         self._described = described
         self._hub: Hub | None = None
-
-    @property
-    def teams(self) -> tuple[tuple[int, ...], ...]:
-        """The seats of each team, if another policy plays the other teams."""
-        against = self.policy.against
-        return () if against is None else self.policy.teams or against.card.teams or teams_of(self.policy.seats)
-
-    @property
-    def facts(self) -> tuple[str, ...]:
-        """The names of the facts that are logged for the episodes that were played."""
-        return self.policy.facts if self._hub is None else self._hub.coordinator.run.facts
 
     @property
     def workers(self) -> int:
@@ -157,32 +147,37 @@ class PolicyPlayer:
 
     def _published(self) -> Hub:
         policy = self.policy
-        # One lane for each worker of this program, because the failures of a worker without a lane don't count.
-        lanes = max(1, self._lobby.processes.expected)
-        settings = msgspec.structs.replace(self._settings, lanes=lanes)
-        run = RunSpec(
-            policy.env,
-            policy.spec,
-            rollout_steps=1,
-            copies=1,
-            lanes=lanes,
-            seed=0,
-            facts=policy.facts,
-            masked=policy.masked,
-            seats=policy.seats,
-            takes_turns=bool(policy.seats),  # with several agents, they may take turns
-            **msgspec.structs.asdict(settings.terms()),
-        )
-        if (against := policy.against) is None:
-            hub = open_hub(settings, run, self._lobby, self._check_interrupt)
-        else:
-            keys = tuple(key for key in run.info_keys if key != SCORE)[: MAX_FACTS - 1]
-            run = msgspec.structs.replace(run, teams=self.teams, facts=(*keys, SCORE), opponent=against.card.policy)
+        pool = None
+        if policy.against is not None:
             pool = OpponentPool(PoolSettings(seed=0, window=1, save_steps=1, latest=0.0, max_lag=0))
-            hub = open_hub(settings, run, self._lobby, self._check_interrupt, opponents=pool)
-            hub.publish(RIVAL, against.parameters, against.buffers, deal=False, env_steps=0)
+        hub = open_hub(self._settings, self.run, self._lobby, self._check_interrupt, opponents=pool)
+        if policy.against is not None:
+            hub.publish(RIVAL, policy.against.parameters, policy.against.buffers, deal=False, env_steps=0)
         hub.publish(POLICY, policy.parameters, policy.buffers, deal=False)
         return hub
+
+
+def _run_to_play(policy: SavedPolicy, settings: RolloutConfig) -> RunSpec:
+    """The specification that `Welcome` sends to workers. Raises `UsageError` if one policy can't play against the other."""
+    run = RunSpec(
+        policy.env,
+        policy.spec,
+        rollout_steps=1,
+        copies=1,
+        lanes=settings.lanes,
+        seed=0,
+        info_keys=policy.info_keys,
+        masked=policy.masked,
+        seats=policy.seats,
+        takes_turns=bool(policy.seats),  # with several agents, they may take turns
+        **msgspec.structs.asdict(settings.terms()),
+    )
+    if (against := policy.against) is None:
+        return run
+    _check_rival(policy, against)
+    keys = tuple(key for key in policy.info_keys if key != SCORE)[: MAX_FACTS - 1]
+    teams = policy.teams or against.card.teams or teams_of(policy.seats)
+    return msgspec.structs.replace(run, teams=teams, info_keys=keys, opponent=against.card.policy)
 
 
 def _check_rival(policy: SavedPolicy, against: StoredPolicy) -> None:

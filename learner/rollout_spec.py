@@ -13,7 +13,7 @@ from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.envs.kinds_of_copies import has_masks
 from millrace.protocol.errors import UsageError
 from millrace.protocol.policy.layout import acting_size
-from millrace.protocol.specs import SCORE, ExtraArray, PolicySpec, RunSpec, facts_of_all_seats, seat_returns
+from millrace.protocol.specs import ExtraArray, PolicySpec, RunSpec, seat_returns
 from millrace.protocol.wire.codec import check_can_be_sent
 from millrace.protocol.wire.compression import has_zstd
 from millrace.protocol.wire.message_sizes import MAX_FRAME_BYTES
@@ -59,7 +59,7 @@ def rollout_spec(
         images_dtype=config.acting_dtype if policy.convolves else "float32",
         masked=masked,
         extras=extras,
-        facts=(*config.info_keys, SCORE) if teams else facts_of_all_seats(config.info_keys, seats),
+        info_keys=config.info_keys,
         seats=seats,
         takes_turns=spaces.takes_turns,
         teams=teams,

@@ -177,7 +177,7 @@ def play(flags: EvaluateFlags, watch: ShowPlayed, given: Given | None = None) ->
             prefix = "" if flags.against is None else f"against-{flags.against.resolve().name}-"
             return record_videos(player, flags.run, episodes, flags.seed, flags.max_steps, prefix)
         played = player.play(EvaluationPlan.of(episodes, flags.seed, copies, flags.max_steps), bound="--max-steps:")
-        return evaluation_of(played, player.facts), []
+        return evaluation_of(played, player.run.facts), []
 
 
 def playing_workers(flags: PlayFlags, count: int, copies: int) -> PlayingWorkers:

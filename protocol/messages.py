@@ -37,7 +37,7 @@ from millrace.protocol.rollout import Episode, Rollout
 from millrace.protocol.space_spec import EnvDescription
 from millrace.protocol.specs import RunSpec, StepSpec, WaitSpec
 
-PROTOCOL_VERSION = 15
+PROTOCOL_VERSION = 16
 TOLD_TO_STOP = "told to stop"
 """The reason in the Goodbye of a worker that got a signal. Any other reason says why the worker declines what it was asked
 to do.

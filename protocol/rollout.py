@@ -47,7 +47,9 @@ class Episode(msgspec.Struct, frozen=True, array_like=True):
     """number of steps (rule EPISODES)"""
     seconds: Seconds
     facts: Annotated[tuple[float, ...], Meta(max_length=MAX_FACTS)] = ()
-    """one number for each name in `RunSpec.facts`, from the info of the episode's last step; NaN where the info lacked it"""
+    """one number for each name in `RunSpec.info_keys`, from the info of the episode's last step; NaN where the info lacked
+    it. With `RunSpec.teams`, the score follows; otherwise the return of each seat follows, unless that makes more than 32
+    """
     opponent: Whole | None = None
     """who played the other teams, as in a `Permit`; null if the policy played all seats"""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import Literal
 
 import msgspec
@@ -302,8 +303,8 @@ class RunSpec(SessionTerms, frozen=True, tag=True):
     """precision in which workers process images with the built-in convolutions"""
     masked: bool = False
     """whether rollouts contain masks of the allowed actions"""
-    facts: tuple[str, ...] = ()
-    """names of numbers that the environment reports in `info` when an episode ends"""
+    info_keys: tuple[str, ...] = ()
+    """names of numbers that the environment reports in `info` when an episode ends; they are an episode's first `facts`"""
     extras: tuple[ExtraArray, ...] = ()
     """additional arrays of each rollout"""
     seats: tuple[str, ...] = ()
@@ -344,15 +345,16 @@ class RunSpec(SessionTerms, frozen=True, tag=True):
         return (lane * self.copies + copy) % len(self.teams)
 
     @property
-    def info_keys(self) -> tuple[str, ...]:
-        """The facts that the environment itself reports. Further facts are computed: the score, or the seats' returns."""
-        counted = 1 if self.teams else len(self.seats) if self.has_seat_returns else 0
-        return self.facts[: len(self.facts) - counted]
+    def facts(self) -> tuple[str, ...]:
+        """Names of the facts of an episode: those that the environment reports, then the score or the seats' returns."""
+        if self.teams:
+            return (*self.info_keys, SCORE)
+        return self.info_keys + seat_returns(self.seats) if self.has_seat_returns else self.info_keys
 
     @property
     def has_seat_returns(self) -> bool:
-        """Whether the facts of an episode include the return of each seat, as they do unless there are too many seats."""
-        return bool(self.seats) and self.facts[-len(self.seats) :] == seat_returns(self.seats)
+        """Whether the facts of an episode include the return of each seat: not with opponents, nor with too many seats."""
+        return bool(self.seats) and not self.teams and len(self.info_keys) + len(self.seats) <= MAX_FACTS
 
     @property
     def seats_of_copy(self) -> int:
@@ -395,14 +397,7 @@ it, else 0.
 """
 
 
-def facts_of_all_seats(info_keys: tuple[str, ...], seats: tuple[str, ...]) -> tuple[str, ...]:
-    """Names of the facts of an episode without opponents: those that the environment reports, then the seats' returns.
-
-    The returns are left out if that would be too many facts.
-    """
-    return info_keys + (seat_returns(seats) if len(seats) + len(info_keys) <= MAX_FACTS else ())
-
-
+@lru_cache  # the facts of each episode are counted
 def seat_returns(seats: tuple[str, ...]) -> tuple[str, ...]:
     """The names that the returns of these seats have among the facts of an episode."""
     return tuple(one_line(f"return_{seat}", MAX_NAME) for seat in seats)

@@ -12,7 +12,7 @@ import { readToken, routingId } from "./token.js";
 
 export { box, discrete, UsageError };
 
-const PROTOCOL_VERSION = 15;
+const PROTOCOL_VERSION = 16;
 const FIELDS = { // how many fields each message of the learner has, of those that the environment profile knows
   Welcome: 3, Rejoin: 1, Describe: 5, Weights: 4, Release: 2, HeartbeatReply: 3, Drain: 1, Reset: 7, Step: 5, Call: 8,
 };

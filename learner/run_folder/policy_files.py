@@ -23,9 +23,9 @@ from millrace.protocol.errors import UsageError
 from millrace.protocol.policy.layout import Field, buffer_layout, named_views, parameter_layout, total_size
 from millrace.protocol.policy.possible import why_impossible
 from millrace.protocol.space_spec import MAX_SEATS
-from millrace.protocol.specs import PolicySpec, RunSpec, facts_of_all_seats
+from millrace.protocol.specs import PolicySpec, RunSpec
 
-POLICY_FORMAT = 2
+POLICY_FORMAT = 3
 
 
 class ArrayPosition(msgspec.Struct, frozen=True):
@@ -48,8 +48,8 @@ class PolicyDescription(msgspec.Struct, frozen=True, kw_only=True):
     """the names of the arrays that are not parameters: mean and standard deviation for observation normalization"""
     wrappers: tuple[Line, ...] = ()
     """the wrappers of every env copy, the innermost first"""
-    facts: Annotated[tuple[Name, ...], Meta(max_length=MAX_FACTS)] = ()
-    """the names of the numbers that the run logs for each episode"""
+    info_keys: Annotated[tuple[Name, ...], Meta(max_length=MAX_FACTS)] = ()
+    """names of numbers that the environment reports in `info` when an episode ends"""
     masked: bool = False
     """whether the environment says which actions are allowed"""
     eval_env_kwargs: dict[str, Scalar] = {}
@@ -83,7 +83,7 @@ def encode_description(run: RunSpec) -> bytes:
         arrays=_array_positions(acting),
         buffers=tuple(field.name for field in buffer_layout(spec)),
         wrappers=env.wrappers,
-        facts=facts_of_all_seats(run.info_keys, run.seats),
+        info_keys=run.info_keys,
         masked=run.masked,
         eval_env_kwargs=env.eval_kwargs,
         seats=run.seats,

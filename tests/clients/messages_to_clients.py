@@ -72,7 +72,7 @@ def messages(lanes: int) -> list[ToWorker]:
         HeartbeatReply(SESSION, 2, FEW[:1]),
         Drain("the run is over"),
         Refuse("no"),
-        Welcome(SESSION, 3, RunSpec(CARTPOLE, POLICY, 4, 2, 2, 1, facts=("return_a", "return_b"), seats=("a", "b"))),
+        Welcome(SESSION, 3, RunSpec(CARTPOLE, POLICY, 4, 2, 2, 1, seats=("a", "b"))),
     ]
 
 

@@ -60,9 +60,9 @@ def test_the_numbers_that_a_run_logs_of_its_episodes_stand_in_policy_json(tmp_pa
     spec = PolicySpec(observation_leaves(made.observation_space), action_spec(made.action_space), net=(8,))
     folder = RunFolder.create(resolve("CartPole-v1", run_dir=str(tmp_path), info_keys=("of_config",)))
     folder.write_policy(
-        policy_run(spec, env, facts=("of_card",)), np.zeros(acting_size(spec), np.float32), np.zeros(0, np.float32)
+        policy_run(spec, env, info_keys=("of_card",)), np.zeros(acting_size(spec), np.float32), np.zeros(0, np.float32)
     )
-    assert saved_policy(folder.path).facts == ("of_card",)
+    assert saved_policy(folder.path).info_keys == ("of_card",)
 
 
 def lobby(link: FakeLink, processes: WorkerProcesses) -> Lobby:

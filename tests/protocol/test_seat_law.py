@@ -17,13 +17,14 @@ import pytest
 
 from millrace.learner.shards.division import part_of
 from millrace.protocol.arrays import Array
-from millrace.protocol.bounds import MAX_NAME
+from millrace.protocol.bounds import MAX_FACTS, MAX_NAME
 from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.errors import BadRollout
 from millrace.protocol.messages import Permit, Weights
 from millrace.protocol.rollout import Episode, Rollout, stack_rollouts
 from millrace.protocol.rows.rollout_checks import LARGEST_REWARD, validate, wrong_facts
 from millrace.protocol.specs import ActionSpec, ExtraArray, Leaf, PolicySpec, RunSpec, seat_returns
+from millrace.workers.opponents import whole_episode
 from tests.support.conversation.example_messages import example
 from tests.support.in_process.collectors import SESSION, VERSION, no_pulse, random_collector, random_weights
 from tests.workers.collect.test_seat_rows import FORMS, collected, seated_run
@@ -96,7 +97,7 @@ def test_a_flag_that_is_not_the_environments_is_refused_or_could_be(
 ) -> None:
     run, refused, lawful = seated_run(form, T, N=3), 0, 0
     if teams:
-        run = msgspec.structs.replace(run, teams=teams, facts=("score",))
+        run = msgspec.structs.replace(run, teams=teams)
     rollouts = against_opponents(run, max(6, 120 // T)) if teams else collected(run, max(2, 40 // T))[1]
     place = "column [0-2]" if teams else "copy [0-2], [abc]"
     for rollout in rollouts:
@@ -118,7 +119,7 @@ SEATS = ("black", "white")
 def run_of(form: str, T: int, copies: int, **changes: Any) -> RunSpec:
     policy = PolicySpec((Leaf("", "box", (1,), "float32"),), ActionSpec("discrete", (), "int64", (2,), (0,)))
     turns = form == "turns"
-    run = RunSpec(EnvSpec("Fake-v0"), policy, T, copies, 1, 0, seats=SEATS, takes_turns=turns, facts=("a", "b"))
+    run = RunSpec(EnvSpec("Fake-v0"), policy, T, copies, 1, 0, seats=SEATS, takes_turns=turns)
     return msgspec.structs.replace(run, **changes)
 
 
@@ -217,7 +218,7 @@ def test_an_episode_has_one_reset_the_returns_of_all_seats_and_each_fact() -> No
     validate(msgspec.structs.replace(rollout, episodes=(Episode(most, 4, 0.0, episode.facts),)), run)
 
 
-TEAMS: dict[str, Any] = {"teams": ((0,), (1,)), "scripted": ("module:program",), "facts": ("a", "score")}
+TEAMS: dict[str, Any] = {"teams": ((0,), (1,)), "scripted": ("module:program",), "info_keys": ("a",)}
 
 
 def of_one_team(**changes: Any) -> tuple[Rollout, RunSpec]:
@@ -266,7 +267,7 @@ def test_with_teams_an_episode_has_an_opponent_and_a_score(opponent: int | None,
 
 @pytest.mark.parametrize("score", [0.0, 1 / 3, 0.5, 1.0, 0.25, 2 / 3])
 def test_of_three_teams_as_many_as_share_the_first_place_share_the_score(score: float) -> None:
-    run = msgspec.structs.replace(of_one_team()[1], seats=tuple("abc"), teams=((0,), (1,), (2,)), facts=("score",))
+    run = msgspec.structs.replace(of_one_team()[1], seats=tuple("abc"), teams=((0,), (1,), (2,)), info_keys=())
     says = "" if score in (0, 1, 1 / 2, 1 / 3) else f"expected the score 0, 1/n for n from 1 to 3, got {score}"
     assert wrong_facts(Episode(0.0, 1, 0.0, (score,), 0), run) == says
 
@@ -304,7 +305,30 @@ def test_the_name_of_a_return_is_as_short_as_a_name_and_hides_nothing() -> None:
     (name,) = found = seat_returns(("\u202e" + "a" * (MAX_NAME - 1),))
     assert len(name) == MAX_NAME
     assert name.startswith("return_\\u202eaaa")
-    assert run_of("turns", 1, 1, seats=("\u202e" + "a" * (MAX_NAME - 1),), facts=found).has_seat_returns
+    assert run_of("turns", 1, 1, seats=("\u202e" + "a" * (MAX_NAME - 1),)).facts == found
+
+
+@pytest.mark.parametrize(
+    ("info_keys", "seats", "teams", "counted"),
+    [
+        (2, 0, (), ()),
+        (0, 2, (), ("return_0", "return_1")),
+        (MAX_FACTS - 2, 2, (), ("return_0", "return_1")),
+        (MAX_FACTS - 1, 2, (), ()),
+        (0, MAX_FACTS + 1, (), ()),
+        (MAX_FACTS - 1, 2, ((0,), (1,)), ("score",)),
+    ],
+)
+def test_the_facts_of_an_episode_are_the_environments_then_the_score_or_the_returns_of_few_agents(
+    info_keys: int, seats: int, teams: tuple[tuple[int, ...], ...], counted: tuple[str, ...]
+) -> None:
+    keys = tuple(f"key{k}" for k in range(info_keys))
+    run = run_of("turns", 1, 1, info_keys=keys, seats=tuple(map(str, range(seats))), teams=teams)
+    assert run.facts == keys + counted
+    returns = tuple(map(float, range(max(1, seats))))
+    episode = whole_episode(run, None, 0, returns, 1, 0.0, (0.5,) * info_keys)
+    if not teams:
+        assert episode.facts == (0.5,) * info_keys + (returns if counted else ())
 
 
 def test_a_batch_says_which_rows_of_each_column_only_reset_its_copy_and_a_part_keeps_them() -> None:

@@ -26,7 +26,7 @@ from millrace.protocol.errors import EnvironmentFailed, UsageError
 from millrace.protocol.messages import Evaluate
 from millrace.protocol.rollout import Episode
 from millrace.protocol.space_spec import MAX_DEPTH, MAX_ELEMENTS, MAX_LEAVES, MAX_SEATS
-from millrace.protocol.specs import PolicySpec, RunSpec, facts_of_all_seats
+from millrace.protocol.specs import PolicySpec, RunSpec
 from millrace.workers.evaluate.evaluator import Evaluator
 from tests.support.conversation.example_messages import example
 from tests.support.in_process.collectors import collect, no_pulse, random_collector, random_policy
@@ -159,8 +159,7 @@ def run_on(make: Callable[[], Any]) -> RunSpec:
     policy = PolicySpec(observation_leaves(space), action_spec(env.action_space))
     seats = env.seats if isinstance(env, SeatedEnv) else ()
     turns = isinstance(env, SeatedEnv) and env.takes_turns
-    facts = facts_of_all_seats((), seats)
-    return RunSpec(spec, policy, 8, 2, 1, seed=1, masked=masked, seats=seats, takes_turns=turns, facts=facts)
+    return RunSpec(spec, policy, 8, 2, 1, seed=1, masked=masked, seats=seats, takes_turns=turns)
 
 
 def collected(make: Callable[[], Any]) -> str:

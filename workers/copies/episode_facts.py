@@ -1,4 +1,4 @@
-"""Facts of episodes: the numbers that an environment reports in `info` at an episode's last step (`RunSpec.facts`).
+"""Facts of episodes: the numbers that an environment reports in `info` at an episode's last step (`RunSpec.info_keys`).
 
 Rule: a number that is absent or not finite is missing, and is stored as NaN, not 0. A value that isn't a number is an error
 of the environment, and the error's message names the key.

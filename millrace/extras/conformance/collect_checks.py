@@ -53,7 +53,7 @@ from millrace.protocol.messages import (
 from millrace.protocol.policy.features import leaf_of_features
 from millrace.protocol.policy.layout import acting_size, buffer_size, named_views, parameter_layout
 from millrace.protocol.rules import Rule
-from millrace.protocol.specs import PolicySpec, RunSpec, seat_returns
+from millrace.protocol.specs import PolicySpec, RunSpec
 from millrace.protocol.wire.codec import encode
 from millrace.protocol.wire.plain_values import pack
 from millrace.protocol.wire.weight_dtypes import to_wire_dtype
@@ -166,7 +166,6 @@ def run_spec(learner: Learner, steps: int = STEPS, **policy_fields: Any) -> Scri
         copies=settings.copies,
         lanes=2,
         seed=5,
-        facts=seat_returns(env.seats),
         seats=env.seats,
         takes_turns=env.takes_turns,
         heartbeat_s=settings.heartbeat_s,
@@ -291,7 +290,7 @@ def keeps_rows(learner: Learner) -> Script[None]:
 def declines_other_agents(learner: Learner) -> Script[None]:
     """Begin a run with agents that the environment doesn't have."""
     run = yield from run_spec(learner)
-    run = replace(run, seats=() if run.seats else ("one", "other"), facts=(), takes_turns=False)
+    run = replace(run, seats=() if run.seats else ("one", "other"), takes_turns=False)
     yield from learner.joining()
     learner.welcome(run)
     session = Collecting(learner, run)

@@ -76,8 +76,8 @@ class LaneRows:
                 expected.append((float(self._return[n]), int(self._length[n])))
                 self._return[n] = 0.0
                 self._length[n] = 0
-        if run.seats:  # take the returns from facts, because rewards outside of valid rows also count
-            returns = (sum(episode.facts[-len(run.seats) :]) for episode in rollout.episodes)
+        if run.seats:  # rewards outside of valid rows also count, so only the facts contain the returns
+            returns = (sum(one.facts) if run.has_seat_returns else one.reward for one in rollout.episodes)
             expected = [(total, length) for total, (_, length) in zip(returns, expected, strict=True)]
         got = [(episode.reward, episode.length) for episode in rollout.episodes]  # `validate` has checked their number
         if not _same(expected, got) and _same(sorted(expected), sorted(got)):

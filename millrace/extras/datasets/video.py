@@ -71,7 +71,7 @@ def record_videos(
         subfolder(run, FOLDER)
         with tempfile.TemporaryDirectory(dir=folder, prefix=".new-") as new:
             while len(results) < episodes:
-                at_once = max(AT_ONCE, len(player.teams))  # a plan divides its episodes among the teams
+                at_once = max(AT_ONCE, len(player.run.teams))  # a plan divides its episodes among the teams
                 count = min(at_once, episodes - len(results))
                 for one in episodes_played.play(count, longest, frames=True):
                     video = Path(new, f"{prefix}seed-{seed}-episode-{len(results)}.mp4")
@@ -87,7 +87,7 @@ def record_videos(
         raise
     except OSError as error:
         raise RunError(f"videos of run {run} were not written: {error.strerror or first_line(error)}") from error
-    return evaluation_of(results, player.facts), videos
+    return evaluation_of(results, player.run.facts), videos
 
 
 def _write(path: Path, frames: list[Array], frames_per_s: float) -> None:

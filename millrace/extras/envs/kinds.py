@@ -23,13 +23,13 @@ def open_native(run: RunSpec, first: EnvCopy, pulse: Pulse) -> VectorCopies:
     """Make the copies of a lane in the environment's own vectorized form."""
     with activity().during(MAKING):
         env = make_copy(first, lambda: make_native(run.env, run.copies))
-        return VectorCopies(env, run.facts, masked=run.masked, critic_keys=run.policy.critic_keys)
+        return VectorCopies(env, run.info_keys, masked=run.masked, critic_keys=run.policy.critic_keys)
 
 
 def open_envpool(run: RunSpec, first: EnvCopy, pulse: Pulse) -> EnvpoolCopies:
     """Make the copies of a lane with envpool."""
     with activity().during(MAKING):  # importing the module that registers the environment may take a long time
-        return make_copy(first, lambda: EnvpoolCopies(envpool_spec(run.env), run.copies, run.facts))
+        return make_copy(first, lambda: EnvpoolCopies(envpool_spec(run.env), run.copies, run.info_keys))
 
 
 def native_spaces(env: EnvSpec) -> tuple[gymnasium.Space[Any], gymnasium.Space[Any]]:

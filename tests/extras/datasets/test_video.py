@@ -36,8 +36,7 @@ def test_each_team_is_filmed_once_before_one_is_filmed_again(
     player = SimpleNamespace(
         policy=SimpleNamespace(env=SimpleNamespace(id="game")),
         describe=lambda mode: described,
-        facts=(),
-        teams=tuple((n,) for n in range(teams)),
+        run=SimpleNamespace(facts=(), teams=tuple((n,) for n in range(teams))),
     )
     _, films = video.record_videos(cast(PolicyPlayer, player), tmp_path, 5, 7, 100, "against-old-")
     assert together == expected

@@ -66,7 +66,9 @@ def test_envpool_at_its_time_limit() -> None:
 def test_envpool() -> None:
     """Also at the time limit, which is applied here, and in steps in which some copies are reset explicitly."""
     run = msgspec.structs.replace(
-        run_of("CartPole-v1", T=200, N=8, kwargs={"max_episode_steps": 20}), vector="envpool", facts=("elapsed_step", "no")
+        run_of("CartPole-v1", T=200, N=8, kwargs={"max_episode_steps": 20}),
+        vector="envpool",
+        info_keys=("elapsed_step", "no"),
     )
     (rollout,) = collect(random_collector(run), run)
     validate(rollout, run)
@@ -78,7 +80,7 @@ def test_envpool() -> None:
 
 
 def test_a_native_vector_environment_without_infos_has_no_facts() -> None:
-    run = msgspec.structs.replace(run_of("CartPole-v1", T=100), vector="native", facts=("is_success",))
+    run = msgspec.structs.replace(run_of("CartPole-v1", T=100), vector="native", info_keys=("is_success",))
     (rollout,) = collect(random_collector(run), run)
     assert rollout.episodes
     assert all(math.isnan(row[0]) for row in facts(rollout))

@@ -93,7 +93,6 @@ TEAMS: dict[str, Any] = {
     "seats": ("red", "blue"),
     "teams": ((0,), (1,)),
     "scripted": ("module:program",),
-    "facts": ("score",),
 }
 PLAN = EvaluationPlan((5, 6, 7, 8, 9, 1), copies=6, most_steps=9, opponents=(0, -1))
 
@@ -152,7 +151,7 @@ def test_an_answer_of_other_matches_is_refused_and_its_ticket_is_dealt_again(
 
 
 def test_without_teams_an_answer_names_no_opponents() -> None:
-    learner = Learner(lanes=1, facts=("score",))
+    learner = Learner(lanes=1, info_keys=("score",))
     order = asked(learner)
     assert order.opponents == order.teams == ()
     wrong = against(order, (0, 0, -1, -1, 0, 0))

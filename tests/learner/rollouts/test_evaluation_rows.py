@@ -161,7 +161,7 @@ def test_an_answer_that_no_player_gives_is_a_strike(changes: dict[str, object]) 
 def test_an_answer_with_wrong_facts_is_a_strike(facts: tuple[float, ...]) -> None:
     played = Played()
     evaluation = played.learner.evaluation
-    evaluation._run = msgspec.structs.replace(evaluation._run, facts=("a number",))
+    evaluation._run = msgspec.structs.replace(evaluation._run, info_keys=("a number",))
     answer = played.answer(1)
     episodes = tuple(msgspec.structs.replace(episode, facts=facts) for episode in answer.episodes)
     played.learner.says(A, msgspec.structs.replace(answer, episodes=episodes))
@@ -268,5 +268,5 @@ def test_a_return_is_one_that_the_rewards_of_all_seats_can_give() -> None:
     evaluation._run = msgspec.structs.replace(evaluation._run, seats=("black", "white"))
     for total, strikes in ((2.001 * LARGEST_REWARD, 1), (math.nan, 2), (2 * LARGEST_REWARD, 2)):
         played.learner.says(A, of_seats(played, 2))
-        played.learner.says(A, msgspec.structs.replace(played.answer(1), episodes=(Episode(total, 1, 0.0),)))
+        played.learner.says(A, msgspec.structs.replace(played.answer(1), episodes=(Episode(total, 1, 0.0, (0.0, 0.0)),)))
         assert played.strikes() == strikes

@@ -161,8 +161,8 @@ def test_a_policy_that_does_not_fit_its_card_is_refused(tmp_path: Path) -> None:
     card.write_text(whole.replace('"net": [\n      8', '"net": [\n      9'))
     with pytest.raises(UsageError, match=r"actor\.0\.bias: expected float32 \(9,\), got \(8,\)"):
         folder.read_policy()
-    card.write_text(whole.replace('"format": 2', '"format": 1'))
-    with pytest.raises(UsageError, match="expected format 2, got 1; install the millrace that wrote it"):
+    card.write_text(whole.replace('"format": 3', '"format": 2'))
+    with pytest.raises(UsageError, match="expected format 3, got 2; install the millrace that wrote it"):
         folder.read_policy()
     card.write_text(whole)
     (tmp_path / "policy.safetensors").write_bytes((tmp_path / "policy.safetensors").read_bytes()[:-4])
@@ -376,7 +376,7 @@ def test_a_resumed_run_adds_an_evaluation_to_the_row_of_its_update(tmp_path: Pat
 @pytest.mark.parametrize(
     ("wrong", "said"),
     [
-        ({"facts": [f"f{n}" for n in range(33)]}, "length <= 32"),
+        ({"info_keys": [f"f{n}" for n in range(33)]}, "length <= 32"),
         ({"env": "a\nb"}, "matching regex"),
         ({"policy": {"action": {"dtype": "object"}}}, "action: expected a dtype"),
         ({"policy": {"action": {"dtype": "int64"}}}, "action: expected a dtype"),

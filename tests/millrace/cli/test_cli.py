@@ -528,13 +528,15 @@ def test_a_status_needs_time_for_the_answer(capsys: Captured, seconds: str) -> N
 # ------------------------------------------------------------------------------------------------- evaluate, plot, help
 
 
-def a_run_that_acts(tmp_path: Path, env_id: str = "CartPole-v1", facts: tuple[str, ...] = ()) -> Path:
+def a_run_that_acts(tmp_path: Path, env_id: str = "CartPole-v1", info_keys: tuple[str, ...] = ()) -> Path:
     """Its policy is all zeros: always left, in CartPole, where it falls after nine steps."""
     run = RunFolder.create(resolve(env_id, run_dir=str(tmp_path)))
     env = EnvSpec(env_id)
     made = env.make()
     spec = PolicySpec(observation_leaves(made.observation_space), action_spec(made.action_space), net=(4,))
-    run.write_policy(policy_run(spec, env, facts=facts), np.zeros(acting_size(spec), np.float32), np.zeros(0, np.float32))
+    run.write_policy(
+        policy_run(spec, env, info_keys=info_keys), np.zeros(acting_size(spec), np.float32), np.zeros(0, np.float32)
+    )
     return run.path
 
 
@@ -573,7 +575,7 @@ def test_evaluate_films_a_few_episodes(tmp_path: Path, capsys: Captured) -> None
         assert films == [f"{run}/videos/seed-7-episode-{i}.mp4" for i in range(2)]
         assert sorted(path.name for path in (run / "videos").iterdir()) == [Path(film).name for film in films]
     assert all(b"ftyp" in Path(film).read_bytes()[:12] for film in films)
-    run = a_run_that_acts(tmp_path, facts=("score",))
+    run = a_run_that_acts(tmp_path, info_keys=("score",))
     assert main(["evaluate", str(run), "--video", "--episodes", "2", "--max-steps", "11"]) == 0
     said, *_ = capsys.readouterr().out.splitlines()
     assert said == "return 5.0 ± 0.0 over 2 episodes, 2 of them cut short, score missing"

@@ -301,7 +301,7 @@ def test_values_that_are_not_of_the_space_are_refused() -> None:
 
 
 def test_facts_are_as_many_as_the_run_asks_for_and_finite_or_missing() -> None:
-    episode, run = Episode(1.0, 1, 1.0), msgspec.structs.replace(spaces_run(), facts=("a", "b"))
+    episode, run = Episode(1.0, 1, 1.0), msgspec.structs.replace(spaces_run(), info_keys=("a", "b"))
     for facts in ((1.0, -1e308), (float("nan"), 0.0)):
         assert wrong_facts(msgspec.structs.replace(episode, facts=facts), run) == ""
     assert wrong_facts(episode, run) == "expected 2 facts, got 0"

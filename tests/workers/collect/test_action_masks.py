@@ -43,7 +43,7 @@ def masked_run(name: str, T: int = 40, N: int = 3, fault: str = "", **policy: An
 
 
 def vectorized(run: RunSpec, lane: int, pulse: Any) -> VectorCopies:
-    return VectorCopies(SyncVectorEnv([run.env.make] * run.copies), run.facts, masked=run.masked)
+    return VectorCopies(SyncVectorEnv([run.env.make] * run.copies), run.info_keys, masked=run.masked)
 
 
 def split(run: RunSpec, lanes: int) -> tuple[SplitVectorEnv, Collector]:

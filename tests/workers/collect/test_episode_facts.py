@@ -37,7 +37,7 @@ from tests.support.users_code.fact_envs import Facts
 
 NAMES = ("is_success", "distance", "speed")
 FACTS = "tests.support.users_code.fact_envs:Facts-v0"
-RUN = msgspec.structs.replace(run_of(FACTS, T=50, N=3), facts=NAMES)
+RUN = msgspec.structs.replace(run_of(FACTS, T=50, N=3), info_keys=NAMES)
 
 
 def evaluate_order(run: RunSpec, episodes: int) -> Evaluate:
@@ -73,13 +73,15 @@ def test_facts_of_an_episode_that_began_in_an_earlier_rollout() -> None:
 
 
 def test_without_names_there_are_none() -> None:
-    run = msgspec.structs.replace(RUN, facts=())
+    run = msgspec.structs.replace(RUN, info_keys=())
     (rollout,) = collect(random_collector(run), run)
     assert set(facts(rollout)) == {()}
 
 
 def test_a_vector_environment_gives_the_facts_of_the_loop() -> None:
-    collector = random_collector(RUN, lambda run, lane, pulse: VectorCopies(SyncVectorEnv([Facts] * run.copies), run.facts))
+    collector = random_collector(
+        RUN, lambda run, lane, pulse: VectorCopies(SyncVectorEnv([Facts] * run.copies), run.info_keys)
+    )
     (rollout,), (loop,) = collect(collector, RUN), collect(random_collector(RUN), RUN)
     assert same(facts(rollout), facts(loop))
 
@@ -98,7 +100,7 @@ def test_a_split_vector_environment_gives_the_facts_of_the_loop() -> None:
 
 def test_facts_of_a_vector_environment_do_not_depend_on_the_infos_of_other_copies() -> None:
     name = "tests.support.users_code.fact_envs:Unlike-v0"
-    run = msgspec.structs.replace(run_of(name, T=20), facts=("score",))
+    run = msgspec.structs.replace(run_of(name, T=20), info_keys=("score",))
     expected = [facts(rollout) for rollout in collect(random_collector(run), run, lanes=range(2))]
     with any_order(VectorEnvSettings(name, 4, lanes=2), 2, shared=True) as (env, _):
         split = SplitVectorEnv(env, run)
@@ -108,7 +110,7 @@ def test_facts_of_a_vector_environment_do_not_depend_on_the_infos_of_other_copie
 
 
 def test_evaluation_episodes_have_facts_too() -> None:
-    run = msgspec.structs.replace(RUN, facts=("is_success", "speed"))
+    run = msgspec.structs.replace(RUN, info_keys=("is_success", "speed"))
     evaluator = Evaluator(run, random_policy(run.policy))
     answer = evaluator.play(evaluate_order(run, 4), lambda rows: None, no_pulse)
     assert same([episode.facts for episode in answer.episodes], [(1.0, math.nan)] * 4)
@@ -118,8 +120,8 @@ def test_evaluation_episodes_have_facts_too() -> None:
 
 @pytest.mark.parametrize("vector", [False, True])
 def test_what_is_no_number_names_the_key(vector: bool) -> None:
-    run = msgspec.structs.replace(run_of(FACTS, kwargs={"text": True}), facts=("name",))
-    copies = (lambda run, lane, pulse: VectorCopies(SyncVectorEnv([run.env.make] * 2), run.facts)) if vector else None
+    run = msgspec.structs.replace(run_of(FACTS, kwargs={"text": True}), info_keys=("name",))
+    copies = (lambda run, lane, pulse: VectorCopies(SyncVectorEnv([run.env.make] * 2), run.info_keys)) if vector else None
     collector = random_collector(run, copies) if copies else random_collector(run)
     expected = r"^lane 0, copy [01], step 2: info name: expected a number, got \w+ '?north'?; name only numbers"
     with pytest.raises(EnvironmentFailed, match=expected.replace("north'?", "north.*")):
@@ -127,7 +129,7 @@ def test_what_is_no_number_names_the_key(vector: bool) -> None:
 
 
 def test_an_evaluation_names_the_key_too() -> None:
-    run = msgspec.structs.replace(run_of(FACTS, kwargs={"text": True}), facts=("name",))
+    run = msgspec.structs.replace(run_of(FACTS, kwargs={"text": True}), info_keys=("name",))
     evaluator = Evaluator(run, random_policy(run.policy))
     with pytest.raises(EnvironmentFailed, match=r"copy 0, step 2: info name: expected a number, got str 'north'"):
         evaluator.play(evaluate_order(run, 2), lambda rows: None, no_pulse)

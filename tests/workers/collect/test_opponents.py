@@ -23,7 +23,7 @@ from millrace.protocol.policy.layout import acting_size
 from millrace.protocol.policy.policy import make_policy
 from millrace.protocol.rollout import Episode, Rollout, stack_rollouts
 from millrace.protocol.rows.rollout_checks import validate, wrong_facts
-from millrace.protocol.specs import SCORE, PolicySpec, RunSpec
+from millrace.protocol.specs import PolicySpec, RunSpec
 from millrace.workers.collect.collector import Collector
 from millrace.workers.evaluate.evaluator import Evaluator
 from millrace.workers.opponents import KnownOpponents, Match, Opponent, OtherTeams
@@ -37,7 +37,7 @@ SCRIPTED = f"{__name__}:always_two"
 
 
 def with_teams(run: RunSpec, patterns: Sequence[str] = (), **changes: Any) -> RunSpec:
-    return msgspec.structs.replace(run, teams=teams_of(run.seats, patterns), facts=(SCORE,), **changes)
+    return msgspec.structs.replace(run, teams=teams_of(run.seats, patterns), **changes)
 
 
 def always(action: int, version: int, spec: PolicySpec) -> Weights:
@@ -125,7 +125,7 @@ def test_teams_are_of_one_size_and_every_agent_is_in_one() -> None:
 @pytest.mark.parametrize("form", FORMS)
 def test_a_rollout_has_the_rows_of_its_team_bit_for_bit(form: str) -> None:
     """The opponent does what the policy does, so the environment tells the same histories without one."""
-    alone = msgspec.structs.replace(seated_run(form, T=9, N=6, net=()), facts=())
+    alone = seated_run(form, T=9, N=6, net=())
     run = with_teams(alone)
     ours, all_seats = collect(collector_of(run), run, [0] * 5), collect(collector_of(alone), alone, [None] * 5)
     for got, whole in zip(ours, all_seats, strict=True):
@@ -235,7 +235,7 @@ def test_the_scores_of_all_teams_of_an_episode_add_up_to_one(returns: list[int])
     """So equal policies score one over the number of teams, however often they tie, and no rating grows without end."""
     seats = tuple("abcde"[: len(returns)])
     run, opponent = with_teams(seated_run("turns", T=5, N=1)), Opponent.__new__(Opponent)
-    run = msgspec.structs.replace(run, seats=seats, teams=teams_of(seats), facts=(SCORE,))
+    run = msgspec.structs.replace(run, seats=seats, teams=teams_of(seats))
     opponent.number = 9
     scores = []
     for team in range(len(returns)):

@@ -25,7 +25,7 @@ from millrace.protocol.policy.policy import make_policy
 from millrace.protocol.random_streams import RoundStreams
 from millrace.protocol.rollout import Rollout, stack_rollouts
 from millrace.protocol.rows.rollout_checks import validate
-from millrace.protocol.specs import PolicySpec, RunSpec, seat_returns
+from millrace.protocol.specs import PolicySpec, RunSpec
 from millrace.workers.collect.collector import Collector
 from millrace.workers.evaluate.evaluator import Evaluator
 from tests.support.conversation.example_messages import example
@@ -41,8 +41,7 @@ def seated_run(form: str, T: int, N: int, **policy: Any) -> RunSpec:
     env = FORMS[form]()
     spec = PolicySpec((*observation_leaves(env.observation_space("a")),), action_spec(env.action_space("a")), **policy)
     name = EnvSpec(f"tests.support.users_code.seat_envs:{FORMS[form].__name__}")
-    turns, facts = form == "turns", seat_returns(AGENTS)
-    return RunSpec(name, spec, T, N, lanes=8, seed=1, seats=AGENTS, takes_turns=turns, facts=facts)
+    return RunSpec(name, spec, T, N, lanes=8, seed=1, seats=AGENTS, takes_turns=form == "turns")
 
 
 def collected(run: RunSpec, number: int, lane: int = 0) -> tuple[Collector, list[Rollout]]:
@@ -98,7 +97,7 @@ def test_a_row_is_what_an_agent_lived_through(form: str) -> None:
 
 @pytest.mark.parametrize("form", FORMS)
 def test_episodes_count_every_reward_and_have_the_facts_of_their_last_step(form: str) -> None:
-    run = msgspec.structs.replace(seated_run(form, T=30, N=20), facts=("steps", *seat_returns(AGENTS)))
+    run = msgspec.structs.replace(seated_run(form, T=30, N=20), info_keys=("steps",))
     collector, rollouts = collected(run, 2)
     episodes = [episode for rollout in rollouts for episode in rollout.episodes]
     envs = [seated.env for seated in collector.lanes[0].copies.envs]  # type: ignore[attr-defined]
@@ -313,7 +312,7 @@ class Alone(gymnasium.Env[Any, Any]):
 def test_an_environment_of_other_agents_is_refused_in_one_line() -> None:
     together, turns = "agents: a, b, c", "agents that take turns: a, b, c"
     crowd, game = (seated_run(form, T=2, N=2) for form in ("together", "turns"))
-    alone = msgspec.structs.replace(crowd, seats=(), facts=())
+    alone = msgspec.structs.replace(crowd, seats=())
     of_alone = EnvSpec(f"{__name__}:{Alone.__name__}")
     for run, env, expected, got in (
         (crowd, of_alone, together, "agents: none"),
@@ -321,8 +320,8 @@ def test_an_environment_of_other_agents_is_refused_in_one_line() -> None:
         (alone, game.env, "agents: none", turns),
         (game, of_alone, turns, "agents: none"),
         (crowd, game.env, together, turns),
-        (msgspec.structs.replace(crowd, seats=("a", "b"), facts=()), crowd.env, "agents: a, b", together),
-        (msgspec.structs.replace(crowd, seats=("a", "c", "b"), facts=()), crowd.env, "agents: a, c, b", together),
+        (msgspec.structs.replace(crowd, seats=("a", "b")), crowd.env, "agents: a, b", together),
+        (msgspec.structs.replace(crowd, seats=("a", "c", "b")), crowd.env, "agents: a, c, b", together),
     ):
         changed = msgspec.structs.replace(run, env=env)
         says = f"environment {env.id}: expected {expected}, got {got}; install the version .*$"

@@ -27,7 +27,7 @@ from millrace.protocol.lane_past import LastEpisode
 from millrace.protocol.messages import LanePast, Permit
 from millrace.protocol.rollout import Rollout
 from millrace.protocol.rows.rollout_checks import validate
-from millrace.protocol.specs import PolicySpec, RunSpec, seat_returns
+from millrace.protocol.specs import PolicySpec, RunSpec
 from millrace.protocol.wire.plain_values import pack
 from millrace.workers.collect.collector import Collector
 from millrace.workers.copies.reset_ahead import ResetAhead
@@ -127,9 +127,8 @@ def seated_run(kind: type[RandomGame | RandomCrowd], T: int, N: int, **policy: A
     seen = without_mask(space, env.action_space("a")) if masked else space
     spec = PolicySpec(observation_leaves(seen), action_spec(env.action_space("a")), **policy)
     turns = kind is not Crowd
-    facts = seat_returns(AGENTS)
     name = EnvSpec(f"{HERE}{kind.__name__}")
-    return RunSpec(name, spec, T, N, lanes=8, seed=1, seats=AGENTS, takes_turns=turns, facts=facts, masked=masked)
+    return RunSpec(name, spec, T, N, lanes=8, seed=1, seats=AGENTS, takes_turns=turns, masked=masked)
 
 
 def masked_run(T: int, N: int) -> RunSpec:
@@ -147,7 +146,7 @@ def tuple_run(T: int, N: int) -> RunSpec:
     env = name.make()
     policy = PolicySpec(observation_leaves(env.observation_space), action_spec(env.action_space))
     seats = ("agent_0", "agent_1")
-    return RunSpec(name, policy, T, N, lanes=8, seed=1, seats=seats, facts=seat_returns(seats))
+    return RunSpec(name, policy, T, N, lanes=8, seed=1, seats=seats)
 
 
 RUNS: dict[str, Callable[[int, int], RunSpec]] = {

@@ -15,7 +15,7 @@ from millrace.protocol.errors import EnvironmentFailed
 from millrace.workers.lanes.running_episodes import EndedEpisode, RunningEpisodes
 from tests.support.in_process.collectors import run_of
 
-RUN = msgspec.structs.replace(run_of("CartPole-v1"), facts=("speed",))
+RUN = msgspec.structs.replace(run_of("CartPole-v1"), info_keys=("speed",))
 N = 3
 Rows = tuple[Array, Bools]
 

@@ -11,9 +11,9 @@
 
 namespace millrace {
 
-constexpr std::uint64_t PROTOCOL_VERSION = 15;
+constexpr std::uint64_t PROTOCOL_VERSION = 16;
 constexpr std::size_t MAX_FRAMES = 256, MAX_HEAD_BYTES = 1 << 20, MAX_FRAME_BYTES = 1 << 30, MAX_DIMENSIONS = 8, MAX_COPIES = 1 << 16,
-                      MAX_SEATS = 1 << 10;
+                      MAX_SEATS = 1 << 10, MAX_FACTS = 32;
 
 struct Frame {  // bytes that belong to somebody else
   const void* data;
@@ -42,8 +42,8 @@ struct Run {  // WaitSpec, RunSpec or StepSpec; or what a Describe asks for
   std::vector<Leaf> observation;
   std::vector<Leaf> action;
   std::size_t rollout_steps = 0, copies = 0;  // of a RunSpec, as is all that follows
-  std::vector<std::string> facts, seats;
-  bool takes_turns = false, has_seat_returns = false;  // has_seat_returns: the last facts of an episode are those of its seats
+  std::vector<std::string> info_keys, seats;
+  bool takes_turns = false;
   std::uint64_t seed = 0;
   std::vector<std::size_t> net{64, 64};
   bool relu = false, normalize = false;
@@ -289,7 +289,7 @@ class Decoder {
       else if (name == "rollout_steps") run.rollout_steps = r.natural();
       else if (name == "seed") run.seed = r.natural();
       else if (name == "masked") { if (r.boolean()) run.beyond = "action masks"; }
-      else if (name == "facts") names(r, run.facts);
+      else if (name == "info_keys") names(r, run.info_keys);
       else if (name == "seats") names(r, run.seats);
       else if (name == "takes_turns") run.takes_turns = r.boolean();
       else if (name == "extras") { if (std::size_t n = r.array()) for (run.beyond = "further arrays"; n; --n) r.skip(); }
@@ -305,8 +305,6 @@ class Decoder {
       throw BadMessage("RunSpec: expected its steps, copies and spaces");
     bool many = run.copies > MAX_COPIES || std::any_of(run.lanes.begin(), run.lanes.end(), [](std::size_t n) { return n > MAX_COPIES; });
     if (many || run.seats.size() > MAX_SEATS) throw BadMessage("Welcome: expected at most 65536 copies in a lane, and 1024 agents in each");
-    auto of_seat = [](const std::string& seat, const std::string& fact) { return fact == "return_" + seat; };
-    run.has_seat_returns = run.facts.size() >= run.seats.size() && std::equal(run.seats.rbegin(), run.seats.rend(), run.facts.rbegin(), of_seat);
     if (!(run.heartbeat_s > 0) || !(run.learner_timeout_s > 0)) throw BadMessage("Welcome: expected times above 0");
     return run;
   }

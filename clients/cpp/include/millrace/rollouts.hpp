@@ -247,11 +247,11 @@ class CollectorSession : public Session {  // a Session that holds the weights a
   }
 
   void write(const std::vector<Episode>& episodes, const std::vector<double>& seat_returns) {
-    const std::size_t A = run_.seats.size(), F = run_.facts.size(), reported = run_.has_seat_returns ? A : 0;
+    const std::size_t A = run_.seats.size(), K = run_.info_keys.size(), reported = K + A <= MAX_FACTS ? A : 0;
     head_.array(episodes.size());
     for (std::size_t i = 0; i < episodes.size(); ++i) {
-      head_.array(4).real(episodes[i].reward).natural(episodes[i].length).real(std::max(0.0, episodes[i].seconds)).array(F);
-      for (std::size_t f = 0; f < F - reported; ++f) head_.real(std::nan(""));  // facts that the learner asks for: we have none
+      head_.array(4).real(episodes[i].reward).natural(episodes[i].length).real(std::max(0.0, episodes[i].seconds)).array(K + reported);
+      for (std::size_t k = 0; k < K; ++k) head_.real(std::nan(""));  // facts that the learner asks for: we have none
       for (std::size_t a = 0; a < reported; ++a) head_.real(seat_returns[i * A + a]);
     }
   }
