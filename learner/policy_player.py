@@ -21,16 +21,15 @@ from millrace.learner.open_hub import open_hub
 from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan, OnRows, PlayedEpisode
 from millrace.learner.rollouts.hub import GOODBYE_IF_CUT_SHORT_S, Hub
 from millrace.learner.rollouts.opponent_pool import OpponentPool, PoolSettings, teams_of
-from millrace.learner.run_folder.policy_files import StoredPolicy
+from millrace.learner.run_folder.policy_files import PolicyDescription, StoredPolicy
 from millrace.learner.run_folder.run_folder import RunFolder, Which
-from millrace.protocol.arrays import Floats
 from millrace.protocol.bounds import MAX_FACTS
 from millrace.protocol.env_spec import EnvLike, EnvSpec
 from millrace.protocol.envs.description import DescribedEnv
 from millrace.protocol.envs.wrappers import WrapperLike
 from millrace.protocol.errors import UsageError
 from millrace.protocol.own_module import refuse_modules_in
-from millrace.protocol.specs import SCORE, ActionSpec, Leaf, PolicySpec, RunSpec
+from millrace.protocol.specs import SCORE, ActionSpec, Leaf, RunSpec
 
 RIVAL = 0
 POLICY = 1
@@ -38,22 +37,17 @@ POLICY = 1
 
 
 class SavedPolicy(NamedTuple):
-    """A policy from a run folder, and the environment that it was trained for."""
+    """A policy from a run folder, and the environment in which it plays."""
 
-    spec: PolicySpec
+    stored: StoredPolicy
     env: EnvSpec
-    parameters: Floats
-    buffers: Floats
-    info_keys: tuple[str, ...] = ()
-    """names of numbers that the environment reports in `info` when an episode ends"""
-    masked: bool = False
-    """whether the environment says which actions are allowed"""
-    seats: tuple[str, ...] = ()
-    """the names of the environment's agents"""
-    teams: tuple[tuple[int, ...], ...] = ()
-    """the seats of each team, if the policy was trained against opponents"""
     against: StoredPolicy | None = None
     """the policy that plays the other teams"""
+
+    @property
+    def card(self) -> PolicyDescription:
+        """The content of policy.json."""
+        return self.stored.card
 
 
 def saved_policy(
@@ -64,13 +58,14 @@ def saved_policy(
     `env` and `wrappers` override these names. Raises `UsageError`, with a one-line message, if the policy cannot be read, or
     if the environment or a wrapper cannot be found.
     """
-    card, parameters, buffers = RunFolder.open_policy(run).read_policy(which)
+    stored = RunFolder.open_policy(run).read_policy(which)
+    card = stored.card
     refuse_modules_in(run, (*([card.env] if env is None else []), *(card.wrappers if wrappers is None else [])))
     # The wrappers that other settings add are always kept, because the policy's observations contain what they add.
     of_settings = [wrapper for wrapper in card.wrappers if wrapper in (SEAT_ID, WITH_STATE)]
     outer = card.wrappers if wrappers is None else [*wrappers, *of_settings]
     spec = EnvSpec.of(card.env if env is None else env, card.env_kwargs, outer, card.eval_env_kwargs)
-    return SavedPolicy(card.policy, spec, parameters, buffers, card.info_keys, card.masked, card.seats, card.teams)
+    return SavedPolicy(stored, spec)
 
 
 class PolicyPlayer:
@@ -146,54 +141,55 @@ class PolicyPlayer:
             self._hub.drain(reason, timeout_s=GOODBYE_IF_CUT_SHORT_S)
 
     def _published(self) -> Hub:
-        policy = self.policy
+        stored, against = self.policy.stored, self.policy.against
         pool = None
-        if policy.against is not None:
+        if against is not None:
             pool = OpponentPool(PoolSettings(seed=0, window=1, save_steps=1, latest=0.0, max_lag=0))
         hub = open_hub(self._settings, self.run, self._lobby, self._check_interrupt, opponents=pool)
-        if policy.against is not None:
-            hub.publish(RIVAL, policy.against.parameters, policy.against.buffers, deal=False, env_steps=0)
-        hub.publish(POLICY, policy.parameters, policy.buffers, deal=False)
+        if against is not None:
+            hub.publish(RIVAL, against.parameters, against.buffers, deal=False, env_steps=0)
+        hub.publish(POLICY, stored.parameters, stored.buffers, deal=False)
         return hub
 
 
 def _run_to_play(policy: SavedPolicy, settings: RolloutConfig) -> RunSpec:
     """The specification that `Welcome` sends to workers. Raises `UsageError` if one policy can't play against the other."""
+    card = policy.card
     run = RunSpec(
         policy.env,
-        policy.spec,
+        card.policy,
         rollout_steps=1,
         copies=1,
         lanes=settings.lanes,
         seed=0,
-        info_keys=policy.info_keys,
-        masked=policy.masked,
-        seats=policy.seats,
-        takes_turns=bool(policy.seats),  # with several agents, they may take turns
+        info_keys=card.info_keys,
+        masked=card.masked,
+        seats=card.seats,
+        takes_turns=bool(card.seats),  # True permits turns, and also agents that all act at once
         **msgspec.structs.asdict(settings.terms()),
     )
-    if (against := policy.against) is None:
+    if policy.against is None:
         return run
-    _check_rival(policy, against)
-    keys = tuple(key for key in policy.info_keys if key != SCORE)[: MAX_FACTS - 1]
-    teams = policy.teams or against.card.teams or teams_of(policy.seats)
-    return msgspec.structs.replace(run, teams=teams, info_keys=keys, opponent=against.card.policy)
+    rival = policy.against.card
+    _check_rival(policy.env.id, card, rival)
+    keys = tuple(key for key in card.info_keys if key != SCORE)[: MAX_FACTS - 1]
+    teams = card.teams or rival.teams or teams_of(card.seats)
+    return msgspec.structs.replace(run, teams=teams, info_keys=keys, opponent=rival.policy)
 
 
-def _check_rival(policy: SavedPolicy, against: StoredPolicy) -> None:
-    """Raise `UsageError` unless this policy can play against the other one."""
-    rival = against.card
-    if len(policy.seats) < 2:
-        raise UsageError(f"against: expected an environment of several agents, got {policy.env.id}")
+def _check_rival(env: str, card: PolicyDescription, rival: PolicyDescription) -> None:
+    """Raise `UsageError` unless the policy of this card can play against the rival in the environment of this id."""
+    if len(card.seats) < 2:
+        raise UsageError(f"against: expected an environment of several agents, got {env}")
     for what, expected, got in (
-        ("agents", policy.seats, rival.seats),
-        ("observations", policy.spec.observation, rival.policy.observation),
-        ("actions", policy.spec.action, rival.policy.action),
-        ("action masks", policy.masked, rival.masked),
-        ("teams", policy.teams or rival.teams, rival.teams or policy.teams),
+        ("agents", card.seats, rival.seats),
+        ("observations", card.policy.observation, rival.policy.observation),
+        ("actions", card.policy.action, rival.policy.action),
+        ("action masks", card.masked, rival.masked),
+        ("teams", card.teams or rival.teams, rival.teams or card.teams),
     ):
         if expected != got:
-            of = "" if policy.env.id == rival.env else f" of {policy.env.id}, got one of {rival.env}:"
+            of = "" if env == rival.env else f" of {env}, got one of {rival.env}:"
             raise UsageError(
                 f"against: expected a policy{of} with the same {what}, {_in_words(expected)}; got {_in_words(got)}"
             )

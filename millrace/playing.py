@@ -197,7 +197,7 @@ def policy_to_play(flags: PlayFlags, given: Given | None) -> SavedPolicy:
     """The policy to play and its environment. Raises `UserFacingError` if one of them can't be found or can't be played."""
     env, wrappers = given or Given(flags.env or None, flags.wrappers or None)
     saved = saved_policy(flags.run, _which(flags), env=env, wrappers=wrappers)
-    if saved.seats and flags.inference == "learner":
+    if saved.card.seats and flags.inference == "learner":
         raise UsageError(
             f"inference learner: {saved.env.id} has several agents, and workers must act; use --inference workers"
         )

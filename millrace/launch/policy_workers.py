@@ -50,7 +50,7 @@ def policy_player(policy: SavedPolicy, which: PlayingWorkers, watch: Callable[[s
     with ExitStack() as stack:
         interrupts = stack.enter_context(Interrupts())
         if which.inference == "learner" or which.transport == "inproc":
-            stack.enter_context(one_thread(uses_torch=policy.spec.needs_torch))
+            stack.enter_context(one_thread(uses_torch=policy.card.policy.needs_torch))
 
         def check_interrupt() -> None:
             if interrupts.received:

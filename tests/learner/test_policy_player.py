@@ -14,7 +14,7 @@ from millrace.learner.config.rollout_config import RolloutConfig
 from millrace.learner.members.lobby import Lobby
 from millrace.learner.members.worker_processes import WorkerProcesses
 from millrace.learner.open_hub import lobby_settings
-from millrace.learner.policy_player import PolicyPlayer, SavedPolicy, saved_policy
+from millrace.learner.policy_player import PolicyPlayer, saved_policy
 from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan
 from millrace.learner.run_folder.run_folder import RunFolder
 from millrace.protocol.env_spec import EnvSpec
@@ -31,7 +31,7 @@ from tests.support.conversation.example_messages import example
 from tests.support.conversation.fake_ends import BUFFERS, PARAMETERS, run_spec
 from tests.support.conversation.fake_link import FakeLink
 from tests.support.in_process.fake_processes import FakeProcesses
-from tests.support.in_process.saved_policies import load_policy, policy_run
+from tests.support.in_process.saved_policies import load_policy, policy_of_run, policy_run
 
 
 @pytest.mark.parametrize("env_id", ["CartPole-v1", "Pendulum-v1"])
@@ -62,7 +62,7 @@ def test_the_numbers_that_a_run_logs_of_its_episodes_stand_in_policy_json(tmp_pa
     folder.write_policy(
         policy_run(spec, env, info_keys=("of_card",)), np.zeros(acting_size(spec), np.float32), np.zeros(0, np.float32)
     )
-    assert saved_policy(folder.path).info_keys == ("of_card",)
+    assert saved_policy(folder.path).card.info_keys == ("of_card",)
 
 
 def lobby(link: FakeLink, processes: WorkerProcesses) -> Lobby:
@@ -104,7 +104,7 @@ class FourWorkers(FakeLink):
 
     def player(self, max_env_failures: int) -> PolicyPlayer:
         run = run_spec()
-        policy = SavedPolicy(run.policy, run.env, PARAMETERS, BUFFERS)
+        policy = policy_of_run(run, PARAMETERS, BUFFERS)
         processes, settings = (
             FakeProcesses(of_ended=self.ended, expected=4),
             RolloutConfig(max_env_failures=max_env_failures),
@@ -144,7 +144,7 @@ def test_an_episode_that_does_not_end_is_shown_with_its_env_steps_and_their_boun
         if len(shown) == 5:
             raise KeyboardInterrupt
 
-    policy = SavedPolicy(run.policy, run.env, PARAMETERS, BUFFERS)
+    policy = policy_of_run(run, PARAMETERS, BUFFERS)
     player = PolicyPlayer(policy, lobby(Endless(), WorkerProcesses()), stop, shown.append, RolloutConfig())
     with pytest.raises(KeyboardInterrupt):
         player.play(EvaluationPlan.of(2, seed=5, copies=2, max_steps=100_000), bound="--max-steps:", before=(3, 500))

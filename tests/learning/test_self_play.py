@@ -27,7 +27,7 @@ def exploitability_of_the_pool(folder: Path, seed: int) -> float:
         net=[8], learning_rate=0.003, ent_coef=0.3, normalize_advantage=False, normalize_rewards=False, workers=1,
         transport="inproc", eval_episodes=1, progress=False,
     )  # fmt: skip
-    spec = saved_policy(run.path).spec
+    spec = saved_policy(run.path).card.policy
     policy = make_policy(spec)
     throws = []
     for parameters, buffers in zip(*checkpoint.newest(run.path)[0].state["opponent_policies"], strict=True):

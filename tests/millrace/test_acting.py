@@ -51,8 +51,8 @@ def played(run: Path, copies: int, *, greedy: bool = True, seed: int = 3) -> lis
     saved = saved_policy(run)
     with policy_player(saved, PlayingWorkers(1, "inproc"), silent) as player:
         player.play(plan, lambda episode, some: rows[episode].append(some))
-    to_env = make_action_converter(saved.spec.action)
-    leaves = range(len(saved.spec.observation))
+    to_env = make_action_converter(saved.card.policy.action)
+    leaves = range(len(saved.card.policy.observation))
     return [
         (
             [np.concatenate([some.obs[i][bool(n) :] for n, some in enumerate(one)]) for i in leaves],

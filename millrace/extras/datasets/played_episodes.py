@@ -46,7 +46,7 @@ class PlayedEpisodes:
         self._player = player
         self._seeds = iter(seeds)
         self._stochastic = stochastic
-        self._to_env_action = action_leaves_of(player.policy.spec)
+        self._to_env_action = action_leaves_of(player.run.policy)
         self._episodes = self._steps = self._bytes = 0  # so far: episodes, their steps, and bytes of their observations
 
     def until(self, steps: int) -> Iterator[tuple[RecordedEpisode, bool]]:

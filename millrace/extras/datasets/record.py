@@ -17,7 +17,10 @@ def write_dataset(flags: RecordFlags, watch: ShowPlayed, given: Given | None = N
     left behind.
     """
     saved = policy_to_play(flags, given)
-    for found, why in ((saved.seats, f"{saved.env.id} has several agents"), (saved.spec.critic, "the run has critic_keys")):
+    for found, why in (
+        (saved.card.seats, f"{saved.env.id} has several agents"),
+        (saved.card.policy.critic, "the run has critic_keys"),
+    ):
         if found:
             raise UsageError(f"record: {why}, which a dataset can't have")
     with policy_player(saved, playing_workers(flags, flags.workers, 1), watch) as player:

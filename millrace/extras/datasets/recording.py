@@ -38,7 +38,7 @@ def record_episodes(
     """
     if npy is not None and not npy.parent.is_dir():
         raise UsageError(f"{npy} cannot be written: no such folder {npy.parent}")
-    env = EnvironmentOfDataset(player.describe(), masked=player.policy.masked)
+    env = EnvironmentOfDataset(player.describe(), masked=player.run.masked)
     how = "drawn from" if stochastic else "the most probable of"
     about = f"Actions {how} the policy of millrace run {run.resolve().name}; seed {seed}."
     returns: list[float] = []

@@ -54,7 +54,7 @@ def record_videos(
     episode gets an equal share, but at most `LONGEST_EPISODE`. Returns the evaluation and the paths of the videos. Raises
     `UserFacingError`, with a one-line message, if videos can't be made.
     """
-    env_id = player.policy.env.id
+    env_id = player.run.env.id
     env = player.describe("rgb_array")
     modes = env.metadata.get("render_modes", [])
     if env.render_mode != "rgb_array" or not isinstance(modes, list | tuple) or "rgb_array" not in modes:

@@ -34,9 +34,8 @@ def test_each_team_is_filmed_once_before_one_is_filmed_again(
     monkeypatch.setattr(video, "_write", lambda path, frames, rate: path.touch())
     described = SimpleNamespace(metadata={"render_modes": ["rgb_array"]}, render_mode="rgb_array")
     player = SimpleNamespace(
-        policy=SimpleNamespace(env=SimpleNamespace(id="game")),
         describe=lambda mode: described,
-        run=SimpleNamespace(facts=(), teams=tuple((n,) for n in range(teams))),
+        run=SimpleNamespace(env=SimpleNamespace(id="game"), facts=(), teams=tuple((n,) for n in range(teams))),
     )
     _, films = video.record_videos(cast(PolicyPlayer, player), tmp_path, 5, 7, 100, "against-old-")
     assert together == expected

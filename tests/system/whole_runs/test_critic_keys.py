@@ -34,7 +34,7 @@ def trained(path: Path, env: str = "hidden_envs:Hidden", **settings: Any) -> Pat
 @pytest.mark.parametrize("core", [None, "gru"])
 def test_the_critic_knows_what_the_actor_does_not_see(tmp_path: Path, core: Any) -> None:
     run = trained(tmp_path, steps=2_500, rollout_steps=16, learning_rate=5e-3, n_epochs=4, core=core, core_size=8, **RAW)
-    algorithm = algorithm_class("ppo")(PPOConfig(), saved_policy(run).spec, total_steps=1, seed=1)
+    algorithm = algorithm_class("ppo")(PPOConfig(), saved_policy(run).card.policy, total_steps=1, seed=1)
     algorithm.load_state_dict(checkpoint.newest(run)[0].state["algorithm"])
     rows = torch.tensor([[0.5, -0.5, *hidden] for hidden in np.eye(len(REWARDS))], dtype=torch.float32)
     with torch.no_grad():
@@ -51,9 +51,9 @@ def test_the_critic_knows_what_the_actor_does_not_see(tmp_path: Path, core: Any)
 
 def test_a_policy_is_saved_loaded_and_evaluated_without_them(tmp_path: Path) -> None:
     run = trained(tmp_path, steps=300, rollout_steps=16)
-    spec = saved_policy(run).spec
+    spec = saved_policy(run).card.policy
     assert [leaf.path for leaf in spec.observation] == ["seen"]
-    arrays = sum(array.size for array in saved_policy(run).parameters[None])
+    arrays = sum(array.size for array in saved_policy(run).stored.parameters[None])
     assert arrays == acting_size(spec) == (2 * 64 + 64) + (64 * 64 + 64) + (64 * 2 + 2)
     policy = millrace.load(run)
     assert policy({"seen": np.array([0.5, -0.5], np.float32)}) in (0, 1)
@@ -71,7 +71,7 @@ def test_the_weights_do_not_depend_on_the_number_of_workers(tmp_path: Path, sett
 
 def test_several_agents_have_the_state_of_their_environment(tmp_path: Path) -> None:
     run = trained(tmp_path, "seat_envs:ChainCrowd", steps=300, rollout_steps=16, critic_keys=["state"])
-    spec = saved_policy(run).spec
+    spec = saved_policy(run).card.policy
     assert [(leaf.path, leaf.shape) for leaf in (*spec.observation, *spec.critic)] == [
         ("observation", (9,)),
         ("state", (2,)),

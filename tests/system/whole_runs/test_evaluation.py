@@ -24,6 +24,7 @@ from millrace.protocol.errors import EnvironmentFailed, UserFacingError
 from millrace.protocol.specs import SessionTerms
 from tests.support.gymnasium_versions import CLIFF
 from tests.support.in_process.collectors import TOY, random_weights, run_of
+from tests.support.in_process.saved_policies import policy_of_run
 from tests.system.stage.processes import START_S, Stage, crowding, wait_for
 from tests.system.stage.run_folders import policy_of
 
@@ -37,7 +38,7 @@ def silent(text: str) -> None:
 def untrained(env: str, kwargs: dict[str, Any] | None = None) -> SavedPolicy:
     """A policy with random weights."""
     run = run_of(env, kwargs=kwargs)
-    return SavedPolicy(run.policy, run.env, *random_weights(run.policy))
+    return policy_of_run(run, *random_weights(run.policy))
 
 
 @pytest.mark.parametrize("env", ["CartPole-v1", pytest.param("Pendulum-v1", marks=pytest.mark.soak)])

@@ -26,8 +26,8 @@ from millrace.learner.run_setup import check_evaluation_spaces
 from millrace.protocol.arrays import Floats
 from millrace.protocol.envs.description import DescribedEnv
 from millrace.protocol.errors import UsageError
-from millrace.protocol.policy.policy import make_policy
 from millrace.protocol.policy.recurrent import zero_state
+from tests.support.in_process.saved_policies import load_policy
 from tests.support.users_code.seat_envs import CHAIN_REWARD, MOVES, values_of_the_chain
 from tests.system.stage.run_folders import folder_of, policy_of
 
@@ -55,7 +55,7 @@ def each_observation() -> Floats:
 
 def value_of_each(run: Path) -> Floats:
     """What the critic of a run of PPO says of each observation of the chain."""
-    algorithm = algorithm_class("ppo")(PPOConfig(), saved_policy(run).spec, total_steps=1, seed=1)
+    algorithm = algorithm_class("ppo")(PPOConfig(), saved_policy(run).card.policy, total_steps=1, seed=1)
     algorithm.load_state_dict(checkpoint.newest(run)[0].state["algorithm"])
     with torch.no_grad():
         return algorithm.net.value(torch.from_numpy(each_observation())).numpy()  # type: ignore[attr-defined, no-any-return]
@@ -63,11 +63,9 @@ def value_of_each(run: Path) -> Floats:
 
 def best_of_each(run: Path) -> Floats:
     """What a run of DQN says of the better action in each."""
-    saved = saved_policy(run)
-    policy = make_policy(saved.spec)
-    policy.load(saved.parameters, saved.buffers)
+    policy, spec, _ = load_policy(run)
     obs = each_observation()[None]
-    return np.asarray(policy([obs], zero_state(saved.spec, *obs.shape[:2]))[0, :, :2].max(-1))  # the last is ε
+    return np.asarray(policy([obs], zero_state(spec, *obs.shape[:2]))[0, :, :2].max(-1))  # the last is ε
 
 
 @pytest.mark.parametrize("env", ["ChainGame", "ChainCrowd"])
@@ -136,7 +134,7 @@ def test_an_episode_has_the_return_of_each_agent_and_their_sum(tmp_path: Path) -
 @pytest.mark.parametrize("env", ["ChainGame", "ChainCrowd"])
 def test_each_agent_can_be_told_which_one_it_is(tmp_path: Path, env: str) -> None:
     run = trained(tmp_path, env, steps=300, rollout_steps=16, seat_id=True)
-    leaves = saved_policy(run).spec.observation
+    leaves = saved_policy(run).card.policy.observation
     assert [(leaf.path, leaf.kind, leaf.sizes) for leaf in leaves] == [
         ("observation", "box", ()),
         ("seat", "discrete", (2,)),
