@@ -137,16 +137,14 @@ def _spaces(config: Config, env: DescribedEnv) -> EnvSpaces:
 
 def check_evaluation_spaces(config: Config, training: DescribedEnv, evaluation: DescribedEnv) -> None:
     """Raise `UsageError` if `eval_env_kwargs` change the environment's spaces or agents."""
-    expected, got = (
-        EnvSpaces.of_description(env, config.action_masks, config.critic_keys) for env in (training, evaluation)
-    )
+    expected, got = (_spaces(config, env) for env in (training, evaluation))
     if (expected.observation, expected.action) != (got.observation, got.action):
         raise UsageError(
             f"eval_env_kwargs: expected the spaces of training, {training.observation_space} and {training.action_space}, "
             f"got {evaluation.observation_space} and {evaluation.action_space}"
         )
-    agents = [agents_in_words(env.seats, env.takes_turns) for env in (training, evaluation)]
-    if agents[0] != agents[1]:
+    if (expected.seats, expected.takes_turns) != (got.seats, got.takes_turns):
+        agents = [agents_in_words(env.seats, env.takes_turns) for env in (training, evaluation)]
         raise UsageError(f"eval_env_kwargs: expected the agents of training, {agents[0]}; got {agents[1]}")
 
 

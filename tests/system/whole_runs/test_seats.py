@@ -186,6 +186,9 @@ def test_an_evaluation_has_the_agents_of_training() -> None:
     for other, got in ((turns, "agents that take turns: a, b"), (none, "agents: none")):
         with pytest.raises(UsageError, match=f"^eval_env_kwargs: expected the agents of training, agents: a, b; got {got}$"):
             check_evaluation_spaces(config, two, other)
+    many, others = (replace(none, seats=(*(f"agent_{n}" for n in range(99)), last)) for last in ("a", "b"))
+    with pytest.raises(UsageError, match=r"^eval_env_kwargs: expected the agents of training"):
+        check_evaluation_spaces(config, many, others)
 
 
 def test_so_is_what_a_saved_policy_of_theirs_cannot_do(tmp_path: Path) -> None:
