@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from millrace.learner.algorithms.replay.replay_buffer import Content, ReplayBuffer, Sample
+from millrace.learner.algorithms.replay.replay_buffer import ReplayBuffer, Sample
 from millrace.protocol.arrays import Floats, Ints
 from millrace.protocol.errors import UsageError
 from millrace.protocol.machine.available_memory import GIB, available_bytes
@@ -21,22 +21,18 @@ from millrace.protocol.rollout import Batch
 PRIOR_SLOT = -1  # stands for every prior transition in `Sample.slots`
 
 
-def check_dataset_fits_memory(content: Content) -> None:
-    """Raise `UsageError` if a dataset of this size does not fit into the free memory. Checkpoints don't copy the dataset."""
-    needed = content.bytes
-    free = available_bytes()
-    if free is not None and needed > free:
-        raise UsageError(
-            f"prior: {content.size} observations of the dataset take {needed / GIB:.1f} GiB, "
-            f"but {free / GIB:.1f} GiB of memory are free; record a smaller dataset"
-        )
-
-
 class PriorTransitions(ReplayBuffer):
     """The transitions of a dataset, which no checkpoint copies."""
 
     _purpose = Purpose.PRIOR
-    _check_memory = staticmethod(check_dataset_fits_memory)
+
+    def _check_memory(self, needed: int) -> None:
+        free = available_bytes()
+        if free is not None and needed > free:
+            raise UsageError(
+                f"prior: {self.size} observations of the dataset take {needed / GIB:.1f} GiB, "
+                f"but {free / GIB:.1f} GiB of memory are free; record a smaller dataset"
+            )
 
 
 class MixedReplay(ReplayBuffer):
@@ -53,12 +49,12 @@ class MixedReplay(ReplayBuffer):
         `UsageError` if there is too little memory, or, with hindsight, if the rewards don't agree with the goals.
         """
         prior = PriorTransitions(
-            self._content.observation,
+            tuple(self._observation.values()),
             size=slots,
             n_step=self._n_step,
             gamma=self._gamma,
             seed=self._seed,
-            action=self._content.action,
+            action=self._action,
             hindsight=self._hindsight,
         )
         for episode, batch in enumerate(batches):

@@ -1,11 +1,10 @@
 """The replay buffer: stores rows, and draws n-step transitions, uniformly or by priority.
 
-The buffer is a ring of preallocated numpy arrays. A slot holds a raw observation. If a valid row begins with this
-observation, the slot also holds the rest of the row: action, reward, whether it terminated, and the slot of the next
-observation. Each observation is therefore stored once (or each frame of a frame stack, see `shared_channels.py`). When a
-transition is drawn, its n-step return is computed by following the rows from slot to slot. A slot without a row holds the
-final observation of a truncated episode, or the newest observation of an env copy, whose row arrives with the copy's next
-rollout.
+A slot of the ring (`ring.py`) holds a raw observation. If a valid row begins with this observation, the slot also holds the
+rest of the row: action, reward, whether it terminated, and the slot of the next observation. Each observation is therefore
+stored once (or each frame of a frame stack, see `shared_channels.py`). When a transition is drawn, its n-step return is
+computed by following the rows from slot to slot. A slot without a row holds the final observation of a truncated episode, or
+the newest observation of an env copy, whose row arrives with the copy's next rollout.
 
 Rule: rows that are not valid are never stored. A row's next observation is newer than the row, and the ring overwrites the
 oldest slot first, so the rows that follow a stored row are always stored, too. They are rows of the same seat, however long
@@ -20,24 +19,18 @@ This module uses no sockets and no files, and all randomness comes from the seed
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Container, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 
 from millrace.learner.algorithms.replay.episode_paths import NO_SLOT, EpisodePaths
 from millrace.learner.algorithms.replay.hindsight import Goals, Hindsight
-from millrace.learner.algorithms.replay.priorities import Priorities
-from millrace.learner.algorithms.replay.rewinding import Remembered, Rewinding
+from millrace.learner.algorithms.replay.ring import Ring
 from millrace.learner.algorithms.replay.shared_channels import SharedChannels
-from millrace.learner.algorithms.replay.sum_tree import SumTree
 from millrace.learner.algorithms.returns import EpisodeEnds
 from millrace.protocol.arrays import Array, Bools, Doubles, Floats, Ints
 from millrace.protocol.errors import UsageError
-from millrace.protocol.machine.available_memory import GIB, available_bytes
-from millrace.protocol.random_streams import Purpose, generator
 from millrace.protocol.rollout import Batch
 from millrace.protocol.specs import ActionSpec, Leaf
 
@@ -77,56 +70,6 @@ class Sample(NamedTuple):
         )
 
 
-class Content(NamedTuple):
-    """The properties of a replay buffer that determine how much memory it needs."""
-
-    observation: tuple[Leaf, ...]
-    size: int
-    """the number of slots"""
-    prioritized: bool = False
-    action: ActionSpec = DISCRETE
-    linked: bool = False
-    """whether it stores the paths that lead to the later rows of an episode"""
-    choices: int = 0
-    """the number of choices in an action mask; 0 without masks"""
-
-    @property
-    def bytes(self) -> int:
-        """Size of the replay buffer in bytes."""
-        leaves = sum(int(np.prod(leaf.shape)) * np.dtype(leaf.dtype).itemsize for leaf in self.observation)
-        slots = self.size * (leaves + self.choices + row_dtype(self.action).itemsize)
-        tree = SumTree.memory_bytes(self.size) if self.prioritized else 0
-        paths = EpisodePaths.memory_bytes(self.size) if self.linked else 0
-        return slots + tree + paths
-
-
-def check_fits_memory(content: Content) -> None:
-    """Raise `UsageError` if there isn't enough memory for the buffer and a copy of it. The error names a size that fits.
-
-    Writing a checkpoint needs such a copy.
-    """
-    size = content.size
-    needed = 2 * content.bytes
-    free = available_bytes()
-    if free is None or needed <= free:
-        return
-    fits = size * free // needed
-    fits -= fits % 10 ** max(0, len(str(fits)) - 2)
-    raise UsageError(
-        f"replay_size {size}: {size} transitions take {needed / 2 / GIB:.1f} GiB, and as much again while a checkpoint is "
-        f"written, but {free / GIB:.1f} GiB of memory are free; take --replay-size {fits} or less"
-    )
-
-
-class Overwritten(NamedTuple):
-    """The contents of some slots before they were written."""
-
-    slots: Ints  # [K]
-    rows: Array  # [K] with dtype `row_dtype`
-    weights: Doubles | None  # [K] their weights in the sum tree; None without priorities
-    leaves: tuple[Array, ...]  # [K, *leaf] each; empty if only rows or priorities were written
-
-
 def _goes_on(ends: EpisodeEnds, continues: Bools) -> Bools:
     """[T+1, N] True where row t begins with an observation that is already stored, because the previous row led to it.
 
@@ -139,11 +82,8 @@ def _goes_on(ends: EpisodeEnds, continues: Bools) -> Bools:
     return goes_on
 
 
-class ReplayBuffer(Rewinding[Overwritten]):
+class ReplayBuffer(Ring):
     """The newest transitions of all lanes, drawn uniformly or by priority."""
-
-    _purpose = Purpose.REPLAY
-    _check_memory = staticmethod(check_fits_memory)
 
     def __init__(
         self,
@@ -161,43 +101,34 @@ class ReplayBuffer(Rewinding[Overwritten]):
 
         Raises `UsageError` if there is too little memory.
         """
-        self._content = Content(observation, size, alpha is not None, action, linked=hindsight is not None)
-        self.size = size  # number of slots
-        self._check_memory(self._content)
-        self._transition_bytes = 2 * self._content.bytes // size  # a drawn transition has two observations
+        self._observation = {f"obs{i}": leaf for i, leaf in enumerate(observation)}
+        shapes = {name: (leaf.shape, leaf.dtype) for name, leaf in self._observation.items()}
+        super().__init__(
+            size,
+            shapes | {"row": ((), row_dtype(action))},
+            seed=seed,
+            alpha=alpha,
+            images={name: leaf for name, leaf in self._observation.items() if leaf.is_image},
+            other_bytes=0 if hindsight is None else EpisodePaths.memory_bytes(size),
+        )
+        self._share(())
+        self._transition_bytes = 2 * self.bytes // size  # a drawn transition has two observations
+        self._action = action
         self._n_step = n_step
         self._gamma = gamma
         self._seed = seed
-        self.generator = generator(seed, self._purpose)  # the source of random numbers for all samples
-        self._obs = tuple(self._room(leaf) for leaf in observation)
-        self._mask: Bools | None = None  # [size, choices], the masks of `_obs`; allocated when the first masks arrive
-        self._row = np.zeros(size, row_dtype(action))
-        self._action: Array = self._row["action"]  # this array and the next four are views of `_row`
-        self._reward: Floats = self._row["reward"]
-        self._terminated: Bools = self._row["terminated"]
-        self._follows: Ints = self._row["follows"]  # slot of the next observation; its own slot if that is not stored
-        self._is_row: Bools = self._row["is_row"]
-        self._priorities = None if alpha is None else Priorities(size, alpha)
         self._hindsight = hindsight
         self._paths = None if hindsight is None else EpisodePaths(size)
-        self._written = 0  # number of slots ever written; modulo the size, it is the next slot
-        self._rows = 0
-        self._remembered: Remembered | None = None
-        self._overwritten: list[Overwritten] = []  # contents saved since `remember`, oldest first
-        self._newest: dict[int, Ints] = {}  # by lane, [columns] `_written` when each column's newest observation was stored
-
-    def __len__(self) -> int:
-        """The number of transitions that can be drawn."""
-        return self._rows
 
     @property
-    def bytes(self) -> int:
-        """Memory of the replay buffer, in bytes."""
-        saved = 0
-        for leaf, stored in zip(self._content.observation, self._obs, strict=True):
-            if isinstance(stored, SharedChannels):
-                saved += self.size * math.prod(leaf.shape) - stored.nbytes
-        return self._content.bytes - saved
+    def _is_row(self) -> Bools:
+        is_row: Bools = self.arrays["row"]["is_row"]
+        return is_row
+
+    def _share(self, names: Container[str]) -> None:
+        super()._share(names)
+        arrays = self._all_arrays()
+        self._obs = [arrays[name] for name in self._observation]  # looked up once, because each draw reads them
 
     # ---------------------------------------------------------------- writing
 
@@ -210,9 +141,10 @@ class ReplayBuffer(Rewinding[Overwritten]):
         if self._hindsight is not None:
             self._hindsight.check(batch)
         if batch.mask is not None:
-            self._make_mask(batch.mask.shape[-1])
-        if not self._written:
-            self._share_channels([leaf[:, 0] for leaf in batch.obs])
+            self._make_masks(batch.mask.shape[-1:])
+        if not self._written:  # the first images, from one copy's rollout, show whether sharing channels saves memory
+            first = dict(zip(self._observation, (leaf[:, 0] for leaf in batch.obs), strict=True))
+            self._share([name for name, leaf in self._images.items() if SharedChannels.worthwhile(leaf, first[name])])
         for at in range(0, len(batch.lane), batch.columns_per_rollout):  # a lane's rollouts are in order of collection
             self._add(batch, slice(at, at + batch.columns_per_rollout), int(batch.lane[at]))
 
@@ -238,13 +170,12 @@ class ReplayBuffer(Rewinding[Overwritten]):
         written = np.maximum.accumulate(written)  # while a seat waits, its newest observation stays where it is
         self._written += int(np.count_nonzero(needed))
         slot = written % self.size
-        if batch.mask is not None:
-            obs.append(batch.mask[:, columns])
         new = slot[needed]
-        self._keep(new, self._per_observation())
-        self._keep(slot[0][continues], ())
-        self._rows -= int(np.count_nonzero(self._is_row[new]))
-        self._is_row[new] = False
+        self._keep(new)
+        self._keep(slot[0][continues], ["row"])
+        row = self.arrays["row"]
+        self._rows -= int(np.count_nonzero(row["is_row"][new]))
+        row["is_row"][new] = False
         if self._priorities is not None:
             self._priorities.tree.set(new, 0.0)
         if self._paths is not None:
@@ -252,40 +183,20 @@ class ReplayBuffer(Rewinding[Overwritten]):
             before[1:][valid] = slot[:-1][valid]
             self._paths.overwrite(new)
             self._paths.append(new, before[needed])
-        for kept, leaf in zip(self._per_observation(), obs, strict=True):
-            kept[new] = leaf[needed]
+        for stored, leaf in zip(self._obs, obs, strict=True):
+            stored[new] = leaf[needed]
+        if batch.mask is not None:
+            self.arrays["mask"][new] = batch.mask[:, columns][needed]
         rows = slot[:-1][valid]
-        self._action[rows] = batch.action[:, columns][valid]
-        self._reward[rows] = batch.reward[:, columns][valid]
-        self._terminated[rows] = terminated[valid]
-        self._follows[rows] = np.where(leads[valid], slot[1:][valid], rows)
-        self._is_row[rows] = True
+        row["action"][rows] = batch.action[:, columns][valid]
+        row["reward"][rows] = batch.reward[:, columns][valid]
+        row["terminated"][rows] = terminated[valid]
+        row["follows"][rows] = np.where(leads[valid], slot[1:][valid], rows)
+        row["is_row"][rows] = True
         self._rows += len(rows)
         if self._priorities is not None:
             self._priorities.add(rows)
         self._newest[lane] = np.where(goes_on[-1], written[-1], NO_SLOT)
-
-    def _make_mask(self, choices: int) -> None:
-        if self._mask is None:
-            content = self._content._replace(choices=choices)
-            self._check_memory(content)
-            self._content = content
-            self._mask = np.ones((self.size, choices), bool)
-
-    def _share_channels(self, first: Sequence[Array]) -> None:
-        """Share equal channels of image leaves if the first images, from one copy's rollout, show that this saves memory."""
-        self._obs = tuple(
-            self._room(leaf, shared=leaf.is_image and SharedChannels.worthwhile(leaf, images))
-            for leaf, images in zip(self._content.observation, first, strict=True)
-        )
-
-    def _room(self, leaf: Leaf, *, shared: bool = False) -> Array | SharedChannels:
-        """Allocate the array that holds a leaf of each observation."""
-        return SharedChannels(self.size, leaf) if shared else np.zeros((self.size, *leaf.shape), leaf.dtype)
-
-    def _per_observation(self) -> tuple[Array | SharedChannels, ...]:
-        """The arrays with one entry for each stored observation: the leaves, and the mask if there are masks."""
-        return self._obs if self._mask is None else (*self._obs, self._mask)
 
     def _continues(self, first: Sequence[Array], newest: Ints, room: int) -> Bools:
         """[N] True where a copy's rollout begins with the newest observation that is stored for it.
@@ -312,7 +223,7 @@ class ReplayBuffer(Rewinding[Overwritten]):
             weight = np.ones(count, np.float32)
         else:
             slots, weight = self._priorities.draw(self.generator, count, self._rows, beta)
-            row = self._row[slots]
+            row = self.arrays["row"][slots]
         goals = None if self._hindsight is None else self._other_goals(self._hindsight.share, slots)
         reward, discount, last = self._follow(row, goals)
         return Sample(
@@ -323,7 +234,7 @@ class ReplayBuffer(Rewinding[Overwritten]):
             discount=discount.astype(np.float32),
             next_leaves=self._leaves(last, goals),
             weight=weight,
-            next_mask=None if self._mask is None else self._mask[last],
+            next_mask=self.arrays["mask"][last] if "mask" in self.arrays else None,
         )
 
     def _other_goals(self, share: float, slots: Ints) -> Goals:
@@ -353,9 +264,10 @@ class ReplayBuffer(Rewinding[Overwritten]):
             yield from (drawn.part(slice(i * count, (i + 1) * count)) for i in range(these))
 
     def _uniform(self, count: int) -> tuple[Ints, Array]:
-        used = min(self._written, self.size)
+        rows = self.arrays["row"]
+        used = self._used
         slots = self.generator.integers(0, used, count)
-        while not (found := (row := self._row[slots])["is_row"]).all():  # few rounds, because half of the slots have a row
+        while not (found := (row := rows[slots])["is_row"]).all():  # few rounds, because half of the slots have a row
             slots[~found] = self.generator.integers(0, used, np.count_nonzero(~found))
         return slots, row
 
@@ -370,7 +282,7 @@ class ReplayBuffer(Rewinding[Overwritten]):
         ended = row["terminated"]
         at = row["follows"]
         for _ in range(self._n_step - 1):
-            row = self._row[at]
+            row = self.arrays["row"][at]
             self._set_outcome(row, goals)
             going = row["is_row"] & ~ended  # the others stay at the last slot that they reached
             reward += np.where(going, discount * row["reward"], 0)
@@ -390,89 +302,26 @@ class ReplayBuffer(Rewinding[Overwritten]):
         row["reward"][goals.rows] = outcome.reward
         row["terminated"][goals.rows] = outcome.terminated
 
-    @property
-    def prioritized(self) -> bool:
-        """Whether transitions are drawn by priority."""
-        return self._priorities is not None
-
     def update_priorities(self, slots: Ints, error: Floats) -> None:
         """Set the priorities of the transitions in these slots [B] from their errors [B]. Call it before the next `add`."""
         if self._priorities is not None:
-            self._keep(slots, ())
+            self._keep(slots, [])
             self._priorities.update(slots, np.abs(error).astype(np.float64))
 
-    # ---------------------------------------------------------------- rolling back
+    # ---------------------------------------------------------------- what is recomputed
 
     def roll_back(self) -> None:
         """Return to the state of the last `remember`."""
         super().roll_back()
         self._find_paths()
 
-    def _put_back(self, old: Overwritten) -> None:
-        self._row[old.slots] = old.rows
-        for leaf, before in zip(self._per_observation(), old.leaves, strict=False):
-            leaf[old.slots] = before
-        if self._priorities is not None and old.weights is not None:
-            self._priorities.tree.set(old.slots, old.weights)
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from a `state_dict`, bit for bit. Raises ValueError if its size differs from this buffer's."""
+        super().load_state_dict(state)
+        self._find_paths()
 
     def _find_paths(self) -> None:
         """Recompute the paths of the stored rows. Called after anything other than `add` has changed these rows."""
         if self._paths is not None:
-            used = min(self._written, self.size)
-            by_age = np.arange(self._written - used, self._written) % self.size
-            self._paths = EpisodePaths.rebuilt(self.size, by_age, self._is_row, self._follows)
-
-    def _keep(self, slots: Ints, leaves: Sequence[Array | SharedChannels]) -> None:
-        """If `remember` was called, save the contents of these slots, which are about to be overwritten."""
-        if self._remembered is not None and len(slots):
-            weights = None if self._priorities is None else self._priorities.tree.weights[slots]
-            self._overwritten.append(Overwritten(slots, self._row[slots], weights, tuple(leaf[slots] for leaf in leaves)))
-
-    # ---------------------------------------------------------------- saving
-
-    def _arrays(self) -> dict[str, Array]:
-        """All arrays with one entry for each slot, by name."""
-        own = {name: getattr(self, f"_{name}") for name in ("action", "reward", "terminated", "follows", "is_row")}
-        tree = {} if self._priorities is None else {"weight": self._priorities.tree.weights}
-        masks = {} if self._mask is None else {"mask": self._mask}
-        leaves = {f"obs{i}": leaf for i, leaf in enumerate(self._obs) if not isinstance(leaf, SharedChannels)}
-        return leaves | masks | own | tree
-
-    def _shared(self) -> dict[str, SharedChannels]:
-        return {f"obs{i}": leaf for i, leaf in enumerate(self._obs) if isinstance(leaf, SharedChannels)}
-
-    def state_dict(self) -> dict[str, Any]:
-        """A copy of the slots in use, as tensors and plain data."""
-        used = min(self._written, self.size)
-        return {
-            "size": self.size,
-            "arrays": {name: torch.tensor(array[:used]) for name, array in self._arrays().items()},
-            "shared": {name: list(map(torch.from_numpy, images.saved(used))) for name, images in self._shared().items()},
-            "newest": {lane: torch.tensor(written) for lane, written in self._newest.items()},
-            "written": self._written,
-            "highest": self._highest,
-            "generator": self.generator.bit_generator.state,
-        }
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from a `state_dict`, bit for bit. Raises ValueError if its size differs from this buffer's."""
-        if state["size"] != self.size:
-            raise ValueError(f"replay_size: expected {state['size']}, got {self.size}")
-        self._written = state["written"]
-        used = min(self._written, self.size)
-        self._is_row[used:] = False
-        if "mask" in state["arrays"]:
-            self._make_mask(state["arrays"]["mask"].shape[1])
-        shared = state.get("shared", {})
-        self._obs = tuple(self._room(leaf, shared=f"obs{i}" in shared) for i, leaf in enumerate(self._content.observation))
-        for name, images in self._shared().items():
-            images.load(*(tensor.numpy() for tensor in shared[name]))
-        for name, array in self._arrays().items():
-            if name != "weight":
-                array[:used] = state["arrays"][name].numpy()
-        if self._priorities is not None:
-            self._priorities.load(state["arrays"]["weight"].numpy(), state["highest"])
-        self._rows = int(np.count_nonzero(self._is_row))
-        self._newest = {int(lane): written.numpy().copy() for lane, written in state["newest"].items()}
-        self._find_paths()
-        self.generator.bit_generator.state = state["generator"]
+            by_age = np.arange(self._written - self._used, self._written) % self.size
+            self._paths = EpisodePaths.rebuilt(self.size, by_age, self._is_row, self.arrays["row"]["follows"])

@@ -14,21 +14,15 @@ This module uses no files, and all randomness comes from the seed.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 
-from millrace.learner.algorithms.replay.priorities import Priorities
-from millrace.learner.algorithms.replay.rewinding import Remembered, Rewinding
-from millrace.learner.algorithms.replay.sum_tree import SumTree
+from millrace.learner.algorithms.replay.ring import Ring
 from millrace.learner.algorithms.returns import EpisodeEnds, n_step_returns
-from millrace.protocol.arrays import Array, Bools, Doubles, Floats, Ints
+from millrace.protocol.arrays import Array, Bools, Floats, Ints
 from millrace.protocol.errors import UsageError
-from millrace.protocol.machine.available_memory import GIB, available_bytes
-from millrace.protocol.random_streams import Purpose, generator
 from millrace.protocol.rollout import Batch
 from millrace.protocol.specs import PolicySpec
 
@@ -55,15 +49,7 @@ class SequenceSample(NamedTuple):
     next_mask: Bools | None  # [B, choices] actions allowed k steps later; None without action masks
 
 
-class ReplacedSequences(NamedTuple):
-    """The contents of some slots before they were written."""
-
-    slots: Ints
-    arrays: dict[str, Array]
-    weights: Doubles | None
-
-
-class SequenceReplay(Rewinding[ReplacedSequences]):
+class SequenceReplay(Ring):
     """The newest sequences of all lanes, drawn uniformly or by priority."""
 
     def __init__(
@@ -81,14 +67,10 @@ class SequenceReplay(Rewinding[ReplacedSequences]):
 
         Raises `UsageError` if there is too little memory.
         """
-        self.size = max(1, rows // steps)  # number of slots, each of which holds one sequence
-        self._steps = steps
-        self._n_step = n_step
-        self._gamma = gamma
-        self.prioritized = alpha is not None  # whether sequences are drawn by priority
         T = steps
+        self._leaves = [f"obs{i}" for i in range(len(policy.observation))]
         shapes: dict[str, tuple[tuple[int, ...], Any]] = {
-            f"obs{i}": ((T + 1, *leaf.shape), leaf.dtype) for i, leaf in enumerate(policy.observation)
+            name: ((T + 1, *leaf.shape), leaf.dtype) for name, leaf in zip(self._leaves, policy.observation, strict=True)
         }
         shapes |= {
             "action": ((T, *policy.action.shape), policy.action.stored_dtype),
@@ -96,43 +78,17 @@ class SequenceReplay(Rewinding[ReplacedSequences]):
             "terminated": ((T,), "bool"),
             "truncated": ((T,), "bool"),
             "valid": ((T,), "bool"),
-            "begins": ((T,), "bool"),
+            "begins": ((T,), "bool"),  # True where obs[t+1] begins an episode
             "state": ((policy.state_size,), "float32"),
-            "before": ((), "int64"),
+            "before": ((), "int64"),  # the number of the previous sequence, in the order in which they were written
         }
-        self._leaves = [f"obs{i}" for i in range(len(policy.observation))]
-        self._shapes = shapes
-        self._check_memory()
-        self.arrays = {name: np.zeros((self.size, *shape), dtype) for name, (shape, dtype) in shapes.items()}
-        """Arrays with one entry for each slot, by name. `begins` is True where obs[t+1] begins an episode. `before` is the
-        number of the previous sequence; sequences are numbered in the order in which they were written."""
-        self.generator = generator(seed, Purpose.REPLAY)  # the source of random numbers for all samples
-        self._priorities = None if alpha is None else Priorities(self.size, alpha)
-        self._written = 0  # number of sequences ever written; modulo the size, it is the next slot
-        self._rows = 0
-        self._newest: dict[int, Ints] = {}  # by lane, [columns] the number of each column's newest sequence
-        self._remembered: Remembered | None = None
-        self._overwritten: list[ReplacedSequences] = []  # contents saved since `remember`, oldest first
-
-    def __len__(self) -> int:
-        """The number of rows that can be drawn."""
-        return self._rows
+        super().__init__(max(1, rows // steps), shapes, seed=seed, alpha=alpha, steps=steps)
+        self._n_step = n_step
+        self._gamma = gamma
 
     @property
-    def bytes(self) -> int:
-        """Memory of all slots, in bytes."""
-        slot: int = sum(math.prod(shape) * np.dtype(dtype).itemsize for shape, dtype in self._shapes.values())
-        return self.size * slot + (SumTree.memory_bytes(self.size) if self.prioritized else 0)
-
-    def _check_memory(self) -> None:
-        free = available_bytes()
-        if free is not None and 2 * self.bytes > free:
-            fits = self.size * free // (2 * self.bytes) * self._steps
-            raise UsageError(
-                f"replay_size {self.size * self._steps}: its sequences take {self.bytes / GIB:.1f} GiB, and as much again "
-                f"while a checkpoint is written, but {free / GIB:.1f} GiB of memory are free; "
-                f"take --replay-size {fits} or less"
-            )
+    def _is_row(self) -> Bools:
+        return self.arrays["valid"]
 
     # ---------------------------------------------------------------- writing
 
@@ -145,8 +101,8 @@ class SequenceReplay(Rewinding[ReplacedSequences]):
                 f"replay_size {self.size * self._steps}: expected room for two rollouts of a lane, {least} rows; "
                 f"take --replay-size {least} or more"
             )
-        if batch.mask is not None and "mask" not in self.arrays:
-            self._make_mask(batch.mask.shape[-1])
+        if batch.mask is not None:
+            self._make_masks((self._steps + 1, batch.mask.shape[-1]))
         begins = batch.begins
         for at in range(0, len(batch.lane), N):  # a lane's rollouts are in order of collection
             self._add(batch, begins, slice(at, at + N), int(batch.lane[at]))
@@ -165,7 +121,7 @@ class SequenceReplay(Rewinding[ReplacedSequences]):
         used = np.flatnonzero(arrays["valid"].any(1))  # the columns that have a valid row
         numbers = self._written + np.arange(len(used))
         slots = numbers % self.size
-        self._keep(slots, all_arrays=True)
+        self._keep(slots)
         self._rows += int(np.count_nonzero(arrays["valid"])) - int(np.count_nonzero(self.arrays["valid"][slots]))
         for name, array in arrays.items():
             self.arrays[name][slots] = array[used]
@@ -192,11 +148,6 @@ class SequenceReplay(Rewinding[ReplacedSequences]):
             continues &= same.reshape(len(fresh), -1).all(1)
         return np.where(continues, known, NONE)
 
-    def _make_mask(self, choices: int) -> None:
-        self._shapes["mask"] = ((self._steps + 1, choices), "bool")
-        self._check_memory()
-        self.arrays["mask"] = np.ones((self.size, self._steps + 1, choices), bool)
-
     # ---------------------------------------------------------------- reading
 
     def samples(self, number: int, count: int, beta: float = 1.0) -> Iterator[SequenceSample]:
@@ -209,12 +160,11 @@ class SequenceReplay(Rewinding[ReplacedSequences]):
         For `beta`, see `ReplayBuffer`.
         """
         sequences = max(FEWEST, count // self._steps)
-        used = min(self._written, self.size)
         if self._priorities is None:
-            slots = self.generator.integers(0, used, sequences)
+            slots = self.generator.integers(0, self._used, sequences)
             weight = np.ones(sequences, np.float32)
         else:
-            slots, weight = self._priorities.draw(self.generator, sequences, used, beta)
+            slots, weight = self._priorities.draw(self.generator, sequences, self._used, beta)
         return self._drawn(slots, weight)
 
     def _drawn(self, slots: Ints, weight: Floats) -> SequenceSample:
@@ -258,61 +208,20 @@ class SequenceReplay(Rewinding[ReplacedSequences]):
         highest = np.zeros(len(sequences))
         np.maximum.at(highest, of_row, size)
         mean = np.bincount(of_row, size) / np.bincount(of_row)
-        self._keep(sequences)
+        self._keep(sequences, [])
         self._priorities.update(sequences, HIGHEST_SHARE * highest + (1 - HIGHEST_SHARE) * mean)
-
-    # ---------------------------------------------------------------- rolling back
-
-    def _put_back(self, old: ReplacedSequences) -> None:
-        for name, array in old.arrays.items():
-            self.arrays[name][old.slots] = array
-        if self._priorities is not None and old.weights is not None:
-            self._priorities.tree.set(old.slots, old.weights)
-
-    def _keep(self, slots: Ints, *, all_arrays: bool = False) -> None:
-        """If `remember` was called, save the contents of these slots, which are about to be overwritten."""
-        if self._remembered is not None and len(slots):
-            weights = None if self._priorities is None else self._priorities.tree.weights[slots]
-            arrays = {name: array[slots] for name, array in self.arrays.items()} if all_arrays else {}
-            self._overwritten.append(ReplacedSequences(slots, arrays, weights))
 
     # ---------------------------------------------------------------- saving
 
     def state_dict(self) -> dict[str, Any]:
         """A copy of the slots in use, as tensors and plain data."""
-        used = min(self._written, self.size)
-        weights = {} if self._priorities is None else {"weight": torch.tensor(self._priorities.tree.weights[:used])}
-        return {
-            "size": self.size,
-            "steps": self._steps,
-            "arrays": {name: torch.tensor(array[:used]) for name, array in self.arrays.items()} | weights,
-            "newest": {lane: torch.tensor(numbers) for lane, numbers in self._newest.items()},
-            "written": self._written,
-            "highest": self._highest,
-            "generator": self.generator.bit_generator.state,
-        }
+        return super().state_dict() | {"steps": self._steps}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from a `state_dict`, bit for bit. Raises ValueError if the number or length of sequences differs."""
-        for name, expected, got in (
-            ("rollout_steps", state["steps"], self._steps),
-            ("replay_size", state["size"] * state["steps"], self.size * self._steps),
-        ):
-            if expected != got:
-                raise ValueError(f"{name}: expected {expected}, got {got}")
-        self._written = state["written"]
-        used = min(self._written, self.size)
-        arrays = state["arrays"]
-        if "mask" in arrays and "mask" not in self.arrays:
-            self._make_mask(arrays["mask"].shape[-1])
-        for name, array in self.arrays.items():
-            array[:used] = arrays[name].numpy()
-        self.arrays["valid"][used:] = False
-        if self._priorities is not None and "weight" in arrays:
-            self._priorities.load(arrays["weight"].numpy(), state["highest"])
-        self._rows = int(np.count_nonzero(self.arrays["valid"]))
-        self._newest = {int(lane): numbers.numpy().copy() for lane, numbers in state["newest"].items()}
-        self.generator.bit_generator.state = state["generator"]
+        if state["steps"] != self._steps:
+            raise ValueError(f"rollout_steps: expected {state['steps']}, got {self._steps}")
+        super().load_state_dict(state)
 
 
 def _flat(array: Array) -> Array:

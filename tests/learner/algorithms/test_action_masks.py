@@ -18,7 +18,7 @@ from millrace.learner.algorithms.impala import IMPALA
 from millrace.learner.algorithms.kernels import trained_networks
 from millrace.learner.algorithms.minibatches import Minibatch, log_probs
 from millrace.learner.algorithms.ppo import PPO
-from millrace.learner.algorithms.replay import replay_buffer
+from millrace.learner.algorithms.replay import ring
 from millrace.learner.algorithms.replay.mixed_replay import MixedReplay
 from millrace.learner.algorithms.replay.replay_buffer import Sample
 from millrace.learner.config.hyperparameters import DQNConfig, IMPALAConfig, PPOConfig
@@ -286,8 +286,7 @@ def test_targets_are_the_best_of_the_allowed_actions_of_the_next_observation(
 def kept(algorithm: DQN) -> Array:
     """The masks that its buffer holds."""
     assert isinstance(algorithm.replay, MixedReplay)
-    assert algorithm.replay._mask is not None
-    return algorithm.replay._mask.copy()
+    return algorithm.replay.arrays["mask"].copy()
 
 
 def test_masks_are_overwritten_with_their_slots() -> None:
@@ -309,11 +308,11 @@ def test_masks_count_for_the_memory_and_are_refused_if_they_do_not_fit(monkeypat
     algorithm = dqn()
     replay, before = algorithm.replay, algorithm.replay.bytes
     masked = true_masks(masked_batch(algorithm, 0))
-    monkeypatch.setattr(replay_buffer, "available_bytes", lambda: 2 * before)
+    monkeypatch.setattr(ring, "available_bytes", lambda: 2 * before)
     with pytest.raises(UsageError, match=r"^replay_size \d+: .*take --replay-size \d+ or less$"):
         replay.add(masked)
     assert len(replay) == 0
-    monkeypatch.setattr(replay_buffer, "available_bytes", lambda: None)
+    monkeypatch.setattr(ring, "available_bytes", lambda: None)
     replay.add(masked)
     assert replay.bytes == before + kept(algorithm).nbytes
 
@@ -322,7 +321,7 @@ def test_without_masks_nothing_is_stored() -> None:
     algorithm = dqn()
     algorithm.replay.add(batch(algorithm, 0))
     assert isinstance(algorithm.replay, MixedReplay)
-    assert algorithm.replay._mask is None
+    assert "mask" not in algorithm.replay.arrays
     assert algorithm.replay.sample(4).next_mask is None
     assert "mask" not in algorithm.replay.state_dict()["arrays"]
     assert distribution(spec_of("discrete")).params_size == 5

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from millrace.learner.algorithms.dqn import DQN, LOSSES, exploration_rate
-from millrace.learner.algorithms.replay import replay_buffer as replay_module
+from millrace.learner.algorithms.replay import ring
 from millrace.learner.algorithms.replay.replay_buffer import Sample
 from millrace.learner.algorithms.running_statistics import RewardScaler
 from millrace.learner.config.hyperparameters import DQNConfig
@@ -352,7 +352,7 @@ def test_actions_that_are_not_one_choice_are_refused(action: ActionSpec, got: st
 
 
 def test_a_replay_too_big_for_this_machine_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(replay_module, "available_bytes", lambda: 10**6)
+    monkeypatch.setattr(ring, "available_bytes", lambda: 10**6)
     with pytest.raises(UsageError, match=r"replay_size 100000: .* take --replay-size \d+ or less"):
         dqn(DQNConfig())
 

@@ -16,7 +16,8 @@ from hypothesis import strategies as st
 
 from millrace.learner.algorithms.replay.hindsight import Hindsight, goal_reward, goals_not_used
 from millrace.learner.algorithms.replay.mixed_replay import PRIOR_SLOT, MixedReplay
-from millrace.learner.algorithms.replay.replay_buffer import Content, ReplayBuffer, Sample
+from millrace.learner.algorithms.replay.replay_buffer import ReplayBuffer, Sample
+from millrace.learner.algorithms.replay.ring import Ring
 from millrace.learner.config.hyperparameters import DQNConfig, PPOConfig, SACConfig
 from millrace.protocol.arrays import Array, Doubles
 from millrace.protocol.errors import UsageError
@@ -282,18 +283,20 @@ def test_prior_transitions_get_other_goals_of_their_own_episodes() -> None:
         made.add_prior([episodes[1], wrong], 50, 0.5)
 
 
-def test_the_memory_that_is_foretold_is_what_it_takes() -> None:
+def test_the_memory_that_is_foretold_is_what_it_takes(monkeypatch: pytest.MonkeyPatch) -> None:
+    foretold: list[int] = []
+    monkeypatch.setattr(Ring, "_check_memory", lambda _, needed: foretold.append(needed))
     lanes = Lanes(0, lanes=1, copies=1, T=49, ends=0.0)
     kept = buffer(50)
     kept.add(with_goals(lanes.rollout(0)))
     assert kept._paths is not None
-    arrays = kept._row.nbytes + sum(leaf.nbytes for leaf in kept._obs)
+    arrays = kept.arrays["row"].nbytes + sum(leaf.nbytes for leaf in kept._obs)
     paths = (
         kept._paths._number.nbytes
         + kept._paths._place.nbytes
         + sum(8 * len(one.slots) for one in kept._paths._paths.values())
     )
-    assert kept.bytes == Content(OBS, 50, linked=True).bytes == arrays + paths
+    assert [kept.bytes] == foretold == [arrays + paths]
 
 
 # -------------------------------------------------------------------- the check of what arrives

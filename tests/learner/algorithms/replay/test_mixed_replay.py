@@ -11,7 +11,6 @@ import torch
 
 from millrace.learner.algorithms.replay import mixed_replay
 from millrace.learner.algorithms.replay.mixed_replay import PRIOR_SLOT, MixedReplay
-from millrace.learner.algorithms.replay.replay_buffer import Content
 from millrace.protocol.errors import UsageError
 from tests.learner.algorithms.replay.test_replay import GAMMA, OBS, Lanes, replay
 
@@ -119,7 +118,8 @@ def test_a_restored_replay_draws_on_to_the_bit_and_needs_the_same_dataset() -> N
 def test_a_dataset_that_does_not_fit_memory_is_refused_as_such(monkeypatch: pytest.MonkeyPatch) -> None:
     """It takes its own size, once: no checkpoint copies it."""
     made, _ = mixed(prior=0)
-    monkeypatch.setattr(mixed_replay, "available_bytes", lambda: Content(OBS, 10_000).bytes)
+    free = replay(10_000).bytes
+    monkeypatch.setattr(mixed_replay, "available_bytes", lambda: free)
     made.add_prior([], 10_000, 0.5)
     with pytest.raises(UsageError, match=r"^prior: 10001 observations of the dataset take .* record a smaller dataset$"):
         made.add_prior([], 10_001, 0.5)

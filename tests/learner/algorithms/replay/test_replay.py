@@ -17,7 +17,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from millrace.learner.algorithms.replay import replay_buffer as module
-from millrace.learner.algorithms.replay.replay_buffer import Content, ReplayBuffer, Sample
+from millrace.learner.algorithms.replay import ring
+from millrace.learner.algorithms.replay.replay_buffer import ReplayBuffer, Sample
+from millrace.learner.algorithms.replay.ring import Ring
 from millrace.learner.algorithms.replay.sum_tree import SumTree
 from millrace.protocol.errors import UsageError
 from millrace.protocol.machine.available_memory import GIB
@@ -460,31 +462,35 @@ def test_observations_stay_as_they_are(dtype: str) -> None:
 
 
 @pytest.mark.parametrize("alpha", [None, 0.5])
-def test_the_memory_that_is_foretold_is_what_it_takes(alpha: float | None) -> None:
+def test_the_memory_that_is_foretold_is_what_it_takes(alpha: float | None, monkeypatch: pytest.MonkeyPatch) -> None:
+    foretold: list[int] = []
+    monkeypatch.setattr(Ring, "_check_memory", lambda _, needed: foretold.append(needed))
     observation = (Leaf("", "box", (84, 84, 4), "uint8", divisor=255), Leaf("n", "discrete", (), "int64", (3,), (0,)))
     kept = ReplayBuffer(observation, size=50, n_step=1, gamma=GAMMA, seed=0, alpha=alpha)
-    arrays = kept._row.nbytes + sum(leaf.nbytes for leaf in kept._obs)
+    arrays = kept.arrays["row"].nbytes + sum(leaf.nbytes for leaf in kept._obs)
     tree = 0 if kept._priorities is None else kept._priorities.tree._nodes.nbytes
-    assert kept.bytes == Content(observation, 50, alpha is not None).bytes == arrays + tree
+    assert [kept.bytes] == foretold == [arrays + tree]
 
 
 def test_a_replay_that_does_not_fit_is_refused_before_it_is_made(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "available_bytes", lambda: 2 * GIB)
+    def of_images(size: int) -> None:
+        ReplayBuffer((Leaf("", "box", (84, 84, 4), "uint8", divisor=255),), size=size, n_step=1, gamma=GAMMA, seed=0)
+
+    monkeypatch.setattr(ring, "available_bytes", lambda: 2 * GIB)
     made: list[object] = []
-    monkeypatch.setattr(np, "zeros", lambda *args: made.append(args))
-    image = (Leaf("", "box", (84, 84, 4), "uint8", divisor=255),)
-    with pytest.raises(UsageError) as refused:
-        ReplayBuffer(image, size=1_000_000, n_step=1, gamma=GAMMA, seed=0)
+    with monkeypatch.context() as patched, pytest.raises(UsageError) as refused:
+        patched.setattr(np, "zeros", lambda *args: made.append(args))
+        of_images(1_000_000)
     assert not made
     line = str(refused.value)
     assert "\n" not in line
     assert "replay_size 1000000: 1000000 transitions take 26.3 GiB" in line
     assert "2.0 GiB of memory are free; take --replay-size 38000 or less" in line
-    module.check_fits_memory(Content(image, 38_000))
+    of_images(38_000)  # its memory is never touched
     with pytest.raises(UsageError):
-        module.check_fits_memory(Content(image, 39_000))
-    monkeypatch.setattr(module, "available_bytes", lambda: None)
-    module.check_fits_memory(Content(image, 1_000_000))
+        of_images(39_000)
+    monkeypatch.setattr(ring, "available_bytes", lambda: None)
+    of_images(39_000)
 
 
 def test_a_rollout_that_does_not_fit_is_refused() -> None:

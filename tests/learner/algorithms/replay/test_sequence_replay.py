@@ -12,7 +12,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from millrace.learner.algorithms.replay import sequence_replay as module
+from millrace.learner.algorithms.replay import ring
 from millrace.learner.algorithms.replay.replay_buffer import DISCRETE
 from millrace.learner.algorithms.replay.sequence_replay import SequenceReplay, SequenceSample
 from millrace.protocol.errors import UsageError
@@ -281,9 +281,9 @@ def test_masks_are_those_of_the_observations_that_follow() -> None:
 
 def test_a_replay_that_does_not_fit_is_refused_before_it_is_made(monkeypatch: pytest.MonkeyPatch) -> None:
     needed = 2 * replay(4, 100).bytes
-    monkeypatch.setattr(module, "available_bytes", lambda: needed)
+    monkeypatch.setattr(ring, "available_bytes", lambda: needed)
     replay(4, 100)
-    with pytest.raises(UsageError, match=r"replay_size 404: its sequences take .* take --replay-size 400 or less"):
+    with pytest.raises(UsageError, match=r"replay_size 404: 404 transitions take .* take --replay-size 400 or less"):
         replay(4, 101)
 
 

@@ -162,4 +162,4 @@ def test_the_memory_that_is_said_is_what_it_takes() -> None:
     stored = buffer._obs[0]
     assert isinstance(stored, SharedChannels)
     plain = 40 * 3 * 1056
-    assert buffer.bytes == buffer._content.bytes - plain + stored.nbytes
+    assert buffer.bytes == replay().bytes - plain + stored.nbytes
