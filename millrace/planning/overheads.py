@@ -2,16 +2,23 @@
 
 For this, it collects from an environment that does nothing.
 
+Rule: the environment that does nothing takes no slot of this machine, so no limit on env copies applies to it, and it waits
+for no other program.
+
 Rule: nothing is assumed about the machine. Rounds of different sizes are timed, and the time per row, lane, copy and rollout
 is computed from the differences. CPU time is measured, so that other programs on this machine hardly affect the result.
 """
 
 from __future__ import annotations
 
+import os
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -28,6 +35,7 @@ from millrace.protocol.arrays import Floats
 from millrace.protocol.rollout import Batch
 from millrace.protocol.specs import ActionSpec, ExtraArray, Leaf, PolicySpec
 from millrace.rollout_service import RolloutBatch, RolloutService
+from millrace.workers.machine_slots import FILE_VARIABLE, LIMIT_VARIABLE
 
 EACH_S = 0.4  # how long rounds of each size are measured
 LEAST_ROUNDS = 3
@@ -88,6 +96,24 @@ class _Round(NamedTuple):
 
 def overheads(config: Config, env: StoodFor) -> Overheads:
     """Measure the overheads for runs with these settings. This takes a few seconds. Raises `UserFacingError` if it fails."""
+    with _slots_of_their_own():
+        return _overheads(config, env)
+
+
+@contextmanager
+def _slots_of_their_own() -> Iterator[None]:
+    """Workers that this process starts meanwhile use another file of slots than the machine's, without a limit."""
+    with TemporaryDirectory(prefix="millrace-plan-") as folder:
+        before = {name: os.environ.pop(name, None) for name in (FILE_VARIABLE, LIMIT_VARIABLE)}
+        os.environ[FILE_VARIABLE] = str(Path(folder, "slots"))
+        try:
+            yield
+        finally:
+            del os.environ[FILE_VARIABLE]
+            os.environ.update({name: value for name, value in before.items() if value is not None})
+
+
+def _overheads(config: Config, env: StoodFor) -> Overheads:
     one_long = _round(config, env, _Size(1, 1, LONG))
     one_short = _round(config, env, _Size(1, 1, SHORT))
     many_long = _round(config, env, _Size(COPIES, COPIES, LONG))

@@ -9,6 +9,7 @@ much longer than any call before, the call counts as one that hangs, so the othe
 from __future__ import annotations
 
 import math
+import os
 import time
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
@@ -38,6 +39,7 @@ from millrace.protocol.envs.spaces import action_spec, observation_leaves
 from millrace.protocol.envs.wrappers import WrapperLike
 from millrace.protocol.errors import MillraceError, RunError, UsageError, first_line
 from millrace.protocol.specs import ActionSpec
+from millrace.workers.machine_slots import LIMIT_VARIABLE, Slots, copies_per_machine, slots_path
 
 OF_PROBE = 0.7  # share of a plan's time in which the environment is measured; millrace's own part is measured in the rest
 LEAST_STEPS = 8  # number of steps that each copy takes, even if they last longer than planned
@@ -82,7 +84,7 @@ def probe(env: ProbedEnv, machine: Machine, seconds: float) -> Probed:
     alone = _tries(env, SessionSize(), OF_ALONE * seconds, end_s)
     first = alone.longest
     if not first.times or not len(first.times[0].steps):
-        raise RunError(f"plan: {env.name}: {_why_no_step(first.wrong, seconds / OF_PROBE)}")
+        raise RunError(f"plan: {env.name}: {_why_no_step(first, seconds / OF_PROBE)}")
     tried = [alone]
     measured = _measured_alone(env, first)
     each = 1
@@ -116,10 +118,12 @@ def probe(env: ProbedEnv, machine: Machine, seconds: float) -> Probed:
     return Probed(measured, first.observation_space, first.action_space, first.seats)
 
 
-def _why_no_step(wrong: str, plan_s: float) -> str:
+def _why_no_step(session: SteppedCopies, plan_s: float) -> str:
     """Why a plan that was to take `plan_s` could not make a step, and what to do unless something was wrong."""
-    if wrong:
-        return f"no step could be made: {wrong}"
+    if session.no_slot:
+        return f"no step could be made: {session.no_slot}; plan again when such a copy has ended"
+    if session.wrong:
+        return f"no step could be made: {session.wrong}"
     why = "the start of a copy, a reset or a step takes longer"
     return (
         f"no step could be made in the {plan_s * OF_PROBE:g} s that a plan with --seconds {plan_s:g} has for steps: {why}; "
@@ -212,11 +216,26 @@ def _session(env: ProbedEnv, size: SessionSize, seconds: float, deadline_s: floa
         except _CallHangs as error:
             wrong = str(error)
         except MillraceError as error:
-            if size.copies == 1 and not any(notes.iterdir()):
+            if size.copies == 1 and not any(notes.iterdir()) and not _no_slot(1):
                 raise
             wrong = one_line(first_line(error, type(error).__name__))
         times = [each for each in read_notes(notes) if len(each.resets)]
-        return SteppedCopies(size, times, traces, start_s, wrong, cut_off, masks, *known)
+        session = SteppedCopies(size, times, traces, start_s, wrong, cut_off, masks, *known)
+        no_slot = "" if session.has_stepped else _no_slot(size.copies)
+        # Without slots, copies can't be made, whatever error follows from this.
+        return session._replace(wrong="", cut_off=True, no_slot=no_slot) if no_slot else session
+
+
+def _no_slot(copies: int) -> str:
+    """Why this machine has no slots for so many copies, if other programs have taken too many; otherwise empty."""
+    most = copies_per_machine()
+    slots = Slots(most=most)
+    try:
+        if not most or slots.have_room(copies):
+            return ""
+    finally:
+        os.close(slots.fd)
+    return f"env copies of other programs hold the slots; {LIMIT_VARIABLE} allows {most} on this machine ({slots_path()})"
 
 
 def _step(

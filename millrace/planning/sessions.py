@@ -44,6 +44,8 @@ class SteppedCopies(NamedTuple):
     action_space: gymnasium.Space[Any]
     seats: tuple[str, ...]
     time_limit: int | None
+    no_slot: str = ""
+    """why this machine had no slots for all copies, because of other programs; empty if it had"""
 
     @property
     def has_stepped(self) -> bool:
@@ -141,6 +143,8 @@ class Tries(NamedTuple):
             return f"{copies}: {failed[-1].wrong} ({tries}); {OF_ITS_OWN}"
         if not self.were_cut_off:
             return ""
+        if last.no_slot:
+            return f"{copies} were not measured, because {last.no_slot}"
         if self.size.copies == 1:
             why = "the time was up before another one returned, so no more copies were tried"
             return f"one copy, after {last.calls} calls: {why}; unless it hangs, {MORE_TIME} {enough_s:.0f}"

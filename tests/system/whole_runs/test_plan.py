@@ -23,6 +23,7 @@ from millrace.planning.measurements import Machine, Measurements
 from millrace.planning.probe import LEAST_STEPS, ProbedEnv, probe
 from millrace.planning.probe_sizes import COPIES_OF_SHORT
 from millrace.protocol.errors import RunError, UsageError
+from millrace.workers.machine_slots import FILE_VARIABLE, LIMIT_VARIABLE, Slots
 
 TOY = "tests.support.envs.toy"
 BRIEF_S = 6.0
@@ -201,6 +202,49 @@ def test_a_number_of_copies_that_fails_once_is_tried_again(tmp_path: Path) -> No
 def test_no_more_copies_are_tried_than_are_allowed_even_if_steps_are_short(most_copies: int) -> None:
     measured = probe(ProbedEnv("CartPole-v1", {}, ()), Machine(cores=2, most_copies=most_copies), seconds=BRIEF_S).measured
     assert measured.copies_worked <= most_copies
+
+
+def limit_copies(monkeypatch: pytest.MonkeyPatch, folder: Path, most: int) -> Path:
+    """Limit the env copies on this machine to `most`. Returns the path of the slots file."""
+    monkeypatch.setenv(LIMIT_VARIABLE, str(most))
+    monkeypatch.setenv(FILE_VARIABLE, str(folder / "slots"))
+    return folder / "slots"
+
+
+def test_a_plan_keeps_within_the_limit_of_copies_on_this_machine_and_ends(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    limit_copies(monkeypatch, tmp_path, 3)
+    plan = millrace.plan("CartPole-v1", seconds=BRIEF_S)
+    assert plan.measured.copies_worked <= 2
+    assert failures(plan.measured) == []
+    assert plan.settings["envs"] + plan.settings["eval_copies"] <= 3
+
+
+@pytest.mark.parametrize("free", [0, 1])
+def test_a_plan_names_the_limit_of_copies_if_other_programs_have_taken_the_slots(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, free: int
+) -> None:
+    file = limit_copies(monkeypatch, tmp_path, 3)
+    others = Slots(most=3)
+    for _ in range(3 - free):
+        others.take()
+    why = rf"env copies of other programs hold the slots; {LIMIT_VARIABLE} allows 3 on this machine \({file}\)"
+    began_s = time.monotonic()
+    try:
+        if not free:
+            with pytest.raises(RunError, match=f"no step could be made: {why}; plan again"):
+                millrace.plan("CartPole-v1", seconds=BRIEF_S)
+        else:
+            measured = probe(ProbedEnv("CartPole-v1", {}, ()), Machine(cores=2, most_copies=2), seconds=BRIEF_S).measured
+            assert (measured.copies_worked, measured.copies_failed, measured.failed_in_one_worker) == (1, 0, 0)
+            assert [
+                re.fullmatch(f"2 copies (side by side|in one worker) were not measured, because {why}", line) is not None
+                for line in measured.findings
+            ] == [True, True]
+    finally:
+        os.close(others.fd)
+    assert time.monotonic() - began_s < BRIEF_S + ENDS_WITHIN_S
 
 
 def compute(seconds: float) -> None:
