@@ -66,6 +66,8 @@ class ZmqVectorEnv(VectorEnv[Any, Any, Array]):
         self.autoreset_mode = AutoresetMode(step.autoreset)  # SyncVectorEnv has this attribute, and TorchRL reads it
         self.render_mode = description.render_mode
         self.spec = description.spec
+        self.max_episode_steps = description.max_episode_steps
+        """time limit of an episode, in env steps; None if there is none"""
         self.single_observation_space = description.observation_space
         self.single_action_space = description.action_space
         self.observation_space = batch_space(self.single_observation_space, N)

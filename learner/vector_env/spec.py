@@ -39,6 +39,8 @@ class VectorEnvDescription:
     render_mode: str | None
     spec: Any
     """gymnasium's `EnvSpec` if all copies have the same registered id; otherwise None"""
+    max_episode_steps: int | None = None
+    """time limit of an episode of the first copy, in env steps; None if there is none"""
 
 
 class RequestedCopies(SessionTerms, frozen=True, kw_only=True):
@@ -77,7 +79,9 @@ class RequestedCopies(SessionTerms, frozen=True, kw_only=True):
         check_can_be_sent(self.envs[0].id, step)
         metadata = {**env.metadata, "autoreset_mode": AutoresetMode(step.autoreset)}
         spec = env.spec if len(self.envs) == 1 and self.envs[0].factory is None else None
-        return VectorEnvDescription(step, env.observation_space, env.action_space, metadata, env.render_mode, spec)
+        return VectorEnvDescription(
+            step, env.observation_space, env.action_space, metadata, env.render_mode, spec, env.max_episode_steps
+        )
 
 
 def _identity(spec: EnvSpec) -> tuple[str, PickledCallable | None, str]:

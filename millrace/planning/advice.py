@@ -15,6 +15,7 @@ from millrace.planning.recommendation import Rate
 BUSY = 0.5  # if the load average per core is above this, the machine counts as busy
 RESETS_COUNT = 1.1  # resets in the background are advised if they make a run faster by at least this factor
 SLOW_START_S = 10.0
+OF_EPISODE = 0.05  # if no episode has ended, resets may matter if one takes more than this share of the time of all steps
 
 
 def about_measurements(sizes: Sizes, situation: Situation, rate: Rate) -> list[str]:
@@ -51,6 +52,11 @@ def about_measurements(sizes: Sizes, situation: Situation, rate: Rate) -> list[s
         )
     if measured.wrong_masks:
         lines.append(f"its action masks aren't as a run needs them: {measured.wrong_masks}")
+    if measured.episode_steps is None and measured.reset_s > OF_EPISODE * measured.alone.steps * measured.alone.own_s:
+        lines.append(
+            f"resets take {time_in_words(measured.reset_s)}, and the expected speed doesn't count them, because no episode "
+            "has ended and there is no time limit; if your episodes are short, allow more time with --seconds"
+        )
     one_agent = measured.agents == 1
     faster = rate(sizes, msgspec.structs.replace(situation, resets_ahead=True))
     if one_agent and faster > RESETS_COUNT * rate(sizes, situation):

@@ -30,7 +30,7 @@ from millrace.learner.vector_env.settings import VectorEnvSettings
 from millrace.planning.measurements import ActionKind, Machine, Measurements, NoMore, StepCosts
 from millrace.planning.probe_sizes import SessionSize, enough_s, most_each, numbers_of_workers, two_fit
 from millrace.planning.random_actions import SEED, RandomActions, SeenMasks
-from millrace.planning.sessions import GRACE_S, MORE_TIME, TRIES, WARM_UP, Failures, SteppedCopies, Tries, hangs
+from millrace.planning.sessions import GRACE_S, MORE_TIME, WARM_UP, Failures, SteppedCopies, Tries, hangs
 from millrace.planning.stopwatch import CopyTimes, read_notes
 from millrace.protocol.arrays import Array
 from millrace.protocol.bounds import one_line
@@ -86,23 +86,23 @@ def probe(env: ProbedEnv, machine: Machine, seconds: float) -> Probed:
     if not first.times or not len(first.times[0].steps):
         raise RunError(f"plan: {env.name}: {_why_no_step(first, seconds / OF_PROBE)}")
     tried = [alone]
-    measured = _measured_alone(env, first)
+    measured = _measured_alone(env, alone)
     each = 1
     if alone.worked and measured.alone.own_s < SHORT_S and (most := most_each(measured, machine)) > 1:
         # Several workers need the other half of the time that is left.
-        several = _tries(env, SessionSize(each=most), OF_ALONE * seconds, (time.monotonic() + end_s) / 2, first)
+        several = _tries(env, SessionSize(each=most), OF_ALONE * seconds, (time.monotonic() + end_s) / 2, alone)
         tried.append(several)
         if several.worked:
             each = most
-            measured = msgspec.structs.replace(measured, side_by_side=(_costs(1, several.longest.times),))
+            measured = msgspec.structs.replace(measured, side_by_side=(_costs(1, several.times),))
     no_more: NoMore = "time" if first.is_too_slow else ""
     for workers in () if no_more else numbers_of_workers(measured, machine, each):
-        tries = _tries(env, SessionSize(workers, each), EACH_S, end_s, first)
+        tries = _tries(env, SessionSize(workers, each), EACH_S, end_s, alone)
         tried.append(tries)
         if not tries.worked:
             no_more = "failed" if tries.show_a_limit else "time"
             break
-        costs = _costs(workers, tries.longest.times)
+        costs = _costs(workers, tries.times)
         if costs.steps_per_s < WORTH_WHILE * measured.side_by_side[-1].steps_per_s:
             no_more = "no faster"
             break
@@ -110,7 +110,7 @@ def probe(env: ProbedEnv, machine: Machine, seconds: float) -> Probed:
     if alone.worked and not any(tries.decide_about_two for tries in tried):
         # An evaluation makes a second copy in a worker. It also shows whether the environment is deterministic.
         two = SessionSize(each=2 if two_fit(measured, machine) else 1)
-        tried.append(_tries(env, two, EACH_S, end_s, first))
+        tried.append(_tries(env, two, EACH_S, end_s, alone))
     measured = _with_all(msgspec.structs.replace(measured, no_more=no_more), tried)
     again_s = max(2 * seconds, enough_s(measured, machine, each, LEAST_STEPS + 1)) / OF_PROBE
     findings = [Failures.of(tried).finding, *(tries.finding(math.ceil(again_s / 60) * 60) for tries in tried)]
@@ -143,21 +143,21 @@ class _CallHangs(Exception):
 
 
 class _NewestCall:
-    """When the newest call of a session began, or when no more were to begin, if that is later."""
+    """When the newest call of a session began, or when no more were to begin, if that is later; and how long copies had been
+    stepped when the newest call returned.
+    """
 
     at_s = math.inf
+    stepped_s = 0.0
 
 
-def _tries(
-    env: ProbedEnv, size: SessionSize, seconds: float, deadline_s: float, alone: SteppedCopies | None = None
-) -> Tries:
-    """Step copies as `_session` does, and try again as long as their number seems to be the reason why they fail."""
-    sessions: list[SteppedCopies] = []
-    while True:
-        sessions.append(_session(env, size, seconds, deadline_s))
-        tries = Tries(tuple(sessions), alone)
-        if not sessions[-1].wrong or not tries.show_a_limit or len(sessions) == TRIES:
-            return tries
+def _tries(env: ProbedEnv, size: SessionSize, seconds: float, deadline_s: float, alone: Tries | None = None) -> Tries:
+    """Step copies for this many seconds in total, as `_session` does, and try again if they fail early."""
+    tries = Tries((_session(env, size, seconds, deadline_s),), alone)
+    while tries.need_another(seconds, deadline_s - time.monotonic()):
+        again = _session(env, size, seconds - tries.stepped_s, deadline_s)
+        tries = tries._replace(sessions=(*tries.sessions, again))
+    return tries
 
 
 def _session(env: ProbedEnv, size: SessionSize, seconds: float, deadline_s: float) -> SteppedCopies:
@@ -201,8 +201,7 @@ def _session(env: ProbedEnv, size: SessionSize, seconds: float, deadline_s: floa
             )
             with start_vector_env(settings, Crew(logs=Path(folder, "logs")), check_time) as envs:
                 start_s = time.monotonic() - began_s
-                limit = None if envs.spec is None else envs.spec.max_episode_steps
-                known = (envs.single_observation_space, envs.single_action_space, envs.seats, limit)
+                known = (envs.single_observation_space, envs.single_action_space, envs.seats, envs.max_episode_steps)
                 random_actions = RandomActions(*known[:2], max(1, len(envs.seats)))
                 called.at_s = end_at_s = time.monotonic() + seconds
                 try:
@@ -220,7 +219,7 @@ def _session(env: ProbedEnv, size: SessionSize, seconds: float, deadline_s: floa
                 raise
             wrong = one_line(first_line(error, type(error).__name__))
         times = [each for each in read_notes(notes) if len(each.resets)]
-        session = SteppedCopies(size, times, traces, start_s, wrong, cut_off, masks, *known)
+        session = SteppedCopies(size, times, traces, start_s, wrong, cut_off, masks, *known, stepped_s=called.stepped_s)
         no_slot = "" if session.has_stepped else _no_slot(size.copies)
         # Without slots, copies can't be made, whatever error follows from this.
         return session._replace(wrong="", cut_off=True, no_slot=no_slot) if no_slot else session
@@ -252,9 +251,11 @@ def _step(
     """
     agents = max(1, len(envs.seats))
     space = envs.single_action_space
+    began_s = time.monotonic()
     envs.reset_async(seed=[SEED] * len(traces))
     while envs.outstanding:
         observation, reward, terminated, truncated, infos = envs.recv()
+        called.stepped_s = time.monotonic() - began_s
         ready = infos["env_id"].tolist()
         for i, copy in enumerate(ready):
             rows = slice(i * agents, (i + 1) * agents)
@@ -308,8 +309,9 @@ def _deterministic(traces: Sequence[Sequence[int]]) -> bool | None:
 # ------------------------------------------------------------------------------------------------------------ the numbers
 
 
-def _measured_alone(env: ProbedEnv, session: SteppedCopies) -> Measurements:
-    """The measurements from a session with one copy."""
+def _measured_alone(env: ProbedEnv, alone: Tries) -> Measurements:
+    """The measurements from the sessions with one copy."""
+    session = alone.longest
     leaves = observation_leaves(session.observation_space)
     keys = session.observation_space.spaces if isinstance(session.observation_space, spaces.Dict) else {}
     return Measurements(
@@ -319,9 +321,9 @@ def _measured_alone(env: ProbedEnv, session: SteppedCopies) -> Measurements:
         images=any(leaf.is_image for leaf in leaves),
         goals={"achieved_goal", "desired_goal"} <= {*keys},
         observation_bytes=sum(math.prod(leaf.shape) * np.dtype(leaf.dtype).itemsize for leaf in leaves),
-        side_by_side=(_costs(1, session.times),),
+        side_by_side=(_costs(1, alone.times),),
         start_s=session.start_s,
-        worker_bytes=session.times[0].bytes,
+        worker_bytes=max(each.bytes for each in alone.times),
     )
 
 
@@ -356,7 +358,7 @@ def _with_all(measured: Measurements, tried: Sequence[Tries]) -> Measurements:
         copies_failed=min((size.copies for size in too_many), default=0),
         worked_in_one_worker=worked_in_one,
         failed_in_one_worker=min((size.each for size in failed if size.workers == 1), default=0),
-        episode_steps=steps / sum(map(len, later)) if later else sessions[0].time_limit,
+        episode_steps=steps / sum(map(len, later)) if later else tried[0].longest.time_limit,
         deterministic=_deterministic([trace for session in sessions for trace in session.traces]),
         failures=len(failures.sessions),
         calls=failures.calls,

@@ -2,7 +2,8 @@
 
 Rule: copies failed because of their number only if all tries with this number failed, and either not all copies could take
 a few steps, or one copy alone took at least `RARER` times as many steps for each failure. Any other failure, such as a crash
-or a hang now and then, can happen to each copy and limits nothing, so it is only counted.
+or a hang now and then, can happen to each copy and limits nothing, so it is only counted. If it happens early and there is
+enough time, the same number of copies is stepped again, and what was measured before and after it is added up.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from millrace.planning.stopwatch import CopyTimes
 
 WARM_UP = 2  # this many steps at the beginning of a copy aren't counted
 TRIES = 3  # how often a number of copies is tried, if they fail
+EARLY = 0.5  # a failure is early if it leaves more than this share of the time in which copies were to be stepped
 RARER = 3
 SLOWER = 3.0  # a call that hangs has taken at least this many times as long as the slowest call that returned
 GRACE_S = 1.0  # how long after its deadline a session waits for the last steps
@@ -44,6 +46,8 @@ class SteppedCopies(NamedTuple):
     action_space: gymnasium.Space[Any]
     seats: tuple[str, ...]
     time_limit: int | None
+    stepped_s: float = 0.0
+    """how long the copies had been stepped when the last call returned"""
     no_slot: str = ""
     """why this machine had no slots for all copies, because of other programs; empty if it had"""
 
@@ -84,8 +88,8 @@ class Tries(NamedTuple):
     """The sessions with the same number of copies: one, or several if they failed."""
 
     sessions: tuple[SteppedCopies, ...]
-    alone: SteppedCopies | None
-    """the session with one copy; None if these sessions have only one copy themselves"""
+    alone: Tries | None
+    """the sessions with one copy; None if these sessions have only one copy themselves"""
 
     @property
     def size(self) -> SessionSize:
@@ -94,8 +98,24 @@ class Tries(NamedTuple):
 
     @property
     def longest(self) -> SteppedCopies:
-        """The session to measure: the one with the most steps."""
+        """The session with the most steps."""
         return max(self.sessions, key=lambda session: session.steps_together)
+
+    @property
+    def times(self) -> list[CopyTimes]:
+        """The times to measure: those of all sessions in which all copies took a few steps, or of the longest session."""
+        measured = [session for session in self.sessions if session.has_stepped] or [self.longest]
+        return [each for session in measured for each in session.times]
+
+    @property
+    def stepped_s(self) -> float:
+        """How long the copies were stepped in all sessions."""
+        return sum(session.stepped_s for session in self.sessions)
+
+    @property
+    def steps_for_each_failure(self) -> float:
+        """The steps of all sessions, divided by the number of failures plus one, because the next failure may be near."""
+        return sum(session.steps_together for session in self.sessions) / (1 + len(self.failed))
 
     @property
     def failed(self) -> list[SteppedCopies]:
@@ -113,7 +133,19 @@ class Tries(NamedTuple):
         if self.alone is None:
             return False
         together = sum(session.steps_together for session in failed) / len(failed)
-        return self.alone.steps_together / (1 + bool(self.alone.wrong)) >= RARER * together
+        return self.alone.steps_for_each_failure >= RARER * together
+
+    def need_another(self, seconds: float, left_s: float) -> bool:
+        """Whether the copies failed so early that they should be stepped again.
+
+        `seconds`: how long they were to be stepped in total. `left_s`: the time until the deadline. Unless their number
+        seems to be the reason why they failed, at least half of this time stays for other numbers of copies.
+        """
+        last = self.sessions[-1]
+        if not last.wrong or len(self.sessions) == TRIES:
+            return False
+        rest_s = seconds - self.stepped_s
+        return self.show_a_limit or (rest_s > EARLY * seconds and 2 * (last.start_s + rest_s) < left_s)
 
     @property
     def worked(self) -> bool:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pytest
+
 from millrace.planning.advice import about_measurements
 from tests.millrace.planning.made_up import chosen, measured, rate, situation
 
@@ -16,3 +18,12 @@ def test_a_wrapper_of_gymnasium_and_hindsight_are_advised_only_for_one_agent() -
     assert "--wrappers millrace:ResetAhead" in resets
     assert "--hindsight" in goals
     assert lines(agents=2) == []
+
+
+@pytest.mark.parametrize(("episode_steps", "reset_s", "says"), [(None, 2.0, True), (None, 1e-3, False), (40.0, 2.0, False)])
+def test_if_no_episode_has_ended_a_line_says_that_slow_resets_are_not_counted(
+    episode_steps: float | None, reset_s: float, says: bool
+) -> None:
+    where = situation(measured(wait_s=0.01, reset_s=reset_s, episode_steps=episode_steps, copies_worked=16))
+    found = about_measurements(chosen(where), where, rate)
+    assert any("doesn't count them, because no episode has ended" in line for line in found) == says

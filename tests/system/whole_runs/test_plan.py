@@ -162,6 +162,41 @@ def test_crashes_and_hangs_now_and_then_limit_nothing_and_are_counted(tmp_path: 
     assert re.match(rf"{measured.failures} failures? in {measured.calls:,} steps", measured.findings[0])
 
 
+class DivergesOnce(gymnasium.Env[Any, Any]):
+    """Waits for 20 ms in each step. Its first copy fails in its tenth step."""
+
+    observation_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
+    action_space = gymnasium.spaces.Discrete(2)
+
+    def __init__(self, failed: str) -> None:
+        self._failed = Path(failed)
+        self._steps = 0
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action: Any) -> Any:
+        time.sleep(0.02)
+        self._steps += 1
+        if self._steps == 10 and not self._failed.exists():
+            self._failed.touch()
+            raise RuntimeError("the solver diverged")
+        return np.zeros(1, np.float32), 0.0, False, False, {}
+
+
+def test_a_copy_that_fails_early_is_stepped_again_and_a_time_limit_stands_in_for_the_length_of_episodes(
+    tmp_path: Path,
+) -> None:
+    limit = 10_000  # no episode ends
+    spec = gymnasium.envs.registration.EnvSpec("Diverges-v0", DivergesOnce, max_episode_steps=limit)
+    env = ProbedEnv(spec, {"failed": str(tmp_path / "failed")}, ())
+    measured = probe(env, Machine(cores=2), seconds=3 * BRIEF_S).measured
+    assert (measured.failures, measured.copies_failed) == (1, 0)
+    assert measured.alone.steps > 20
+    assert measured.episode_steps == limit
+
+
 class FailsOnce(gymnasium.Env[Any, Any]):
     """Waits for 5 ms in each step. The first time that a second copy is made, it fails."""
 
