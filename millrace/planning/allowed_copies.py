@@ -8,12 +8,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from millrace.learner.config.config import Config
-from millrace.planning.in_words import counted
+from millrace.planning.in_words import counted, enumerated
 from millrace.planning.measurements import Measurements
 from millrace.planning.recommendation import ChosenSetting
 
 EVALUATION_COPIES = Config().eval_copies
-MORE_FAILED = "more copies did not work at the same time, and evaluations need copies too"
 
 
 class AllowedCopies(NamedTuple):
@@ -44,7 +43,7 @@ class AllowedCopies(NamedTuple):
         allowed = self._replace(apart=measured.best_apart, failed_in_one_worker=bool(measured.failed_in_one_worker))
         if not measured.copies_failed or 0 < self.here <= measured.copies_worked:
             return allowed
-        return allowed._replace(here=measured.copies_worked, of_run=measured.copies_worked, why=MORE_FAILED)
+        return allowed._replace(here=measured.copies_worked, of_run=measured.copies_worked, why=_why(measured))
 
     @property
     def training(self) -> int:
@@ -79,3 +78,13 @@ class AllowedCopies(NamedTuple):
         if self._is_scarce or self.failed_in_one_worker:
             return "as few as possible"
         return "each worker plays one episode at a time, so more workers take part in an evaluation"
+
+
+def _why(measured: Measurements) -> str:
+    """Why a run has only as many copies as have worked at the same time."""
+    worked = [number for number in measured.copies_tried if 1 < number <= measured.copies_worked]
+    failed = [number for number in measured.copies_tried if number > measured.copies_worked]
+    return (
+        f"{enumerated(worked)} copies worked at the same time, {enumerated(failed)} did not, and evaluations need copies "
+        "too; if you know how many may run, plan with --max-env-copies"
+    )

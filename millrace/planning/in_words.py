@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 UNITS = ((1e-3, "µs", 1e-6), (1.0, "ms", 1e-3), (60.0, "s", 1.0), (3600.0, "min", 60.0), (48 * 3600.0, "h", 3600.0))
 """For each unit: the number of seconds below which it is used, its symbol, and its length in seconds."""
 DAY_S = 86400.0
@@ -24,3 +26,8 @@ def number_in_words(number: float) -> str:
 def counted(number: int, singular: str, plural: str = "") -> str:
     """A number and its noun, such as 1 core or 2 cores."""
     return f"{number:,} {singular if number == 1 else plural or singular + 's'}"
+
+
+def enumerated(numbers: Sequence[int]) -> str:
+    """The numbers in one phrase, such as 2, 3 and 4."""
+    return " and ".join(filter(None, [", ".join(map(str, numbers[:-1])), *map(str, numbers[-1:])]))

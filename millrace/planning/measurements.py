@@ -88,6 +88,8 @@ class Measurements(msgspec.Struct, frozen=True, kw_only=True):
     """the smallest number of copies, more than `copies_worked`, that may have had a problem because of their number; 0 if
     there is none
     """
+    copies_tried: tuple[int, ...] = ()
+    """all numbers of copies that worked at the same time, or failed because of their number, in ascending order"""
     worked_in_one_worker: int = 1
     """the largest number of copies that were stepped in the same worker without such a problem"""
     failed_in_one_worker: int = 0

@@ -4,6 +4,7 @@ Rule: the environment's code runs in workers, never in this process. Each sessio
 its number of copies counts as not measured. An error before the first step is raised; a later one becomes a finding of one
 line. If all copies of a session have taken enough steps, and then a call takes as long as half of the time that is left and
 much longer than any call before, the call counts as one that hangs, so the other half is left for other numbers of copies.
+If a number of copies fails, numbers between the largest one that worked and the smallest one that failed are tried.
 """
 
 from __future__ import annotations
@@ -27,8 +28,9 @@ from millrace.launch.crew import Crew
 from millrace.launch.vector import call_timeouts_of, start_vector_env
 from millrace.learner.vector_env.env import ZmqVectorEnv
 from millrace.learner.vector_env.settings import VectorEnvSettings
+from millrace.planning.last_output import with_last_output
 from millrace.planning.measurements import ActionKind, Machine, Measurements, NoMore, StepCosts
-from millrace.planning.probe_sizes import SessionSize, enough_s, most_each, numbers_of_workers, two_fit
+from millrace.planning.probe_sizes import SessionSize, between, enough_s, most_each, numbers_of_workers, two_fit
 from millrace.planning.random_actions import SEED, RandomActions, SeenMasks
 from millrace.planning.sessions import GRACE_S, MORE_TIME, WARM_UP, Failures, SteppedCopies, Tries, hangs
 from millrace.planning.stopwatch import CopyTimes, read_notes
@@ -102,20 +104,40 @@ def probe(env: ProbedEnv, machine: Machine, seconds: float) -> Probed:
         if not tries.worked:
             no_more = "failed" if tries.show_a_limit else "time"
             break
-        costs = _costs(workers, tries.times)
-        if costs.steps_per_s < WORTH_WHILE * measured.side_by_side[-1].steps_per_s:
+        if (faster := _with_more(measured, workers, tries)) is measured:
             no_more = "no faster"
             break
-        measured = msgspec.structs.replace(measured, side_by_side=(*measured.side_by_side, costs))
+        measured = faster
     if alone.worked and not any(tries.decide_about_two for tries in tried):
         # An evaluation makes a second copy in a worker. It also shows whether the environment is deterministic.
         two = SessionSize(each=2 if two_fit(measured, machine) else 1)
         tried.append(_tries(env, two, EACH_S, end_s, alone))
     measured = _with_all(msgspec.structs.replace(measured, no_more=no_more), tried)
+    measured = _with_numbers_between(env, measured, tried, end_s, each)
     again_s = max(2 * seconds, enough_s(measured, machine, each, LEAST_STEPS + 1)) / OF_PROBE
-    findings = [Failures.of(tried).finding, *(tries.finding(math.ceil(again_s / 60) * 60) for tries in tried)]
+    failed = measured.copies_failed
+    told = [tries for tries in tried if not (tries.show_a_limit and tries.size.workers > 1 and tries.size.copies > failed)]
+    findings = [Failures.of(tried).finding, *(tries.finding(math.ceil(again_s / 60) * 60) for tries in told)]
     measured = msgspec.structs.replace(measured, findings=tuple(filter(None, findings)))
     return Probed(measured, first.observation_space, first.action_space, first.seats)
+
+
+def _with_numbers_between(
+    env: ProbedEnv, measured: Measurements, tried: list[Tries], end_s: float, each: int
+) -> Measurements:
+    """Step numbers of copies between those that worked and those that failed, as long as there is time.
+
+    Appends the sessions to `tried`. `each`: the number of copies of each worker in the costs that were measured before.
+    """
+    while copies := between(measured.copies_worked, measured.copies_failed):
+        tries = _tries(env, SessionSize(copies), EACH_S, end_s, tried[0])
+        tried.append(tries)
+        if not (tries.worked or tries.show_a_limit):
+            break
+        if tries.worked and each == 1 and not measured.alone.computes:
+            measured = _with_more(measured, copies, tries)
+        measured = _with_all(measured, tried)
+    return measured
 
 
 def _why_no_step(session: SteppedCopies, plan_s: float) -> str:
@@ -177,7 +199,7 @@ def _session(env: ProbedEnv, size: SessionSize, seconds: float, deadline_s: floa
             raise _CallHangs(f"a call took longer than {now_s - called.at_s:.0f} s; unless it hangs, {MORE_TIME}")
 
     with TemporaryDirectory(prefix="millrace-plan-") as folder:
-        notes = Path(folder, "notes")
+        notes, logs = Path(folder, "notes"), Path(folder, "logs")
         notes.mkdir()
         began_s = time.monotonic()
         traces: list[list[int]] = [[] for _ in range(size.copies)]
@@ -199,7 +221,7 @@ def _session(env: ProbedEnv, size: SessionSize, seconds: float, deadline_s: floa
                 timeout_s=math.inf,  # only `check_time` limits a call, because a slow worker isn't lost
                 call_timeouts=call_timeouts_of(math.inf),
             )
-            with start_vector_env(settings, Crew(logs=Path(folder, "logs")), check_time) as envs:
+            with start_vector_env(settings, Crew(logs=logs), check_time) as envs:
                 start_s = time.monotonic() - began_s
                 known = (envs.single_observation_space, envs.single_action_space, envs.seats, envs.max_episode_steps)
                 random_actions = RandomActions(*known[:2], max(1, len(envs.seats)))
@@ -217,7 +239,7 @@ def _session(env: ProbedEnv, size: SessionSize, seconds: float, deadline_s: floa
         except MillraceError as error:
             if size.copies == 1 and not any(notes.iterdir()) and not _no_slot(1):
                 raise
-            wrong = one_line(first_line(error, type(error).__name__))
+            wrong = with_last_output(one_line(first_line(error, type(error).__name__)), logs)
         times = [each for each in read_notes(notes) if len(each.resets)]
         session = SteppedCopies(size, times, traces, start_s, wrong, cut_off, masks, *known, stepped_s=called.stepped_s)
         no_slot = "" if session.has_stepped else _no_slot(size.copies)
@@ -327,6 +349,14 @@ def _measured_alone(env: ProbedEnv, alone: Tries) -> Measurements:
     )
 
 
+def _with_more(measured: Measurements, workers: int, tries: Tries) -> Measurements:
+    """Add the costs of a step with more workers, unless they hardly increase the env steps/s."""
+    costs = _costs(workers, tries.times)
+    if costs.steps_per_s < WORTH_WHILE * measured.side_by_side[-1].steps_per_s:
+        return measured
+    return msgspec.structs.replace(measured, side_by_side=(*measured.side_by_side, costs))
+
+
 def _with_all(measured: Measurements, tried: Sequence[Tries]) -> Measurements:
     """Add the measurements that need all sessions, except the findings.
 
@@ -356,6 +386,7 @@ def _with_all(measured: Measurements, tried: Sequence[Tries]) -> Measurements:
         resets=len(resets),
         copies_worked=worked,
         copies_failed=min((size.copies for size in too_many), default=0),
+        copies_tried=tuple(sorted({size.copies for size in (*too_many, *(tries.size for tries in tried if tries.worked))})),
         worked_in_one_worker=worked_in_one,
         failed_in_one_worker=min((size.each for size in failed if size.workers == 1), default=0),
         episode_steps=steps / sum(map(len, later)) if later else tried[0].longest.time_limit,

@@ -41,6 +41,14 @@ def most_each(measured: Measurements, machine: Machine) -> int:
     return max(1, most)
 
 
+def between(worked: int, failed: int) -> int:
+    """The number of copies to try next if `worked` copies worked and `failed` failed; 0 if no number is between them.
+
+    Its ratios to both are about equal, because the numbers tried before were far apart.
+    """
+    return max(worked + 1, math.isqrt(worked * failed)) if failed > worked + 1 else 0
+
+
 def two_fit(measured: Measurements, machine: Machine) -> bool:
     """Whether two copies in one worker fit into the memory. Two are always allowed: one trains, the other evaluates."""
     return machine.free_bytes is None or WORKER_BYTES + 2 * measured.copy_bytes <= OF_MEMORY * machine.free_bytes

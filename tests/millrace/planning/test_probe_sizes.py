@@ -5,7 +5,15 @@ from __future__ import annotations
 import pytest
 
 from millrace.planning.measurements import Machine
-from millrace.planning.probe_sizes import COPIES_OF_SHORT, OF_MEMORY, enough_s, most_each, numbers_of_workers, two_fit
+from millrace.planning.probe_sizes import (
+    COPIES_OF_SHORT,
+    OF_MEMORY,
+    between,
+    enough_s,
+    most_each,
+    numbers_of_workers,
+    two_fit,
+)
 from tests.millrace.planning.made_up import measured
 
 GB = 1 << 30
@@ -35,6 +43,20 @@ def test_small_copies_are_stepped_several_in_a_worker_on_each_core() -> None:
     assert two_fit(found, machine)
     assert [*numbers_of_workers(found, machine, COPIES_OF_SHORT)] == [8]
     assert most_each(found, Machine(cores=8, most_copies=24)) == 3
+
+
+@pytest.mark.parametrize("works", [1, 2, 3, 7, 8, 20, 31])
+def test_the_numbers_between_what_worked_and_what_failed_lead_to_the_largest_that_works(works: int) -> None:
+    worked, failed, tried = 1, 32, 0
+    while number := between(worked, failed):
+        tried += 1
+        worked, failed = (number, failed) if number <= works else (worked, number)
+    assert (worked, failed) == (works, works + 1)
+    assert tried <= 8
+
+
+def test_after_2_and_8_come_4_and_3() -> None:
+    assert (between(2, 8), between(2, 4), between(2, 3)) == (4, 3, 0)
 
 
 def test_enough_time_is_that_of_all_sessions_one_after_another() -> None:

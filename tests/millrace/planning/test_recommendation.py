@@ -97,7 +97,10 @@ def test_licences_bound_copies(wait_s: float, cpu_s: float, licences: int) -> No
 def test_after_a_failure_a_run_needs_no_more_copies_than_have_worked_even_when_it_evaluates(
     worked: int, wait_s: float, cpu_s: float, learning: Learning
 ) -> None:
-    found = measured(wait_s=wait_s, cpu_s=cpu_s, tried=worked, copies_worked=worked, copies_failed=worked + 1)
+    tried = (1, worked, worked + 1, worked + 2)
+    found = measured(
+        wait_s=wait_s, cpu_s=cpu_s, tried=worked, copies_worked=worked, copies_failed=worked + 1, copies_tried=tried
+    )
     allowed = AllowedCopies.of(0, 0).after(found)
     where = situation(found, machine=Machine(cores=32, free_bytes=64 << 30, most_copies=allowed.training))
     sizes = chosen(where, learning)
@@ -109,7 +112,8 @@ def test_after_a_failure_a_run_needs_no_more_copies_than_have_worked_even_when_i
     assert config.workers is not None
     assert config.workers <= config.lanes <= config.envs
     why = {each.name: each.why for each in settings}
-    assert why["max_env_copies"].startswith("more copies did not work at the same time")
+    said = f"{worked} copies worked at the same time, {worked + 1} and {worked + 2} did not, and evaluations need copies too"
+    assert why["max_env_copies"] == f"{said}; if you know how many may run, plan with --max-env-copies"
     assert "may train here" in why["envs"] or config.envs < allowed.training
 
 

@@ -6,6 +6,7 @@ import fcntl
 import os
 import re
 import shlex
+import sys
 import time
 from contextlib import suppress
 from pathlib import Path
@@ -290,14 +291,14 @@ def compute(seconds: float) -> None:
 
 
 class Licensed(gymnasium.Env[Any, Any]):
-    """Computes for `step_s` in each step. Only `licences` copies may exist on this machine: another one fails or, if
-    `waits`, hangs.
+    """Computes for `step_s` in each step. Only `licences` copies may exist on this machine: another one writes what it
+    `says` and fails or, if `waits`, hangs.
     """
 
     observation_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
     action_space = gymnasium.spaces.Discrete(2)
 
-    def __init__(self, licence: str, waits: bool = False, licences: int = 1, step_s: float = 0.003) -> None:
+    def __init__(self, licence: str, waits: bool = False, licences: int = 1, step_s: float = 0.003, says: str = "") -> None:
         self._step_s = step_s
         for n in range(licences):
             self._licence = os.open(f"{licence}{n}", os.O_CREAT | os.O_RDWR)
@@ -305,6 +306,7 @@ class Licensed(gymnasium.Env[Any, Any]):
                 fcntl.flock(self._licence, fcntl.LOCK_EX if waits else fcntl.LOCK_EX | fcntl.LOCK_NB)
                 return
             os.close(self._licence)
+        sys.stderr.write(f"{says}\n")
         raise RuntimeError("no licence is free")
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
@@ -342,10 +344,19 @@ def test_a_limit_on_the_number_of_copies_is_not_taken_for_one_copy_in_each_proce
     env_kwargs: dict[str, Any] = {"licence": str(tmp_path / "licence"), "licences": 3, "step_s": 0.0}
     plan = millrace.plan(Licensed, env_kwargs=env_kwargs, seconds=4 * BRIEF_S)
     measured = plan.measured
-    assert (measured.copies_worked, measured.worked_in_one_worker) == (2, 2)
-    assert 3 < measured.copies_failed == measured.failed_in_one_worker <= COPIES_OF_SHORT
+    assert 2 <= measured.copies_worked <= 3
+    assert measured.worked_in_one_worker == 2
+    assert 3 < measured.copies_failed <= measured.failed_in_one_worker <= COPIES_OF_SHORT
     assert plan.settings["envs"] + plan.settings["eval_copies"] <= plan.settings["max_env_copies"] <= 3
     assert not any("OwnProcess" in line for line in plan.advice)
+
+
+def test_after_a_number_of_copies_failed_numbers_between_it_and_one_that_worked_are_tried(tmp_path: Path) -> None:
+    env_kwargs: dict[str, Any] = {"licence": str(tmp_path / "licence"), "licences": 3, "says": "all seats in use"}
+    measured = probe(ProbedEnv(Licensed, env_kwargs, ()), Machine(cores=4), seconds=6 * BRIEF_S).measured
+    assert (measured.copies_worked, measured.copies_failed, measured.copies_tried) == (3, 4, (1, 2, 3, 4))
+    (line,) = measured.findings
+    assert re.match(r"4 copies side by side: .*no licence is free; w\d wrote: all seats in use \(in all 3 tries\)", line)
 
 
 def test_a_plan_with_more_copies_than_were_measured_says_so_and_that_those_that_took_too_long_may_hang(
