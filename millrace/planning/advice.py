@@ -59,11 +59,12 @@ def about_measurements(sizes: Sizes, situation: Situation, rate: Rate) -> list[s
         )
     one_agent = measured.agents == 1
     faster = rate(sizes, msgspec.structs.replace(situation, resets_ahead=True))
-    if one_agent and faster > RESETS_COUNT * rate(sizes, situation):
+    twice_allowed = not machine.most_copies or 2 * sizes.envs <= machine.most_copies  # the limit counts a copy once
+    if one_agent and twice_allowed and faster > RESETS_COUNT * rate(sizes, situation):
         lines.append(
             f"resets take {time_in_words(measured.reset_s)}: with --wrappers millrace:ResetAhead, which makes them in the "
             f"background, {number_in_words(faster)} env steps/s are expected; the environment must work in a second thread, "
-            "and two of them for each copy fit into the memory"
+            "and each copy then needs the memory and the licences of two"
         )
     if one_agent and measured.goals:
         lines.append(
