@@ -241,7 +241,7 @@ def _session(env: ProbedEnv, size: SessionSize, seconds: float, deadline_s: floa
                 raise
             wrong = with_last_output(one_line(first_line(error, type(error).__name__)), logs)
         times = [each for each in read_notes(notes) if len(each.resets)]
-        session = SteppedCopies(size, times, traces, start_s, wrong, cut_off, masks, *known, stepped_s=called.stepped_s)
+        session = SteppedCopies(size, times, traces, start_s, wrong, cut_off, called.stepped_s, masks, *known)
         no_slot = "" if session.has_stepped else _no_slot(size.copies)
         # Without slots, copies can't be made, whatever error follows from this.
         return session._replace(wrong="", cut_off=True, no_slot=no_slot) if no_slot else session

@@ -41,13 +41,13 @@ class SteppedCopies(NamedTuple):
     """what went wrong, as one line; empty if nothing did"""
     cut_off: bool
     """whether the deadline has passed before all copies had answered"""
+    stepped_s: float
+    """how long the copies had been stepped when the last call returned"""
     masks: SeenMasks
     observation_space: gymnasium.Space[Any]
     action_space: gymnasium.Space[Any]
     seats: tuple[str, ...]
     time_limit: int | None
-    stepped_s: float = 0.0
-    """how long the copies had been stepped when the last call returned"""
     no_slot: str = ""
     """why this machine had no slots for all copies, because of other programs; empty if it had"""
 

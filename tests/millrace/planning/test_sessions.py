@@ -25,7 +25,7 @@ def session(
     times = [CopyTimes(np.zeros((steps, 4)), np.zeros((1, 4)), np.zeros((0, 3))) for _ in range(size.copies)]
     traces = [[0] * (steps + 1) for _ in range(size.copies)]
     known: Any = (None, None, (), None)
-    return SteppedCopies(size, times, traces, 0.5, wrong, cut_off, SeenMasks(False, ""), *known, stepped_s=stepped_s)
+    return SteppedCopies(size, times, traces, 0.5, wrong, cut_off, stepped_s, SeenMasks(False, ""), *known)
 
 
 def alone(steps: int, *wrong: str) -> Tries:

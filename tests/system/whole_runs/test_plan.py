@@ -190,7 +190,7 @@ def test_a_copy_that_fails_early_is_stepped_again_and_a_time_limit_stands_in_for
     tmp_path: Path,
 ) -> None:
     limit = 10_000  # no episode ends
-    spec = gymnasium.envs.registration.EnvSpec("Diverges-v0", DivergesOnce, max_episode_steps=limit)
+    spec = gymnasium.envs.registration.EnvSpec("Diverges-v0", f"{__name__}:DivergesOnce", max_episode_steps=limit)
     env = ProbedEnv(spec, {"failed": str(tmp_path / "failed")}, ())
     measured = probe(env, Machine(cores=2), seconds=3 * BRIEF_S).measured
     assert (measured.failures, measured.copies_failed) == (1, 0)
