@@ -7,7 +7,7 @@ from typing import Literal, NamedTuple
 
 from gymnasium import spaces
 
-from millrace.protocol.envs.action_masks import has_mask, without_mask
+from millrace.protocol.envs.action_masks import has_mask, without_mask, wrong_mask
 from millrace.protocol.envs.description import DescribedEnv
 from millrace.protocol.envs.spaces import action_spec, observation_leaves, with_last
 from millrace.protocol.errors import UsageError, did_you_mean
@@ -45,6 +45,8 @@ class EnvSpaces(NamedTuple):
             raise UsageError(
                 f"action_masks info: expected an action space Discrete or MultiDiscrete, got {env.action_space}"
             )
+        if action_masks == "auto" and (wrong := wrong_mask(observation, env.action_space)):
+            raise UsageError(wrong)
         masked = action_masks == "info" or (action_masks == "auto" and has_mask(observation, env.action_space))
         if masked:
             observation = without_mask(observation, env.action_space)

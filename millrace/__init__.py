@@ -51,6 +51,7 @@ if TYPE_CHECKING:
     from millrace.rollout_service import RolloutBatch, RolloutService
     from millrace.runs import Metrics, Run, train
     from millrace.workers.copies.reset_ahead import ResetAhead
+    from millrace.workers.copies.stack_images import StackImages
     from millrace.workers.copy_slots import env_copy
 
     __version__: str
@@ -82,6 +83,7 @@ __all__ = [
     "Run",
     "RunError",
     "RunPlan",
+    "StackImages",
     "Stalled",
     "Summary",
     "TupleOfAgents",
@@ -120,6 +122,7 @@ _IMPORTED_WHEN_USED = {
     "RolloutService": "millrace.rollout_service",
     "Run": "millrace.runs",
     "RunPlan": "millrace.planning.run_plan",
+    "StackImages": "millrace.workers.copies.stack_images",
     "Summary": "millrace.learner.run_folder.results",
     "TupleOfAgents": "millrace.protocol.envs.tuple_of_agents",
     "env_copy": "millrace.workers.copy_slots",

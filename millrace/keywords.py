@@ -58,8 +58,8 @@ class RolloutKeywords(TypedDict, total=False):
     """
     action_masks: Literal["auto", "info", "none"]
     """Where the environment says which Discrete or MultiDiscrete actions are allowed. auto: in the key action_mask of a
-    Dict observation, if it has one with a bit for each choice. info: in info["action_mask"] of each reset and step,
-    unless the Dict observation has the key. none: all actions are allowed, and the key is an observation.
+    Dict observation, if it has one. info: in info["action_mask"] of each reset and step, unless the Dict observation
+    has the key. none: all actions are allowed, and the key is an observation.
     """
     max_env_copies: int
     """Largest number of env copies that the run has on all machines together, for example because of floating licences.

@@ -50,7 +50,7 @@ GROUPS = {
     "environments": Group(
         "Environments",
         "The vector environment, and what helps to write an environment. `millrace.sb3` needs Stable-Baselines3.",
-        "make_vec sb3.make_vec_env sb3.Sb3VecEnv EnvCopy env_copy ResetAhead TupleOfAgents",
+        "make_vec sb3.make_vec_env sb3.Sb3VecEnv EnvCopy env_copy ResetAhead StackImages TupleOfAgents",
     ),
     "rollouts": Group(
         "Rollouts for your own learner",

@@ -86,8 +86,8 @@ class RolloutConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     """
     action_masks: Fixed[Literal["auto", "info", "none"]] = "auto"
     """Where the environment says which Discrete or MultiDiscrete actions are allowed. auto: in the key action_mask of a Dict
-    observation, if it has one with a bit for each choice. info: in info["action_mask"] of each reset and step, unless the
-    Dict observation has the key. none: all actions are allowed, and the key is an observation.
+    observation, if it has one. info: in info["action_mask"] of each reset and step, unless the Dict observation has the key.
+    none: all actions are allowed, and the key is an observation.
     """
     max_env_copies: Free[Natural] = 0
     """Largest number of env copies that the run has on all machines together, for example because of floating licences. It

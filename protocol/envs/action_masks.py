@@ -31,6 +31,26 @@ def has_mask(observation: gymnasium.Space[Any], action: gymnasium.Space[Any]) ->
     return 0 < wanted == sum(math.prod(leaf.shape) for leaf in leaves) and all(map(_has_bits, leaves))
 
 
+def wrong_mask(observation: gymnasium.Space[Any], action: gymnasium.Space[Any]) -> str:
+    """Why the part `action_mask` of a Dict observation can't be a mask, and what to do.
+
+    Empty if it is a mask, if there is no such part, or if an action has no choices.
+    """
+    if not (isinstance(observation, spaces.Dict) and MASK in observation.spaces and len(observation.spaces) > 1):
+        return ""
+    choices = action_spec(action).choices
+    if not choices or has_mask(observation, action):
+        return ""
+    found = observation_leaves(observation.spaces[MASK])
+    stacked = any(len(leaf.shape) > 1 and leaf.shape[-1] == choices for leaf in found)
+    cause = "a wrapper has stacked it, so stack only the images (millrace:StackImages), or" if stacked else "correct it, or"
+    got = ", ".join(f"{leaf.dtype}{list(leaf.shape)}" for leaf in found) or "nothing"
+    return (
+        f"observation {MASK}: expected a mask, a MultiBinary or a Box of int8 or bool with a bit for each of {choices} "
+        f"choices, got {got}; {cause} set action_masks to none, which makes it an ordinary part of the observation"
+    )
+
+
 def _has_bits(leaf: Leaf) -> bool:
     match leaf.kind:
         case "multibinary":

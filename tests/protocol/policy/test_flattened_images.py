@@ -23,7 +23,16 @@ def lines(shape: tuple[int, ...], dtype: str = "uint8", **policy: Any) -> list[s
 @pytest.mark.parametrize(
     ("shape", "dtype", "advice"),
     [
-        ((4, 96, 96, 3), "uint8", "stack gray frames: --wrappers gymnasium.wrappers:GrayscaleObservation "),
+        (
+            (4, 96, 96, 3),
+            "uint8",
+            'stack them along the channels (--wrappers "millrace:StackImages(n=4)"), or give --encoder',
+        ),
+        (
+            (3, 24, 24, 3),
+            "uint8",
+            'stack them along the channels (--wrappers "millrace:StackImages(n=3)"), or give --encoder',
+        ),
         ((84, 84), "uint8", "stack them (--wrappers "),
         ((84, 84, 3), "float32", "make them uint8 from 0 to 255, of three dimensions"),
         ((2, 4, 84, 84, 3), "uint8", "make them uint8 from 0 to 255, of three dimensions"),
@@ -60,11 +69,12 @@ class Camera(gymnasium.Env[Any, Any]):
 def test_the_wrappers_that_it_names_make_images_of_stacked_frames() -> None:
     stack = "gymnasium.wrappers:FrameStackObservation(stack_size=4)"
     gray = "gymnasium.wrappers:GrayscaleObservation"
+    channels = "millrace:StackImages(n=4)"
     images = {
         wrappers: [leaf.is_image for leaf in observation_leaves(EnvSpec.of(Camera, {}, wrappers).make().observation_space)]
-        for wrappers in ((stack,), (gray,), (gray, stack), (f"{gray}(keep_dim=True)",))
+        for wrappers in ((stack,), (gray,), (gray, stack), (f"{gray}(keep_dim=True)",), (channels,))
     }
-    assert list(images.values()) == [[False], [False], [True], [True]]
+    assert list(images.values()) == [[False], [False], [True], [True], [True]]
 
 
 def test_a_run_says_it(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -12,11 +12,13 @@ from gymnasium import spaces
 from gymnasium.vector import SyncVectorEnv
 
 from millrace.extras.envs.vector_copies import VectorCopies
+from millrace.learner.env_spaces import EnvSpaces
 from millrace.protocol.arrays import Array, Bools
 from millrace.protocol.env_spec import EnvSpec
 from millrace.protocol.envs.action_masks import has_mask, without_mask
+from millrace.protocol.envs.description import DescribedEnv
 from millrace.protocol.envs.spaces import action_spec, observation_leaves
-from millrace.protocol.errors import BadRollout, EnvironmentFailed
+from millrace.protocol.errors import BadRollout, EnvironmentFailed, UsageError
 from millrace.protocol.messages import Evaluate
 from millrace.protocol.rollout import Rollout, stack_rollouts
 from millrace.protocol.rows.rollout_checks import validate
@@ -228,6 +230,31 @@ def test_which_key_of_an_observation_is_a_mask(mask: Any, action: Any, expected:
     assert has_mask(observation, action) == expected
     assert list(without_mask(observation, action).spaces) == (["z"] if expected else ["action_mask", "z"])  # type: ignore[attr-defined]
     assert not has_mask(spaces.Dict({"action_mask": mask}), action)  # nothing would be left to see
+
+
+TO_DO = "; correct it, or set action_masks to none"
+
+
+@pytest.mark.parametrize(
+    ("mask", "got"),
+    [
+        (spaces.MultiBinary(4), f"int8[4]{TO_DO}"),
+        (spaces.Box(0, 1, (5,), np.float32), f"float32[5]{TO_DO}"),
+        (
+            spaces.Box(0, 1, (4, 5), np.int8),
+            "int8[4, 5]; a wrapper has stacked it, so stack only the images (millrace:StackImages), or set action_masks to "
+            "none",
+        ),
+    ],
+)
+def test_a_part_of_an_observation_that_is_called_a_mask_but_cannot_be_one_is_refused(mask: Any, got: str) -> None:
+    observation = spaces.Dict({"action_mask": mask, "z": spaces.Box(0, 1, (2,))})
+    env = DescribedEnv(observation, spaces.MultiDiscrete([2, 3]))
+    expected = "observation action_mask: expected a mask, a MultiBinary or .* with a bit for each of 5 choices, got "
+    with pytest.raises(UsageError, match=f"^{expected}{re.escape(got)}, which makes it an ordinary part"):
+        EnvSpaces.of_description(env)
+    assert [leaf.path for leaf in EnvSpaces.of_description(env, "none").observation] == ["action_mask", "z"]
+    assert len(EnvSpaces.of_description(DescribedEnv(observation, spaces.Box(-1, 1, (5,)))).observation) == 2
 
 
 def test_a_run_without_masks_reads_none() -> None:
