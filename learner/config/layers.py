@@ -5,7 +5,7 @@ named preset, a TOML file, and flags or keyword arguments. When a run is resumed
 the file; with `--resume auto`, the file comes between the config.toml and the flags.
 
 A setting has one name everywhere: the field `learning_rate` is the TOML key `learning_rate` and the flag `--learning-rate`.
-The settings of the algorithm are in a TOML table named after it, such as [ppo].
+The settings of the algorithm are in a TOML table named after it, such as [ppo] or ["my_module:Mine"].
 
 Rule: a layer is a dictionary that knows its source. Layers are merged as dictionaries and converted to a record once, so
 each value is checked once, and an error names the layer that the value comes from.
@@ -156,6 +156,7 @@ def read_lower_layers(algo: str | None, *, file: Path | None, resume: Path | Non
     named = SettingsLayer(f"preset {preset}", whole_runs[preset].settings if preset in whole_runs else {})
     if algo is None:
         algo = _algorithm_of_file({**named.settings, **table}, str(file))
+    _check_tables(table, algo, str(file))
     return LowerLayers(algo, preset, named, _layer_of_file(table, algo, str(file)), None)
 
 
@@ -259,15 +260,38 @@ def _layer_of_file(table: dict[str, Any], algo: str, where: str) -> SettingsLaye
 
     Tables of other algorithms are left out, because one file may hold the tables of several.
     """
-    of_run = {name: value for name, value in table.items() if name not in HYPERPARAMETERS and not is_own(name)}
+    of_run = {name: value for name, value in table.items() if not _is_algorithm(name)}
+    header = _header(algo)
     of_algorithm = table.get(algo, {})
     if not isinstance(of_algorithm, dict):
-        raise UsageError(f"{where}: {algo}: expected a table, {_header(algo)}, got {of_algorithm}")
+        raise UsageError(f"{where}: {algo}: expected a table, {header}, got {of_algorithm}")
     if misplaced := of_run.keys() & {*settings_record(algo).__struct_fields__}:
-        raise UsageError(f"{where}: {min(misplaced)} is a setting of the algorithm; put it in the table {_header(algo)}")
+        raise UsageError(f"{where}: {min(misplaced)} is a setting of the algorithm; put it in the table {header}")
     if misplaced := of_algorithm.keys() & {*Config.__struct_fields__}:
-        raise UsageError(f"{where}: {min(misplaced)} is a setting of the run; put it above the table {_header(algo)}")
+        raise UsageError(f"{where}: {min(misplaced)} is a setting of the run; put it above the table {header}")
     return SettingsLayer(where, of_run | of_algorithm)
+
+
+def _check_tables(table: dict[str, Any], algo: str, where: str) -> None:
+    """Raise `UsageError` for a table of an unknown name, or if a file has tables of algorithms, but none of this one.
+
+    A built-in algorithm that a flag or keyword argument has named in place of the file's needs no table.
+    """
+    header = _header(algo)
+    tables = [name for name in table if _is_algorithm(name)]
+    if tables and algo not in tables and (is_own(algo) or algo == table.get("algo", "ppo")):
+        raise UsageError(
+            f"{where}: expected the settings of {algo} in the table {header}, got only {', '.join(map(_header, tables))}; "
+            "rename that table, or add an empty one if the defaults are right"
+        )
+    for name, value in table.items():
+        if isinstance(value, dict) and name not in (*tables, *TABLES):
+            raise UsageError(f"{where}: unknown table [{name}]; the settings of {algo} are in the table {header}")
+
+
+def _is_algorithm(name: str) -> bool:
+    """Whether an entry of a TOML file is an algorithm's table, by its name."""
+    return name in HYPERPARAMETERS or is_own(name)
 
 
 def _header(algo: str) -> str:

@@ -215,6 +215,33 @@ def test_a_setting_in_the_wrong_table_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    ("tables", "says"),
+    [
+        ("[ppo]", 'settings of own_module:Mine in the table ["own_module:Mine"], got only [ppo]; rename that table'),
+        ("[dqn]\n[ppo]", 'in the table ["own_module:Mine"], got only [dqn], [ppo]; rename that table, or add an empty one'),
+        ("[Mine]", 'unknown table [Mine]; the settings of own_module:Mine are in the table ["own_module:Mine"]'),
+    ],
+)
+def test_settings_in_the_table_of_another_algorithm_are_not_silently_ignored(tmp_path: Path, tables: str, says: str) -> None:
+    file = tmp_path / "my.toml"
+    file.write_text(f'algo = "own_module:Mine"\n{tables}\npenalty = 0.3\n')
+    assert says in refusal(lambda: resolve("E", file=file))
+    file.write_text(f"{tables}\npenalty = 0.3\n")
+    assert says in refusal(lambda: resolve("E", algo="own_module:Mine", file=file))
+
+
+def test_one_file_may_have_the_tables_of_several_algorithms(tmp_path: Path) -> None:
+    file = tmp_path / "my.toml"
+    file.write_text('["own_module:Mine"]\n[ppo]\ngamma = 0.5\n')
+    assert resolve("E", algo="own_module:Mine", file=file) == resolve("E", algo="own_module:Mine")
+    assert resolve("E", algo="a2c", file=file) == resolve("E", algo="a2c")
+    assert resolve("E", file=file).algorithm.gamma == 0.5
+    file.write_text("[a2c]\ngamma = 0.5\n")
+    says = "expected the settings of ppo in the table [ppo], got only [a2c]"
+    assert says in refusal(lambda: resolve("E", file=file))
+
+
+@pytest.mark.parametrize(
     ("name", "says"),
     [
         ("nowhere:Mine", r"no module named nowhere; is it installed, or its folder on PYTHONPATH\?"),

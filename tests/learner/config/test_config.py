@@ -196,7 +196,7 @@ def test_bad_values_are_refused_in_one_line(keywords: dict[str, Any], says: str)
             "env_kwargs: argument x: expected a number of at most 64 bits, text, True or False, got list [1]",
         ),
         ("algorithm = 3", "unknown setting algorithm; did you mean algo?"),
-        ("[algorithm]\ngamma = 0.9", "unknown setting algorithm; did you mean algo?"),
+        ("[algorithm]\ngamma = 0.9", "unknown table [algorithm]; the settings of ppo are in the table [ppo]"),
         ("a =", "is not TOML"),
     ],
 )
