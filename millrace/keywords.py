@@ -499,8 +499,10 @@ class PlayKeywords(TypedDict, total=False):
 
     best: bool
     """use the policy with the best evaluation during the run (--eval-every) instead of the newest policy"""
-    workers: int
-    """number of worker processes that play the episodes; the result does not depend on it"""
+    workers: int | None
+    """number of worker processes that play the episodes; the result does not depend on it. If not given: 2, or 1 if the
+    run's --max-env-copies allows only one worker's copies
+    """
     transport: Literal["inproc", "ipc", "tcp"]
     """how local workers are connected: as threads of this process, by local sockets, or by TCP"""
     bind: str
@@ -518,8 +520,10 @@ class EvaluateKeywords(PlayKeywords, total=False):
     """run folder of a policy that plays the other teams; both sample their actions, and each team is played in turn"""
     seed: int
     """seed of the episodes"""
-    copies: int
-    """number of episodes that a worker plays at the same time"""
+    copies: int | None
+    """number of episodes that a worker plays at the same time; if not given: the run's --eval-copies, but at most its
+    --max-env-copies
+    """
     max_steps: int
     """limit on the env steps of all episodes together; each episode gets an equal share, and is cut when it is used up"""
     video: bool

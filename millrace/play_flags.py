@@ -23,8 +23,10 @@ class PlayFlags(msgspec.Struct, frozen=True, kw_only=True):
     """the environment, if the run can't find it itself, such as my_module:make_env or my_module:MyEnv-v0"""
     wrappers: Annotated[tuple[str, ...], Flag("MODULE:CLASS ...")] = ()
     """the wrappers, innermost first, if the run can't find them itself"""
-    workers: Count = 2
-    """number of worker processes that play the episodes; the result does not depend on it"""
+    workers: Annotated[Count | None, Flag("INT")] = None
+    """number of worker processes that play the episodes; the result does not depend on it. If not given: 2, or 1 if the
+    run's --max-env-copies allows only one worker's copies
+    """
     transport: Literal["inproc", "ipc", "tcp"] = "ipc"
     """how local workers are connected: as threads of this process, by local sockets, or by TCP"""
     bind: str = ""
@@ -44,8 +46,10 @@ class EvaluateFlags(PlayFlags, frozen=True, kw_only=True):
     """run folder of a policy that plays the other teams; both sample their actions, and each team is played in turn"""
     seed: Natural = 1_000_000
     """seed of the episodes"""
-    copies: Annotated[int, Meta(ge=1, le=MAX_SEEDS)] = 4
-    """number of episodes that a worker plays at the same time"""
+    copies: Annotated[Annotated[int, Meta(ge=1, le=MAX_SEEDS)] | None, Flag("INT")] = None
+    """number of episodes that a worker plays at the same time; if not given: the run's --eval-copies, but at most its
+    --max-env-copies
+    """
     max_steps: Count = 1_000_000
     """limit on the env steps of all episodes together; each episode gets an equal share, and is cut when it is used up"""
     video: bool = False

@@ -11,23 +11,29 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TypedDict, TypeVar, Unpack
 
+import msgspec
+
 from millrace.arguments import checked
 from millrace.flags.fields import fields_of
 from millrace.flags.values import convert, with_whole_numbers
 from millrace.keywords import EvaluateKeywords, RecordKeywords
 from millrace.launch.policy_workers import PlayingWorkers, policy_player
+from millrace.learner.config.config import Config
 from millrace.learner.config.rollout_config import RolloutConfig
 from millrace.learner.extras import started_by
 from millrace.learner.policy_player import PolicyPlayer, SavedPolicy, saved_policy, useful_workers
 from millrace.learner.rollouts.evaluation_dealer import EvaluationPlan, evaluation_of
 from millrace.learner.run_folder.results import Evaluation, RecordedDataset
 from millrace.learner.run_folder.run_folder import RunFolder, Which
+from millrace.learner.run_folder.run_format import CONFIG_FILE, read_config
 from millrace.play_flags import EvaluateFlags, PlayFlags, RecordFlags
+from millrace.protocol.bounds import Count, Natural
 from millrace.protocol.env_spec import EnvLike
 from millrace.protocol.envs.wrappers import WrapperLike
 from millrace.protocol.errors import UsageError, did_you_mean
 from millrace.terminal import count_line
 
+WORKERS = 2  # worker processes that play, unless a flag or the run's limit on env copies says otherwise
 NOT_KEYWORDS = ("wrappers",)  # Python code may pass objects for these flags, so functions declare parameters for them
 ShowPlayed = Callable[[str], None]
 """Takes the progress as text, and shows it."""
@@ -36,6 +42,36 @@ RecordVideos = Callable[[PolicyPlayer, Path, int, int, int, str], tuple[Evaluati
 """Takes the player, run folder, episodes, seed, max_steps, and the prefix of the videos' file names. Returns the evaluation
 and the paths of the videos.
 """
+
+
+class SettingsOfRun(msgspec.Struct, frozen=True):
+    """The settings of a run that also apply to the episodes that are played later. The names are those in config.toml."""
+
+    eval_copies: Count = Config().eval_copies
+    max_env_copies: Natural = 0
+    start_timeout_s: float = RolloutConfig().start_timeout_s
+    step_timeout_s: float = RolloutConfig().step_timeout_s
+
+    @staticmethod
+    def read(run: Path) -> SettingsOfRun:
+        """Read them from a run folder. If it contains only a policy, they have their defaults.
+
+        Raises `UsageError` if config.toml can't be read.
+        """
+        if not (run / CONFIG_FILE).is_file():
+            return SettingsOfRun()
+        try:
+            return msgspec.convert(read_config(run), SettingsOfRun)
+        except msgspec.ValidationError as error:
+            raise UsageError(f"{run / CONFIG_FILE} is damaged: {error}; restore it") from error
+
+    def copies(self) -> int:
+        """How many episodes a worker plays at the same time."""
+        return min(self.eval_copies, self.max_env_copies or self.eval_copies)
+
+    def workers(self, copies: int) -> int:
+        """How many workers play, each with this many copies, so that the run's limit on env copies is kept."""
+        return max(1, min(WORKERS, self.max_env_copies // copies)) if self.max_env_copies else WORKERS
 
 
 class Given(NamedTuple):
@@ -167,8 +203,9 @@ def play(flags: EvaluateFlags, watch: ShowPlayed, given: Given | None = None) ->
             raise UsageError("video: expected inference workers, got learner; only a worker that acts renders its episodes")
         record_videos = started_by("video")()
     saved = policy_to_play(flags, given)
-    copies = 1 if flags.video else flags.copies
-    count = useful_workers(flags.workers, episodes, copies)
+    of_run = SettingsOfRun.read(flags.run)
+    copies = 1 if flags.video else flags.copies or of_run.copies()
+    count = useful_workers(flags.workers or of_run.workers(copies), episodes, copies)
     workers = playing_workers(flags, count, min(copies, episodes))
     if flags.against is not None:
         saved = saved._replace(against=RunFolder.open_policy(flags.against).read_policy(_which(flags)))
@@ -180,13 +217,20 @@ def play(flags: EvaluateFlags, watch: ShowPlayed, given: Given | None = None) ->
         return evaluation_of(played, player.run.facts), []
 
 
-def playing_workers(flags: PlayFlags, count: int, copies: int) -> PlayingWorkers:
+def playing_workers(flags: PlayFlags, count: int | None, copies: int) -> PlayingWorkers:
     """`count` local workers that play the episodes, or workers that join from elsewhere at `flags.bind`.
+
+    If `count` is None, it is derived from the run's settings. The timeouts are those of the run.
 
     `copies`: see `PlayingWorkers.copies`.
     """
-    settings = RolloutConfig(max_env_failures=flags.max_env_failures)
-    return PlayingWorkers(count, flags.transport, flags.bind, flags.inference, copies, settings)
+    of_run = SettingsOfRun.read(flags.run)
+    settings = RolloutConfig(
+        max_env_failures=flags.max_env_failures,
+        start_timeout_s=of_run.start_timeout_s,
+        step_timeout_s=of_run.step_timeout_s,
+    )
+    return PlayingWorkers(count or of_run.workers(copies), flags.transport, flags.bind, flags.inference, copies, settings)
 
 
 def _which(flags: PlayFlags) -> Which:

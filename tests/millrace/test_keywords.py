@@ -144,8 +144,8 @@ def test_what_type_checkers_refuse_is_refused_when_it_runs() -> None:
     [
         (millrace.train, "int | None"),
         (millrace.RolloutService, "int | None"),
-        (millrace.evaluate, "int"),
-        (millrace.record, "int"),
+        (millrace.evaluate, "int | None"),
+        (millrace.record, "int | None"),
     ],
 )
 def test_a_signature_shows_every_keyword(function: Callable[..., object], workers: str) -> None:
