@@ -20,6 +20,7 @@ import torch
 from millrace.protocol.errors import UsageError, first_line
 from millrace.protocol.own_module import own_callable
 from millrace.protocol.policy.features import feature_size
+from millrace.protocol.policy.flattened_images import is_stack
 from millrace.protocol.random_streams import Purpose, torch_seed
 from millrace.protocol.specs import ActionSpec, EncoderSpec, Leaf, NamedShape, PolicySpec
 
@@ -90,7 +91,8 @@ def _make(factory: str, spec: PolicySpec, seed: int) -> torch.nn.Module:
         except UsageError:
             raise
         except Exception as error:
-            raise UsageError(f"encoder {factory} cannot be made: {type(error).__name__}: {first_line(error)}") from error
+            raised = f"{type(error).__name__}: {first_line(error)}"
+            raise UsageError(f"encoder {factory} cannot be made: {raised}; {_arguments(spec)}") from error
     if not isinstance(module, torch.nn.Module):
         raise UsageError(f"encoder {factory}: expected it to return a torch.nn.Module, got {type(module).__name__}")
     if kept := [name for name, _ in module.named_buffers()]:
@@ -99,6 +101,17 @@ def _make(factory: str, spec: PolicySpec, seed: int) -> torch.nn.Module:
     if strange := [name for name, parameter in module.named_parameters() if parameter.dtype not in usual]:
         raise UsageError(f"encoder {factory}: expected float32 parameters, got another dtype in {strange[0]}")
     return module.float().eval()
+
+
+def _arguments(spec: PolicySpec) -> str:
+    """The arguments that the factory gets, for errors, and why a stack of images isn't among the images."""
+    images = [leaf.shape for leaf in spec.observation if leaf.is_image]
+    arguments = f"its factory got features={feature_size(spec)}, images={images}"
+    if stacks := [leaf for leaf in spec.observation if is_stack(leaf)]:
+        leaf = stacks[0]
+        advice = f'stack the images along the channels (--wrappers "millrace:StackImages(n={leaf.shape[0]})")'
+        return f"{arguments}; {leaf.name} {leaf.dtype}{list(leaf.shape)} has four dimensions, so it isn't an image: {advice}"
+    return arguments
 
 
 def _output_size(factory: str, module: torch.nn.Module, spec: PolicySpec) -> int:
@@ -111,7 +124,9 @@ def _output_size(factory: str, module: torch.nn.Module, spec: PolicySpec) -> int
         with torch.no_grad():
             out = module(torch.zeros(ROWS, feature_size(spec), dtype=torch.float32), *images)
     except Exception as error:
-        raise UsageError(f"encoder {factory} raised {type(error).__name__}: {first_line(error)}") from error
+        raise UsageError(
+            f"encoder {factory} raised {type(error).__name__}: {first_line(error)}; {_arguments(spec)}"
+        ) from error
     if not isinstance(out, torch.Tensor) or out.dim() != 2 or len(out) != ROWS or out.dtype != torch.float32:
         got = f"{out.dtype}{list(out.shape)}" if isinstance(out, torch.Tensor) else type(out).__name__
         raise UsageError(f"encoder {factory}: expected float32[{ROWS}, K] of two observations, got {got}")

@@ -22,7 +22,7 @@ from millrace.protocol.policy.layout import acting_size
 from millrace.protocol.policy.own_encoder import describe_encoder, make_encoder
 from millrace.protocol.policy.policy import make_policy
 from millrace.protocol.policy.torch_policy import TorchPolicy
-from millrace.protocol.specs import NamedShape, PolicySpec
+from millrace.protocol.specs import Leaf, NamedShape, PolicySpec
 from tests.support.in_process.described import run_spec
 from tests.support.in_process.saved_policies import load_policy, policy_run
 from tests.support.numbers.batches import DISCRETE, IMAGE, batch, no_pulse, recurrent
@@ -111,7 +111,8 @@ def test_one_that_is_different_here_is_refused() -> None:
         (f"{HERE}:of_doubles", "expected float32 parameters, got another dtype in weight"),
         (f"{HERE}:of_one_dimension", r"expected float32[2, K] of two observations, got torch.float32[2]"),
         (f"{HERE}:wants_more", "raised RuntimeError: mat1 and mat2 shapes cannot be multiplied"),
-        (f"{HERE}:raises", "cannot be made: OSError: no such file"),
+        (f"{HERE}:wants_more", "; its factory got features=4, images=[]"),
+        (f"{HERE}:raises", "cannot be made: OSError: no such file; its factory got features=4, images=[]"),
     ],
 )
 def test_one_that_cannot_be_used_is_refused_in_one_line(factory: str, says: str) -> None:
@@ -119,6 +120,16 @@ def test_one_that_cannot_be_used_is_refused_in_one_line(factory: str, says: str)
         describe_encoder(factory, DISCRETE.observation, DISCRETE.action)
     assert says in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_it_is_said_that_a_stack_of_images_is_no_image() -> None:
+    stack = Leaf("view", "box", (3, 24, 24, 3), "uint8")
+    with pytest.raises(UsageError) as caught:
+        describe_encoder(f"{HERE}:raises", (stack,), DISCRETE.action)
+    assert str(caught.value).endswith(
+        "; its factory got features=5184, images=[]; observation view uint8[3, 24, 24, 3] has four dimensions, so it isn't "
+        'an image: stack the images along the channels (--wrappers "millrace:StackImages(n=3)")'
+    )
 
 
 def test_one_without_parameters_will_do() -> None:
