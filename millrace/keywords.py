@@ -191,7 +191,9 @@ class TrainKeywords(RolloutKeywords, total=False):
     target_return: float | None
     """Stop as soon as the mean return of an evaluation is at least this. Needs eval_every."""
     target_mean_return: float | None
-    """Stop as soon as the mean return of the last 100 training episodes is at least this."""
+    """Stop as soon as the mean return of the last 100 training episodes is at least this. A run with fewer than 100
+    episodes never stops because of this setting.
+    """
     self_play: int
     """Self-play in a multi-agent environment: the policy plays one team, and opponents play the others. The opponents are
     drawn from this many of the policy's newest snapshots. 0: the policy plays all agents, or only against your own

@@ -80,7 +80,9 @@ class Config(RolloutConfig, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     target_return: Free[float | None] = None
     """Stop as soon as the mean return of an evaluation is at least this. Needs eval_every."""
     target_mean_return: Free[float | None] = None
-    """Stop as soon as the mean return of the last 100 training episodes is at least this."""
+    """Stop as soon as the mean return of the last 100 training episodes is at least this. A run with fewer than 100 episodes
+    never stops because of this setting.
+    """
 
     # ---------------------------------------------------------------------------------------------------------- self-play
 
