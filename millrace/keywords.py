@@ -301,6 +301,8 @@ class TrainKeywords(RolloutKeywords, total=False):
     sac, tqc, crossq, xqc: Temperature α: the weight of the entropy. none: α is learned so that the entropy stays near
     target_entropy.
     """
+    ent_coef_schedule: Literal["constant", "linear"]
+    """ppo, a2c, impala, reinforce: linear: ent_coef falls to zero over the run."""
     vf_coef: float
     """ppo, a2c, impala, reinforce: Weight of the value loss in the total loss."""
     max_grad_norm: float | None

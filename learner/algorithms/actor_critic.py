@@ -20,7 +20,7 @@ from torch import Tensor
 from millrace.learner.algorithms import losses
 from millrace.learner.algorithms.algorithm import Algorithm
 from millrace.learner.algorithms.bodies.networks import ActorCriticNetwork
-from millrace.learner.algorithms.gradient_descent import GradientDescent, UpdateMetrics, clip_norm
+from millrace.learner.algorithms.gradient_descent import GradientDescent, UpdateMetrics, clip_norm, scheduled
 from millrace.learner.algorithms.kernels.optimizer_step import make_optimizer, take_step
 from millrace.learner.algorithms.kernels.trained_networks import actor_critic_network
 from millrace.learner.algorithms.minibatches import (
@@ -87,6 +87,7 @@ class ActorCritic(GradientDescent):
         super().__init__(config, policy, total_steps=total_steps)
         self.net = actor_critic_network(policy, device, seed)
         self.seed = seed
+        self.ent_coef: float = config.ent_coef  # the value in this update, which follows the schedule
         if policy.action.numbers:
             self.net.parameters["actor.log_std"].detach().fill_(config.log_std_init)
         self.generator = torch.Generator().manual_seed(torch_seed(seed, Purpose.SHUFFLES))
@@ -110,11 +111,16 @@ class ActorCritic(GradientDescent):
         policy_loss = losses.policy_gradient(rows.log_prob_now, rows.advantage)
         value_loss = losses.value_loss(rows.value, rows.target)
         entropy_loss = losses.entropy_loss(rows.entropy)
-        return policy_loss + self.vf_coef * value_loss + self.config.ent_coef * entropy_loss, {
+        return policy_loss + self.vf_coef * value_loss + self.ent_coef * entropy_loss, {
             "policy_gradient_loss": policy_loss,
             "value_loss": value_loss,
             "entropy_loss": entropy_loss,
         }
+
+    def set_schedules(self) -> None:
+        """Set the learning rate and the entropy coefficient of this update."""
+        super().set_schedules()
+        self.ent_coef = scheduled(self.config.ent_coef, self.config.ent_coef_schedule, self.remaining())
 
     @property
     def vf_coef(self) -> float:
@@ -233,6 +239,8 @@ class ActorCritic(GradientDescent):
         metrics = self.means(step for epoch in epochs for step in epoch)
         metrics["train/learning_rate"] = self.learning_rate
         metrics["train/n_updates"] = float(self.version)
+        if self.config.ent_coef_schedule != "constant":
+            metrics["train/ent_coef"] = self.ent_coef
         log_std = self.net.parameters.get("actor.log_std")
         if log_std is not None:
             metrics["train/std"] = log_std.detach().exp().mean().item()

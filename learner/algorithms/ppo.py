@@ -38,7 +38,7 @@ class PPO(ActorCritic):
         self._kl_limit = math.inf if config.target_kl is None else 1.5 * config.target_kl
 
     def set_schedules(self) -> None:
-        """Set the learning rate and the clip range of this update."""
+        """Set the learning rate, the entropy coefficient and the clip range of this update."""
         super().set_schedules()
         self.clip_range = scheduled(self.config.clip_range, self.config.clip_range_schedule, self.remaining())
 
@@ -68,7 +68,7 @@ class PPO(ActorCritic):
             old_value = rows.target - rows.raw_advantage
             value_loss = losses.clipped_value_loss(rows.value, rows.target, old_value, config.clip_range_vf)
         entropy_loss = losses.entropy_loss(rows.entropy)
-        return policy_loss + config.vf_coef * value_loss + config.ent_coef * entropy_loss, {
+        return policy_loss + config.vf_coef * value_loss + self.ent_coef * entropy_loss, {
             "policy_gradient_loss": policy_loss,
             "value_loss": value_loss,
             "entropy_loss": entropy_loss,

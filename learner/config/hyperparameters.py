@@ -108,6 +108,8 @@ class PolicyGradientConfig(AlgorithmConfig, frozen=True):
     """Optimizer: rmsprop (α = 0.99) or adam, each with ε = 1e-5."""
     ent_coef: Free[NotNegative] = 0.0
     """Weight of the entropy bonus in the loss."""
+    ent_coef_schedule: Free[Schedule] = "constant"
+    """linear: ent_coef falls to zero over the run."""
     vf_coef: Free[NotNegative] = 0.5
     """Weight of the value loss in the total loss."""
     max_grad_norm: Free[Positive] = 0.5

@@ -127,7 +127,9 @@ METRICS: dict[str, dict[str, Meaning]] = {
         "train/q_mean": Meaning(NONE, "Mean value of the actions that were taken.", "mean value"),
         "train/critic_loss": Meaning(NONE, "Continuous actions: mean loss of the critics."),
         "train/actor_loss": Meaning(NONE, "Continuous actions: mean loss of the actor."),
-        "train/ent_coef": Meaning(NONE, "Mean temperature α, the weight of the entropy in SAC.", "entropy coefficient"),
+        "train/ent_coef": Meaning(
+            NONE, "Weight of the entropy, if scheduled; in SAC, the mean temperature α.", "entropy coefficient"
+        ),
         "train/ent_coef_loss": Meaning(NONE, "Mean loss of a learned temperature α.", "loss of the entropy coefficient"),
         "train/entropy": Meaning("nats", "Mean entropy of the actions in [-1, 1], estimated from samples."),
         "train/scaled_reward": Meaning(NONE, "XQC: mean reward of a minibatch, scaled."),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import msgspec
@@ -89,6 +90,31 @@ def test_schedules_follow_the_steps_used(name: str) -> None:
         assert algorithm.version == seed + 1
         used += int(rows.valid.sum())
     assert 0 < left < 1
+
+
+@pytest.mark.parametrize("name", ["ppo", *NAMES])
+def test_the_entropy_coefficient_follows_its_schedule_in_the_loss(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    algorithm = make(name, ent_coef=3.0, ent_coef_schedule="linear")
+    loss_of = algorithm.loss
+    weights: list[float] = []
+
+    def loss(rows: LossInput) -> tuple[Tensor, Mapping[str, Tensor | float]]:
+        total, numbers = loss_of(rows)
+        rest = total - numbers["policy_gradient_loss"] - algorithm.vf_coef * numbers["value_loss"]
+        weights.append((rest / numbers["entropy_loss"]).item())
+        return total, numbers
+
+    monkeypatch.setattr(algorithm, "loss", loss)
+    for seed in range(2):
+        left = 1 - algorithm.env_steps / 10_000
+        metrics = algorithm.update(batch(algorithm, seed), no_pulse)
+        assert metrics["train/ent_coef"] == pytest.approx(3 * left)
+        assert weights == pytest.approx([3 * left] * len(weights), rel=1e-3)
+        weights.clear()
+    assert left < 1
+    algorithm = make(name, ent_coef=3.0)
+    assert "train/ent_coef" not in algorithm.update(batch(algorithm, 0), no_pulse)
+    assert algorithm.ent_coef == 3
 
 
 @pytest.mark.parametrize("name", NAMES)
