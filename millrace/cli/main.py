@@ -23,6 +23,8 @@ from millrace.protocol.bounds import escaped, indented
 from millrace.protocol.errors import UsageError, UserFacingError, did_you_mean, usage_error
 
 ABOUT = "Worker processes step copies of a gymnasium environment; one learner trains a policy in PyTorch."
+NO_COMMANDS = {"export": "; docs/how-to/policies.md shows how to export a policy, for example as ONNX"}
+"""What to do instead of a command that users expect but that doesn't exist."""
 INSTALLED_IN = Path(__file__).parents[2]
 """The folder that contains the package `millrace`"""
 NOT_IN_WORKERS = {
@@ -112,7 +114,7 @@ def _dispatch(argv: list[str]) -> int:
     installed = installed_commands()
     if name in installed:
         return run_installed(name, installed[name], rest)
-    hint = did_you_mean(name, [*COMMANDS, *installed]) or "; millrace --help lists them"
+    hint = NO_COMMANDS.get(name) or did_you_mean(name, [*COMMANDS, *installed]) or "; millrace --help lists them"
     raise UsageError(f"unknown command {name}{hint}")
 
 

@@ -11,7 +11,7 @@ import pytest
 from millrace.learner.config.config import Config
 from millrace.learner.config.hyperparameters import HYPERPARAMETERS, algorithms_with
 from millrace.learner.config.layers import resolve
-from millrace.learner.config.other_names import OUR_NAME, in_place_of
+from millrace.learner.config.other_names import INSTEAD, OUR_NAME, in_place_of
 
 OF_ANY_RUN = {*Config.__struct_fields__}
 SETTINGS = OF_ANY_RUN.union(*(record.__struct_fields__ for record in HYPERPARAMETERS.values()))
@@ -30,7 +30,8 @@ def table() -> list[tuple[list[str], dict[str, str]]]:
 
 def test_the_names_that_an_error_gives_are_settings() -> None:
     assert {*OUR_NAME.values()} <= SETTINGS
-    assert not OUR_NAME.keys() & SETTINGS
+    assert not (OUR_NAME.keys() | INSTEAD.keys()) & SETTINGS
+    assert {flag.replace("-", "_") for line in INSTEAD.values() for flag in re.findall("--([a-z-]+)", line)} <= SETTINGS
 
 
 def test_the_manual_has_every_name_once_and_only_our_settings_in_their_place() -> None:
@@ -62,6 +63,8 @@ def test_the_values_that_the_manual_shows_can_be_written() -> None:
         ("buffer_size", True, f"; millrace calls it --replay-size{algorithms_with('replay_size')}"),
         ("gradient_steps", True, "; it is one of dqn, rainbow alone"),
         ("stepz", True, ""),
+        ("frame_stack", True, '; to stack images, take --wrappers "millrace:StackImages(n=4)"'),
+        ("policy", False, "; the network follows from the environment's spaces, and --net sets its layers"),
     ],
 )
 def test_the_line_says_what_to_write(name: str, flag: bool, says: str) -> None:

@@ -77,6 +77,7 @@ def asked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[Any]:
     ("argv", "says"),
     [
         (["trian"], "unknown command trian; did you mean train?"),
+        (["export"], "unknown command export; docs/how-to/policies.md shows how to export a policy, for example as ONNX"),
         (["fly"], "unknown command fly; millrace --help lists them"),
         (["train"], "which environment? expected one that gymnasium.make takes, as in: millrace train CartPole-v1"),
         (
