@@ -134,7 +134,8 @@ class RunGroup:
             return f"{label}, mean of {len(mean)} {kind}" + (f"; {early}, not in the mean" if ended else "")
         if len(curves) == 1:
             return f"{label}, seed {curves[0].seed}" + (", ended early" if ended else "")
-        return f"{label}, {len(curves)} {'seeds' if one_each else 'runs'}" + (f"; {early}" if ended else "")
+        no_mean = f"; {early}, so there is no mean" if ended else ""
+        return f"{label}, {len(curves)} {'seeds' if one_each else 'runs'}{no_mean}"
 
 
 @dataclass(frozen=True)

@@ -208,7 +208,7 @@ def test_a_failed_run_is_in_its_group_and_in_no_mean(tmp_path: Path) -> None:
     said = text_of(sections.results(report_data(*good, interrupted)))
     assert "greedy −1,233.1 on average of 2 of 3 runs" in said, "it was evaluated, and then ended early"
     one_good = sections.curves(report_data(good[0], failed))
-    assert "PPO, 2 seeds; seed 3 ended early<" in one_good
+    assert "PPO, 2 seeds; seed 3 ended early, so there is no mean<" in one_good
     assert "mean over seeds" not in one_good
     assert "PPO, seed 3, ended early<" in sections.curves(report_data(failed))
 
