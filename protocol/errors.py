@@ -367,6 +367,19 @@ class BadMessage(PeerError):
     """Bytes that are not a valid message."""
 
 
+class CannotUnpack(BadMessage):
+    """A message whose packed arrays are larger than the run allows, or can't be unpacked here.
+
+    Everything else in the message was read. So a message that was packed for another run can be told from a mistake: it is
+    of another session.
+    """
+
+    def __init__(self, line: str, session: int) -> None:
+        """`session` is the session of the message."""
+        super().__init__(line)
+        self.session = session
+
+
 class BadRollout(PeerError):
     """A rollout that breaks the row format or does not fit the run."""
 

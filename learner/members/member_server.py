@@ -47,7 +47,7 @@ from millrace.learner.members.membership import Membership, Outgoing
 from millrace.learner.members.worker_processes import WorkerProcesses
 from millrace.protocol.address import advertised_address, name_for_people
 from millrace.protocol.bounds import one_line
-from millrace.protocol.errors import BadMessage, NoWorkers
+from millrace.protocol.errors import BadMessage, CannotUnpack, NoWorkers
 from millrace.protocol.logs.long_wait import LongWait
 from millrace.protocol.messages import Hello, Inquire, Refuse, Status, ToLearner, ToWorker, Weights
 from millrace.protocol.wire.codec import Buffer, encode
@@ -278,6 +278,8 @@ class MemberServer:
             match message:
                 case RefusedMessage():
                     return ()
+                case CannotUnpack(session=session) if not self._membership.is_session_of(peer, session):
+                    return self._membership.ask_to_rejoin(peer, session)  # it was packed for another run, and is no mistake
                 case BadMessage():
                     self.member_log.warn_limited(peer, f"message from {name_for_people(peer)!r}: {message}")
                     return self._coordinator.reject_message(peer, str(message), now)

@@ -185,9 +185,17 @@ class Membership:
         """The answer to a message from a session that has ended: a request to join again, unless the worker is leaving."""
         if isinstance(message, Hello | Alive | Goodbye | Failure):  # rule UNKNOWN_SESSION
             return []
-        late = message.env_steps if isinstance(message, Rollout) else 0
-        self.events.append(WorkerToldToRejoin(name_for_people(peer), message.session, late))
-        return [(peer, Rejoin(message.session))]
+        return self.ask_to_rejoin(peer, message.session, message.env_steps if isinstance(message, Rollout) else 0)
+
+    def ask_to_rejoin(self, peer: bytes, session: int, late: int = 0) -> list[Outgoing]:
+        """The answer to a message from a session that has ended. `late`: the number of transitions in the message."""
+        self.events.append(WorkerToldToRejoin(name_for_people(peer), session, late))
+        return [(peer, Rejoin(session))]
+
+    def is_session_of(self, peer: bytes, session: int) -> bool:
+        """Whether this peer is a member, in this session."""
+        member = self.members.get(peer)
+        return member is not None and member.session == session
 
     def join(self, peer: bytes, hello: Hello, now: float) -> tuple[list[Outgoing], Member | None]:
         """Answer a Hello. Returns the answer, and the member if one joined."""

@@ -25,7 +25,7 @@ import numpy as np
 
 from millrace.protocol.bounds import one_line
 from millrace.protocol.env_spec import MAX_CALLABLE_BYTES, PickledCallable
-from millrace.protocol.errors import BadMessage, UsageError
+from millrace.protocol.errors import BadMessage, CannotUnpack, UsageError
 from millrace.protocol.messages import (
     Described,
     Hello,
@@ -120,7 +120,8 @@ def check_can_be_sent(env: str, run: RunSpec | StepSpec) -> None:
 def decode_to_learner(frames: Sequence[Buffer], packed_bytes_limit: int = 0) -> ToLearner | Inquire:
     """Decode a message from a worker or an observer. Raises `BadMessage` for anything else, and no other error.
 
-    `packed_bytes_limit` is the largest total unpacked size of the message's packed arrays; 0 forbids packed arrays.
+    `packed_bytes_limit` is the largest total unpacked size of the message's packed arrays; 0 forbids packed arrays. If only
+    these arrays can't be read, the error is a `CannotUnpack`.
     """
     message: ToLearner | Inquire = _decode(frames, TO_LEARNER, packed_bytes_limit)
     return message
@@ -160,10 +161,14 @@ def _decode(frames: Sequence[Buffer], kinds: MessageTypes, packed_bytes_limit: i
         if array.packings is not None:
             taken += size
             if taken > packed_bytes_limit or not packed_bytes_limit:
-                raise BadMessage(f"packed arrays expected at most {packed_bytes_limit} bytes together, got {taken}")
+                line = f"packed arrays expected at most {packed_bytes_limit} bytes together, got {taken}"
+                raise CannotUnpack(line, _session_of(head))
             if size > MAX_FRAME_BYTES:
                 raise BadMessage(f"packed array expected at most {MAX_FRAME_BYTES} bytes, got {size}")
-            return unpack_array(frame, array.packings, array.dtype, array.shape)
+            try:
+                return unpack_array(frame, array.packings, array.dtype, array.shape)
+            except BadMessage as error:
+                raise CannotUnpack(str(error), _session_of(head)) from error
         if size != len(frame):
             raise BadMessage(f"array {array.dtype.str}{array.shape} expected {size} bytes, got {len(frame)}")
         if wanted is PickledCallable:
@@ -182,6 +187,8 @@ def _decode(frames: Sequence[Buffer], kinds: MessageTypes, packed_bytes_limit: i
         )
         named = type(head) is dict and "type" in head  # if a map can be of one type only, msgspec accepts it without "type"
         message = msgspec.convert(head, by_name if named else by_position, dec_hook=hook)
+    except CannotUnpack:
+        raise
     except BadMessage as error:
         raise BadMessage(one_line(str(error), 500)) from error  # the error may quote text from the peer
     except Exception as error:  # msgpack and msgspec raise a dozen types for invalid bytes
@@ -207,6 +214,13 @@ def _explain_validation_error(error: str, head: object, kinds: Any) -> str:
             if not at and len(given) != len(fields):
                 return f"{name} expected {len(fields)} fields, got {len(given)}"
     return error
+
+
+def _session_of(head: object) -> int:
+    """The session in the head of a message that contains arrays. It is the first field, so it was checked before them."""
+    assert type(head) is list
+    session: int = head[1]
+    return session
 
 
 class _DescribedArray(NamedTuple):

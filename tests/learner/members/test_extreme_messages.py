@@ -93,7 +93,7 @@ class Conversation(FakeLink):
     def poll(self, timeout_s: float) -> bool:
         return bool(self.sayings) or super().poll(timeout_s)
 
-    def receive(self) -> Iterator[tuple[bytes, ToLearner]]:
+    def receive(self) -> Iterator[tuple[bytes, ToLearner | BadMessage]]:
         yield from super().receive()
         while self.sayings:
             name, frames = self.sayings.pop(0)

@@ -8,10 +8,13 @@ from collections.abc import Callable, Iterator
 from types import SimpleNamespace
 from typing import cast
 
+import msgspec
+import numpy as np
 import pytest
 
 from millrace.learner.members.describe_coordinator import DescribeCoordinator, Unknown
 from millrace.learner.members.events import Event, LaneContinued
+from millrace.learner.members.lobby import Lobby, LobbySettings
 from millrace.learner.members.member_server import (
     ASK_PROCESSES_S,
     AWAY_S,
@@ -26,20 +29,33 @@ from millrace.learner.members.worker_processes import WorkerProcesses
 from millrace.learner.rollouts.hub import Hub, HubSettings
 from millrace.learner.rollouts.lag_rule import Rounds
 from millrace.learner.rollouts.rollout_dealer import RolloutDealer
-from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
+from millrace.learner.rollouts.ticket_coordinator import STRIKES, TicketCoordinator
 from millrace.learner.vector_env.lane_orders import packed, reset_order
 from millrace.learner.vector_env.order_coordinator import OrderCoordinator
 from millrace.learner.vector_env.step_hub import StepHub
 from millrace.learner.vector_env.vector_env_status import status
 from millrace.protocol.alive import StartFailed, WorkerActivity, WorkerExit
 from millrace.protocol.env_spec import EnvSpec
-from millrace.protocol.errors import EnvironmentFailed, NoWorkers
-from millrace.protocol.messages import PROTOCOL_VERSION, Failure, Goodbye, Heartbeat, Hello, Status, ToLearner
+from millrace.protocol.errors import BadMessage, EnvironmentFailed, NoWorkers
+from millrace.protocol.messages import (
+    PROTOCOL_VERSION,
+    Failure,
+    Goodbye,
+    Heartbeat,
+    Hello,
+    Refuse,
+    Rejoin,
+    Status,
+    ToLearner,
+    Welcome,
+)
 from millrace.protocol.specs import WaitSpec
+from millrace.protocol.wire.codec import decode_to_learner, decode_to_worker, encode
+from millrace.protocol.wire.compression import Packing
 from millrace.protocol.wire.learner_link import LearnerLink
 from tests.learner.vector_env.test_order_coordinator import SPEC
 from tests.support.conversation.example_messages import example
-from tests.support.conversation.fake_ends import run_spec
+from tests.support.conversation.fake_ends import fake_rollout, run_spec
 from tests.support.conversation.fake_link import FakeLink
 from tests.support.in_process.fake_processes import FakeProcesses
 
@@ -158,6 +174,63 @@ def test_a_learner_that_was_stopped_while_it_waited_was_away_too() -> None:
     served.server.listen(POLL_S)
     served.link.poll = waiting  # type: ignore[method-assign]
     assert served.listens_for(TIMEOUT_S - 2 * POLL_S)
+
+
+def packed_rollout(link: FakeLink, session: int) -> BadMessage:
+    """How the link hands over a rollout of this session whose packed observations are larger than the run's."""
+    images = np.zeros((3, 1, 4, 64, 64), np.uint8)
+    rollout = msgspec.structs.replace(fake_rollout(session, lane=0, ticket=1, version=0, sequence=0), obs=(images,))
+    with pytest.raises(BadMessage) as raised:
+        decode_to_learner(encode(rollout, Packing(stack=True)), link.packed_bytes_limit)
+    return raised.value
+
+
+def lobby_server(link: FakeLink) -> MemberServer:
+    """The server of a lobby without workers."""
+    settings = LobbySettings(
+        WaitSpec(), worker_timeout_s=TIMEOUT_S, no_workers_timeout_s=60, stall_timeout_s=60, max_env_failures=1
+    )
+    return Lobby(cast(LearnerLink, link), WorkerProcesses(), settings, lambda: link.now)._server
+
+
+def hub_server(link: FakeLink) -> MemberServer:
+    """The server of a run without workers."""
+    coordinator = TicketCoordinator(run_spec(1), RolloutDealer(1, Rounds(0)), worker_timeout_s=TIMEOUT_S, first_session=1)
+    settings = HubSettings(no_workers_timeout_s=60.0, stall_timeout_s=60.0, max_env_failures=0)
+    return Hub(cast(LearnerLink, link), coordinator, settings, clock=lambda: link.now)._server
+
+
+SERVERS: dict[str, Callable[[FakeLink], MemberServer]] = {
+    "lobby": lobby_server,
+    "run": hub_server,
+    "vector environment": lambda link: step_hub(link)._server,
+}
+
+
+@pytest.mark.parametrize("server_of", SERVERS.values(), ids=SERVERS)
+def test_a_worker_whose_rollout_was_packed_for_another_run_joins_again(
+    server_of: Callable[[FakeLink], MemberServer], caplog: pytest.LogCaptureFixture
+) -> None:
+    """As after a restart of the learner: the rollout arrives before the worker has joined, perhaps before a run exists."""
+    caplog.set_level(logging.INFO)
+    link = FakeLink()
+    server = server_of(link)
+    link.inbox += [(b"w0", packed_rollout(link, 7)), (b"w0", example(Hello))]
+    server.listen(POLL_S)
+    rejoin, welcome, *_ = map(decode_to_worker, link.sent)
+    assert rejoin == Rejoin(7)
+    assert isinstance(welcome, Welcome)
+    assert caplog.records[0].getMessage() == "worker w0 was told to join again: its session had ended"
+    assert {record.levelname for record in caplog.records} == {"INFO"}
+    link.sent.clear()
+    link.inbox.append((b"w0", packed_rollout(link, 7)))
+    server.listen(POLL_S)
+    assert [decode_to_worker(frames) for frames in link.sent] == [Rejoin(7)], "a late copy is no mistake of the member"
+    link.sent.clear()
+    link.inbox += [(b"w0", packed_rollout(link, welcome.session))] * STRIKES
+    server.listen(POLL_S)
+    assert isinstance(decode_to_worker(link.sent[0]), Refuse), "in its session, it must know how large a rollout is"
+    assert "packed arrays expected at most" in caplog.text
 
 
 def step_hub(link: FakeLink, *workers: str) -> StepHub:

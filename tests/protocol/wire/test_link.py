@@ -20,7 +20,7 @@ import zmq
 
 import millrace.protocol.wire.sockets
 from millrace.protocol.address import check_address, is_local
-from millrace.protocol.errors import BadMessage, UsageError
+from millrace.protocol.errors import BadMessage, CannotUnpack, UsageError
 from millrace.protocol.messages import (
     Drain,
     Goodbye,
@@ -148,7 +148,8 @@ def test_a_packed_rollout_arrives_whole_where_there_is_room_for_it(ends: Ends) -
     frames = encode(rollout, Packing(stack=True))
     worker.send(frames)
     ((_, error),) = heard(learner)
-    assert isinstance(error, BadMessage)
+    assert isinstance(error, CannotUnpack)
+    assert error.session == rollout.session
     learner.packed_bytes_limit = rollout.obs[0].nbytes
     before = learner.received.bytes
     worker.send(frames)

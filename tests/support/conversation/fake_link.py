@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
+from millrace.protocol.errors import BadMessage
 from millrace.protocol.messages import ToLearner
 from millrace.protocol.wire.codec import Buffer
 
@@ -19,14 +20,14 @@ class FakeLink:
         self.now = 100.0
         self.packed_bytes_limit = 0
         self.sent: list[Sequence[Buffer]] = []
-        self.inbox: list[tuple[bytes, ToLearner]] = []
+        self.inbox: list[tuple[bytes, ToLearner | BadMessage]] = []
 
     def poll(self, timeout_s: float) -> bool:
         if not self.inbox:
             self.now += timeout_s
         return bool(self.inbox)
 
-    def receive(self) -> Iterator[tuple[bytes, ToLearner]]:
+    def receive(self) -> Iterator[tuple[bytes, ToLearner | BadMessage]]:
         while self.inbox:
             yield self.inbox.pop(0)
 

@@ -21,6 +21,7 @@ from tests.system.stage.processes import START_S, TOY, WORKER_TIMEOUT_S, Learner
 from tests.system.stage.runs import IN_ROLLOUT, LANES, NOTICED_S, accounted, dealt_again, finish, play, within
 from tests.system.stage.small_disk import filled, small_disk
 
+FRAMES = "tests.support.envs.toy:Frames-v0"
 LOCAL = {"transport": "tcp", "rollout-steps": 16, "batch-size": 64, "n-epochs": 1, "eval-episodes": 1}
 LOCAL_FLAGS = [
     *("--env-kwargs", "seconds", "0.005"),
@@ -155,9 +156,12 @@ def test_a_worker_delivers_its_rollout_after_sigterm(stage: Stage) -> None:
 
 
 def test_workers_join_a_resumed_learner_on_the_same_port(stage: Stage) -> None:
+    """The workers finish packed rollouts while there is no learner. These arrive before the workers have joined again."""
+    keys, token = stage.keys()  # so that rollouts are packed
+    packed = {"keys": keys, "max-lag": 1, "env-kwargs": ""}
     address = f"tcp://127.0.0.1:{free_port()}"
-    killed = stage.learner(address, {"min-workers": 2, "checkpoint-every-s": 0.3})
-    workers = [stage.worker(address, f"w{number}") for number in range(2)]
+    killed = stage.learner(address, {"min-workers": 2, "checkpoint-every-s": 0.3, **packed}, env=FRAMES)
+    workers = [stage.worker(address, f"w{number}", "--token", str(token)) for number in range(2)]
     wait_for(lambda: len(killed.checkpoints()) >= 3, START_S, "the third checkpoint")
     killed.kill()
     seen = killed.rows()[-1]["time/total_timesteps"]  # its last rows may be newer than its last checkpoint
@@ -171,7 +175,7 @@ def test_workers_join_a_resumed_learner_on_the_same_port(stage: Stage) -> None:
     assert all(worker.alive() for worker in workers), "a worker had to be restarted"
     steps = [row["time/total_timesteps"] for row in learner.rows()]
     assert steps == sorted(set(steps)), "the curve goes over the same steps twice"
-    finish(learner, workers)
+    finish(learner, workers, max_lag=1)
 
 
 def test_a_slow_learner_loses_no_worker(stage: Stage) -> None:
