@@ -33,9 +33,11 @@ import numpy.typing as npt
 from msgspec import Meta
 
 from millrace.protocol.arrays import Array, Bools, Floats
-from millrace.protocol.bounds import MAX_COPIES, MAX_FACTS, Count, Natural, Real, Seconds, Whole
+from millrace.protocol.bounds import MAX_COPIES, MAX_FACTS, MAX_SAVED_BYTES, Count, Natural, Real, Seconds, Whole
 from millrace.protocol.lane_past import EpisodeBegin
 from millrace.protocol.specs import RunSpec
+
+OF_SAVED_BYTES = 1_000  # overhead in bytes for each saved state
 
 
 class Episode(msgspec.Struct, frozen=True, array_like=True):
@@ -118,7 +120,7 @@ def _env_steps(valid: Array, resets: Array | None) -> int:
 
 
 def rollout_bytes(run: RunSpec) -> int:
-    """Total number of bytes of the arrays in a rollout of this run."""
+    """Total number of bytes of the arrays in a rollout of this run, not counting the states that environments have saved."""
     T = run.rollout_steps
     N = run.sent_columns
     leaves = [(T + 1, leaf.shape, leaf.dtype) for leaf in run.policy.seen]
@@ -130,6 +132,11 @@ def rollout_bytes(run: RunSpec) -> int:
     fixed += (T + 1) * run.copies if run.seats else 0  # resets
     fixed += memory_bytes(run)
     return fixed + sum(rows * N * math.prod(shape) * np.dtype(dtype).itemsize for rows, shape, dtype in steps)
+
+
+def saved_bytes(copies: int) -> int:
+    """Largest number of bytes that the saved states of so many env copies add to `Rollout.memory`."""
+    return copies * (MAX_SAVED_BYTES + OF_SAVED_BYTES)
 
 
 def memory_bytes(run: RunSpec) -> int:

@@ -36,7 +36,7 @@ from millrace.protocol.errors import Stalled
 from millrace.protocol.logs.long_wait import LongWait
 from millrace.protocol.messages import Status, Weights
 from millrace.protocol.progress import RunProgress
-from millrace.protocol.rollout import rollout_bytes
+from millrace.protocol.rollout import rollout_bytes, saved_bytes
 from millrace.protocol.wire.learner_link import LearnerLink
 from millrace.protocol.wire.weight_dtypes import ActingDtype, to_float32, to_wire_dtype
 
@@ -99,7 +99,7 @@ class Hub:
         self.link = link
         self.coordinator = coordinator
         self.settings = settings
-        link.packed_bytes_limit = rollout_bytes(coordinator.run)
+        link.packed_bytes_limit = rollout_bytes(coordinator.run) + saved_bytes(coordinator.run.copies)
         self._processes = processes or WorkerProcesses()
         self._check_interrupt = check_interrupt
         self._observer = observer

@@ -13,10 +13,10 @@ import math
 import numpy as np
 
 from millrace.protocol.arrays import Array
-from millrace.protocol.bounds import LARGEST, MAX_SAVED_BYTES
+from millrace.protocol.bounds import LARGEST
 from millrace.protocol.errors import BadRollout
 from millrace.protocol.policy.masks import no_choice, not_allowed
-from millrace.protocol.rollout import Episode, Rollout, memory_bytes
+from millrace.protocol.rollout import Episode, Rollout, memory_bytes, saved_bytes
 from millrace.protocol.rows.array_checks import Axes, Expected, place_of, wrong_arrays, wrong_observation
 from millrace.protocol.specs import ActionSpec, RunSpec
 
@@ -24,7 +24,6 @@ LARGEST_REWARD = float(np.finfo(np.float32).max) * (1 + 2**-25)
 """The largest number that is still finite when it is rounded to float32. Returns are sums of rewards before
 this rounding.
 """
-OF_SAVED_BYTES = 1_000  # overhead in bytes for each saved state
 
 
 def validate(rollout: Rollout, run: RunSpec, most_steps: int = LARGEST) -> None:
@@ -85,7 +84,7 @@ def validate(rollout: Rollout, run: RunSpec, most_steps: int = LARGEST) -> None:
         raise BadRollout(f"begun: expected starts up to {most_starts}, got {start}")
     if len(set(rollout.saved)) < len(rollout.saved) or max(rollout.saved, default=0) >= run.copies:
         raise BadRollout(f"saved: expected copies 0 to {run.copies - 1}, each at most once, got {rollout.saved[:100]}")
-    most = memory_bytes(run) + len(rollout.saved) * (MAX_SAVED_BYTES + OF_SAVED_BYTES)
+    most = memory_bytes(run) + saved_bytes(len(rollout.saved))
     if (size := sum(array.nbytes for array in rollout.memory)) > most:
         raise BadRollout(f"memory: expected at most {most} bytes, got {size}")
 

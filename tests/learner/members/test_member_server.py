@@ -178,7 +178,7 @@ def test_a_learner_that_was_stopped_while_it_waited_was_away_too() -> None:
 
 def packed_rollout(link: FakeLink, session: int) -> BadMessage:
     """How the link hands over a rollout of this session whose packed observations are larger than the run's."""
-    images = np.zeros((3, 1, 4, 64, 64), np.uint8)
+    images = np.zeros((3, 1, 4, 1024, 1024), np.uint8)
     rollout = msgspec.structs.replace(fake_rollout(session, lane=0, ticket=1, version=0, sequence=0), obs=(images,))
     with pytest.raises(BadMessage) as raised:
         decode_to_learner(encode(rollout, Packing(stack=True)), link.packed_bytes_limit)

@@ -18,11 +18,14 @@ from millrace.learner.rollouts.lag_rule import Rounds
 from millrace.learner.rollouts.opponent_pool import OpponentPool, PoolSettings, PoolState, Snapshot
 from millrace.learner.rollouts.rollout_dealer import RolloutDealer
 from millrace.learner.rollouts.ticket_coordinator import TicketCoordinator
+from millrace.protocol.bounds import MAX_SAVED_BYTES
 from millrace.protocol.errors import RunError
 from millrace.protocol.logs.long_wait import AGAIN_S, FIRST_S
 from millrace.protocol.messages import Evaluated, Heartbeat, Hello, ToLearner, Weights
-from millrace.protocol.rollout import Episode, rollout_bytes
-from millrace.protocol.wire.codec import decode_to_worker
+from millrace.protocol.rollout import Episode, rollout_bytes, saved_bytes
+from millrace.protocol.rows.rollout_checks import validate
+from millrace.protocol.wire.codec import decode_to_learner, decode_to_worker, encode
+from millrace.protocol.wire.compression import Packing
 from millrace.protocol.wire.learner_link import LearnerLink
 from millrace.protocol.wire.weight_dtypes import ActingDtype, to_float32
 from tests.support.conversation.example_messages import example
@@ -55,7 +58,17 @@ def hub_with_a_worker(
 
 def test_a_message_may_unpack_to_a_rollout_of_the_run_and_no_more() -> None:
     link, hub, _ = hub_with_a_worker()
-    assert link.packed_bytes_limit == rollout_bytes(hub.coordinator.run) > 0
+    run = hub.coordinator.run
+    assert link.packed_bytes_limit == rollout_bytes(run) + saved_bytes(run.copies)
+
+
+def test_a_rollout_may_be_packed_together_with_the_states_that_environments_have_saved() -> None:
+    link, hub, _ = hub_with_a_worker()
+    state = np.zeros(MAX_SAVED_BYTES, np.uint8)
+    rollout = msgspec.structs.replace(fake_rollout(1, 0, 1, 0, 0), memory=(state,), saved=(0,))
+    validate(rollout, hub.coordinator.run)
+    read = decode_to_learner(encode(rollout, Packing(zstd=True)), link.packed_bytes_limit)
+    assert encode(read) == encode(rollout)
 
 
 @pytest.mark.parametrize(("dtype", "sent"), [("float32", "<f4"), ("bfloat16", "<u2")])
