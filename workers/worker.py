@@ -299,16 +299,12 @@ class Worker:
         log.error("%s\n%s", error, detail)
         self._do(self._session.fail(_line(error), detail, lane, of_policy=isinstance(error, PolicyFailed)))
 
-    def _cannot_take_part(self, error: Exception, work: Work) -> TypeGuard[UsageError]:
-        """Whether the error means that this worker lacks the environment, or has another version of it.
+    def _cannot_take_part(self, error: Exception, work: Work) -> TypeGuard[UserFacingError]:
+        """Whether the error means that this worker can't do such work, because something is missing here."""
+        begins = isinstance(work, Describe) or (isinstance(work, RolloutTask) and not self._statistics.steps)
+        return begins and _is_missing_here(error)
 
-        If the environment's own code raised (`detail` is its traceback), the worker has the environment.
-        """
-        if not isinstance(error, UsageError) or error.detail:
-            return False
-        return isinstance(work, Describe) or (isinstance(work, RolloutTask) and not self._statistics.steps)
-
-    def _decline(self, error: UsageError) -> None:
+    def _decline(self, error: UserFacingError) -> None:
         """Leave the run. If the reason is that no slot was free, exit only once there is room for a lane, because the
         supervisor then restarts the worker.
         """
@@ -391,7 +387,10 @@ class Worker:
                     )
                     self._heartbeats.start()
         except Exception as error:  # torch and the system raise many types
-            self._fail(error)
+            if _is_missing_here(error):
+                self._decline(error)
+            else:
+                self._fail(error)
 
     def _describe(self, order: Describe) -> Described:
         """Describe an environment. While the environment's code runs, a second thread sends heartbeats.
@@ -418,6 +417,16 @@ class Worker:
         close_described()
         if (owner := self._actors or self._stepper) is not None:
             owner.close()
+
+
+def _is_missing_here(error: Exception) -> TypeGuard[UserFacingError]:
+    """Whether the error means that this worker lacks the environment, a wrapper, the encoder, the policy or an opponent, or
+    has another version of it.
+
+    If the user's own code raised (`detail` is its traceback), the worker has that code.
+    """
+    cause = error.__cause__ if isinstance(error, PolicyFailed) else error  # a `PolicyFailed` may be about a missing module
+    return isinstance(error, UserFacingError) and isinstance(cause, UsageError) and not error.detail
 
 
 def _resident_bytes() -> int:

@@ -17,7 +17,7 @@ from gymnasium.envs.classic_control import CartPoleEnv
 from millrace.protocol.alive import NO_SLOT
 from millrace.protocol.arrays import Array
 from millrace.protocol.call_timeouts import OUR_CODE, CallTimeouts
-from millrace.protocol.env_spec import EnvSpec
+from millrace.protocol.env_spec import AllowedCode, EnvSpec
 from millrace.protocol.messages import (
     Collect,
     Describe,
@@ -37,7 +37,7 @@ from millrace.protocol.messages import (
 )
 from millrace.protocol.policy.layout import acting_size, buffer_size
 from millrace.protocol.rollout import rollout_bytes
-from millrace.protocol.specs import RunSpec, WaitSpec
+from millrace.protocol.specs import EncoderSpec, OwnPolicySpec, RunSpec, WaitSpec
 from millrace.protocol.wire import codec
 from millrace.protocol.wire.codec import Buffer, decode_to_learner, decode_to_worker, encode
 from millrace.protocol.wire.compression import Packing
@@ -347,6 +347,37 @@ def test_a_worker_that_lacks_the_environment_declines_and_is_not_started_again(s
     assert left.exit_code == EXIT_UNSUITABLE
     assert left.reason.startswith(SAYS)
     assert [type(message) for message in link.heard()] == [Hello, Goodbye]
+
+
+MISSING = f"{__name__}_that_is_missing:made"
+ENCODING = msgspec.structs.replace(RUN.policy, encoder=EncoderSpec(MISSING, (), 1))
+ACTING = msgspec.structs.replace(RUN.policy, own=OwnPolicySpec(MISSING, ()))
+WRAPPED = msgspec.structs.replace(RUN.env, wrappers=(MISSING,))
+
+
+@pytest.mark.parametrize(
+    ("called", "run"),
+    [
+        ("encoder", msgspec.structs.replace(RUN, policy=ENCODING)),
+        ("policy", msgspec.structs.replace(RUN, policy=ACTING)),
+        ("wrapper", msgspec.structs.replace(RUN, env=WRAPPED)),
+    ],
+)
+def test_a_worker_that_lacks_a_module_of_the_run_declines_as_without_the_environment(called: str, run: RunSpec) -> None:
+    link = FakeLink(said_to_a_worker(run))
+    left = work(link, WorkerOptions(code=AllowedCode.CALLABLES))
+    assert left.exit_code == EXIT_UNSUITABLE
+    assert left.reason.startswith(f"{called} {MISSING}: no module named {MISSING.partition(':')[0]}")
+    assert [type(message) for message in link.heard()] == [Hello, Goodbye]
+
+
+def test_a_policy_that_is_there_and_cannot_be_made_is_a_failure_of_the_policy() -> None:
+    own = OwnPolicySpec("builtins:int", (), kwargs={"no_such": 1})
+    link = FakeLink(said_to_a_worker(msgspec.structs.replace(RUN, policy=msgspec.structs.replace(RUN.policy, own=own))))
+    assert work(link, WorkerOptions(code=AllowedCode.CALLABLES)).exit_code == 1
+    failure = link.heard()[-1]
+    assert isinstance(failure, Failure)
+    assert failure.of_policy
 
 
 def test_a_worker_that_gets_no_lane_does_not_keep_the_copy_that_it_has_described(monkeypatch: pytest.MonkeyPatch) -> None:
