@@ -86,8 +86,9 @@ class RolloutKeywords(TypedDict, total=False):
     machine.
     """
     keys: str | PathLike[str]
-    """Key folder. Default: MILLRACE_KEYS, else ~/.config/millrace/keys. If a folder is named here or in MILLRACE_KEYS,
-    TCP connections on this machine need keys too.
+    """Key folder. Default: MILLRACE_KEYS, else ~/.config/millrace/keys. TCP connections on this machine need keys too if
+    a folder is named here or in MILLRACE_KEYS, or if workers must call a function or class that the run names, such as
+    an encoder or a wrapper.
     """
     insecure: bool
     """Accept workers on other machines without keys. Anyone who can reach the port can then read, disturb and stop the

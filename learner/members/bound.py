@@ -1,7 +1,7 @@
 """Opens the learner's end of the connection: the socket at its address, with the keys that may connect there.
 
-Rule: code is sent only over ipc, over inproc, or over tcp with keys. Closing `resources` releases everything that was
-acquired, the socket before its context.
+Rule: code is sent or named only over ipc, over inproc, or over tcp with keys. Closing `resources` releases everything that
+was acquired, the socket before its context.
 """
 
 from __future__ import annotations
@@ -46,15 +46,15 @@ class Bound:
 def listen(where: Listening, resources: ExitStack, code: str = "") -> Bound:
     """Bind `where.bind` for workers that are started elsewhere. For `code` and errors, see `bind`."""
     raise_limit()
-    keyring = keyring_for(where, datetime.now(UTC).replace(microsecond=0))
+    keyring = keyring_for(where, datetime.now(UTC).replace(microsecond=0), calls_code=bool(code))
     return bind(where.bind, keyring, resources, code, LINGER_ELSEWHERE_S)
 
 
 def bind(address: str, keyring: Keyring | None, resources: ExitStack, code: str = "", linger_s: float = LINGER_S) -> Bound:
     """Bind this address for peers whose keys are in `keyring`.
 
-    `code` names, for error messages, what is sent to the workers as code; it is empty if nothing is. Raises `UsageError` if
-    code would be sent over tcp without keys, or if the address can't be bound.
+    `code` names, for error messages, the code that workers must call; it is empty if there is none. Raises `UsageError` if
+    there is code and an address of tcp without keys, or if the address can't be bound.
     """
     if code and address.startswith("tcp://") and keyring is None:
         instead = REGISTER_IT if code == FACTORY else ""

@@ -1,8 +1,9 @@
 """The learner's endpoint: its address, who may connect, and the command that starts a worker on another machine.
 
 Rule: an address that other machines can reach needs keys, unless the user sets `insecure`. Keys are made automatically on
-first use. On loopback they are needed only if a key folder was specified. Over ipc and inproc, the operating system decides
-who may connect. `membership.py` then decides which of the connected workers may join a run.
+first use. On loopback they are needed only if a key folder was specified, or if workers must call code that the learner
+names or sends, because a worker does that only for a learner that it can be sure of. Over ipc and inproc, the operating
+system decides who may connect. `membership.py` then decides which of the connected workers may join a run.
 """
 
 from __future__ import annotations
@@ -50,8 +51,8 @@ class BindSettings:
     advertise: str = ""
 
 
-def keyring_for(config: Listening, now: datetime) -> Keyring | None:
-    """The keys that may connect to `config.bind`; None if no key is needed.
+def keyring_for(config: Listening, now: datetime, *, calls_code: bool = False) -> Keyring | None:
+    """The keys that may connect to `config.bind`; None if no key is needed. `calls_code`: whether workers must call code.
 
     Raises `UsageError` if both keys and `insecure` are given, or if the key folder can't be used.
     """
@@ -68,7 +69,7 @@ def keyring_for(config: Listening, now: datetime) -> Keyring | None:
             )
         return None
     asked = chosen_key_folder(config.keys)
-    if asked is None and is_local(config.bind):
+    if asked is None and is_local(config.bind) and not calls_code:
         return None
     folder = KeyFolder(asked)
     return Keyring(folder.server(), folder.ensure_first_client(now), folder)

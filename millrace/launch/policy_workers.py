@@ -78,7 +78,9 @@ def policy_player(policy: SavedPolicy, which: PlayingWorkers, watch: Callable[[s
 def _pool(policy: SavedPolicy, which: PlayingWorkers) -> AbstractContextManager[WorkerPool]:
     where = BindSettings(which.bind)
     if which.inference == "workers":
-        return open_worker_pool(where, which.transport)
+        policies = [policy.spec] if policy.against is None else [policy.spec, policy.against.card.policy]
+        code = policy.env.called_code or ("an encoder" if any(each.encoder is not None for each in policies) else "")
+        return open_worker_pool(where, which.transport, code)
     workers = None if which.bind else min(which.workers, which.copies)
     settings = which.settings
     copies = VectorEnvSettings(

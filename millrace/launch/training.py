@@ -152,8 +152,8 @@ def _pool(config: Config, env: EnvSpec, workers: int, *, elsewhere: bool) -> Abs
     """The pool of the run's workers. No rollout begins until `workers` of them have joined."""
     where = BindSettings(config.bind if elsewhere else "", config.keys, config.insecure, config.advertise)
     if config.inference == "workers":
-        # Workers elsewhere decide for themselves whether to accept code.
-        code = "" if elsewhere else env.called_code or ("an encoder" if config.algorithm.encoder else "")
+        code = env.called_code or ("an encoder" if config.algorithm.encoder else "")
+        code = code or ("an opponent" if config.opponents else "")
         return open_worker_pool(where, config.transport, code)
     from millrace.launch.learner_inference import open_stepping_pool, settings_of_run
 

@@ -68,6 +68,16 @@ def test_on_loopback_keys_are_asked_for_where_a_folder_is_named(
     assert (tmp_path / "b" / "default.token").is_file()
 
 
+@pytest.mark.parametrize("bind", LOOPBACK)
+def test_on_loopback_keys_are_made_if_workers_must_call_code_which_they_do_only_with_a_token(home: Path, bind: str) -> None:
+    keyring = keyring_for(Config(bind=bind), NOW, calls_code=True)
+    (line,) = join_lines(bind, "", keyring)
+    assert line.endswith(f" --token {home}/default.token")
+    token = Token.from_text((home / "default.token").read_text(), "")
+    assert EnvSpec("CartPole-v1", wrappers=("mine:Clip",)).rejection_reason(allowed_code(bind, token)) == ""
+    assert keyring_for(Config(bind=bind, insecure=True), NOW, calls_code=True) is None
+
+
 def test_between_processes_that_share_a_file_there_are_no_keys(tmp_path: Path) -> None:
     for bind in INSIDE:
         assert keyring_for(Config(bind=bind, keys=str(tmp_path / "a")), NOW) is None
