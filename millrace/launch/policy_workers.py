@@ -78,7 +78,7 @@ def policy_player(policy: SavedPolicy, which: PlayingWorkers, watch: Callable[[s
 def _pool(policy: SavedPolicy, which: PlayingWorkers) -> AbstractContextManager[WorkerPool]:
     where = BindSettings(which.bind)
     if which.inference == "workers":
-        policies = [policy.spec] if policy.against is None else [policy.spec, policy.against.card.policy]
+        policies = [each.card.policy for each in (policy.stored, policy.against) if each is not None]
         code = policy.env.called_code or ("an encoder" if any(each.encoder is not None for each in policies) else "")
         return open_worker_pool(where, which.transport, code)
     workers = None if which.bind else min(which.workers, which.copies)
