@@ -157,7 +157,7 @@ def test_record_is_the_command(run: millrace.Run, tmp_path: Path, monkeypatch: p
     ("keywords", "message"),
     [
         ({"episode": 5}, "evaluate: unknown keyword episode; did you mean episodes?"),
-        ({"workers": "two"}, "^evaluate: workers: expected int, got 'two'$"),
+        ({"workers": "two"}, "^evaluate: workers: expected int or \"none\", got 'two'$"),
         ({"episodes": 2.5}, "^evaluate: episodes: expected int or None, got 2.5$"),
         ({"episodes": 0}, "episodes: expected int >= 1, got 0"),
         ({"transport": "udp"}, "^evaluate: transport: expected one of inproc, ipc, tcp, got 'udp'$"),

@@ -258,7 +258,7 @@ def test_a_status_request_is_answered_while_it_steps() -> None:
         ({"lanes": 9}, "lanes: expected 1 to num_envs"),
         ({"lanes": 0}, "lanes: expected 1 to num_envs"),
         ({"bind": "tcp://127.0.0.1:*"}, "workers: expected 0, got "),
-        ({"workers": None, "bind": "tcp://127.0.0.1:*", "env": lambda: None}, "factory"),
+        ({"workers": None, "bind": "tcp://127.0.0.1:*", "insecure": True, "env": lambda: None}, "factory"),
         ({"workers": None, "bind": "tcp://0.0.0.0:*", "insecure": True, "keys": "k"}, "got both"),
         ({"workers": None, "bind": "tcp://0.0.0.0:*", "advertise": "host:7"}, "expected an IPv6 address in brackets"),
         ({"autoreset_mode": "Never"}, "autoreset_mode: expected"),
