@@ -19,6 +19,7 @@ from millrace.protocol.bounds import Count, Natural
 from millrace.protocol.errors import UsageError
 from millrace.protocol.own_module import is_name
 
+LEAST_ROLLOUT = 32  # steps of a rollout in PPO: in shorter ones, advantages depend more on the critic than on rewards
 Fraction = Annotated[float, msgspec.Meta(ge=0, le=1)]
 Schedule = Literal["constant", "linear"]
 Optimizer = Literal["rmsprop", "adam"]
@@ -82,6 +83,11 @@ class AlgorithmConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
     def prior_steps(self) -> int:
         """The number of gradient steps on only prior data before the first rollouts."""
         return 0
+
+    @property
+    def least_rollout(self) -> int:
+        """The smallest number of steps in a rollout from which the algorithm learns as well as with its own number."""
+        return min(LEAST_ROLLOUT, self.rollout_steps)
 
     def minibatch_rows(self, envs: int) -> int:
         """The number of rows in a minibatch of an update, which has the rollouts of this number of env copies."""
@@ -237,6 +243,11 @@ class REINFORCEConfig(PolicyGradientConfig, frozen=True):
     normalize_returns: Free[bool] = True
     """Normalize the returns of each batch (minus the baseline) to mean 0 and standard deviation 1."""
 
+    @property
+    def least_rollout(self) -> int:
+        """See `AlgorithmConfig`. A rollout must contain whole episodes."""
+        return self.rollout_steps
+
 
 class OffPolicyConfig(AlgorithmConfig, frozen=True):
     """Settings of every algorithm that learns from a replay buffer."""
@@ -296,6 +307,11 @@ class OffPolicyConfig(AlgorithmConfig, frozen=True):
     """When rewards are drawn from the buffer, divide them by the running standard deviation of the discounted return, and
     clip them to ±10. With n_step, the sum of n rewards is clipped.
     """
+
+    @property
+    def least_rollout(self) -> int:
+        """See `AlgorithmConfig`. With a recurrent layer, a gradient step uses the sequences of whole rollouts."""
+        return 1 if self.core is None else self.rollout_steps
 
     def minibatch_rows(self, envs: int) -> int:
         """See `AlgorithmConfig`."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from millrace.learner.config.config import Config
 from millrace.learner.config.rollout_config import RolloutConfig
-from millrace.learner.config.update_size import least_rollout, rollout_with
+from millrace.learner.config.update_size import rollout_with
 from millrace.protocol.machine.cpu_cores import usable_cores
 
 
@@ -76,7 +76,7 @@ def _envs(config: Config, lanes: int) -> str:
         return ""
     steps = config.algorithm.rollout_steps
     size = config.envs * steps
-    kept = rollout_with(envs, size, least_rollout(config.algorithm))
+    kept = rollout_with(envs, size, config.algorithm.least_rollout)
     shorter = f" --rollout-steps {kept}" if kept != steps else ""
     larger = f" (updates of {envs * kept:,} env steps instead of {size:,})" if envs * kept > size else ""
     return f" --envs {envs}{shorter}{larger}"

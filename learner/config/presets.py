@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import msgspec
 
 from millrace.flags.toml_words import written
-from millrace.learner.config.update_size import least_rollout, rollout_with
+from millrace.learner.config.update_size import rollout_with
 
 if TYPE_CHECKING:
     from millrace.learner.config.config import Config
@@ -89,7 +89,7 @@ def _other_update_size(config: Config, preset: Mapping[str, Any]) -> str:
     if "replay_size" in preset or config.envs == envs or config.algorithm.rollout_steps != rollout_steps:
         return ""
     size = envs * rollout_steps
-    kept = rollout_with(config.envs, size, least_rollout(config.algorithm))
+    kept = rollout_with(config.envs, size, config.algorithm.least_rollout)
     keep = f"; --rollout-steps {kept} keeps them" if config.envs * kept == size else ""
     return f"; an update has {config.envs * rollout_steps:,} env steps instead of the preset's {size:,}{keep}"
 

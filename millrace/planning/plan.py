@@ -10,7 +10,6 @@ import msgspec
 from millrace.arguments import checked
 from millrace.learner.config.config import Config
 from millrace.learner.config.layers import resolve
-from millrace.learner.config.update_size import least_rollout
 from millrace.planning.advice import about_measurements
 from millrace.planning.allowed_copies import AllowedCopies
 from millrace.planning.expected_rate import Situation, Sizes, steps_per_s
@@ -134,7 +133,7 @@ def _decided(
     """
     default_steps = config.algorithm.rollout_steps
     acting_bytes = situation.overheads.acting_bytes
-    learning = Learning(config.envs, default_steps, least_rollout(config.algorithm), acting_bytes)
+    learning = Learning(config.envs, default_steps, config.algorithm.least_rollout, acting_bytes)
 
     sizes = best({each: _rate(each, situation) for each in candidates(learning, situation.measured, situation.machine)})
     chosen = [*first, *reasons(sizes, learning, situation, _rate)]
