@@ -168,7 +168,8 @@ def _decode(frames: Sequence[Buffer], kinds: MessageTypes, packed_bytes_limit: i
             try:
                 return unpack_array(frame, array.packings, array.dtype, array.shape)
             except BadMessage as error:
-                raise CannotUnpack(str(error), _session_of(head)) from error
+                line = one_line(str(error), 500)  # the error may quote text from the peer
+                raise CannotUnpack(line, _session_of(head)) from error
         if size != len(frame):
             raise BadMessage(f"array {array.dtype.str}{array.shape} expected {size} bytes, got {len(frame)}")
         if wanted is PickledCallable:
