@@ -206,7 +206,7 @@ def play(flags: EvaluateFlags, watch: ShowPlayed, given: Given | None = None) ->
     of_run = SettingsOfRun.read(flags.run)
     copies = 1 if flags.video else flags.copies or of_run.copies()
     count = useful_workers(flags.workers or of_run.workers(copies), episodes, copies)
-    workers = playing_workers(flags, count, min(copies, episodes))
+    workers = playing_workers(flags, count, min(copies, episodes), of_run)
     if flags.against is not None:
         saved = saved._replace(against=RunFolder.open_policy(flags.against).read_policy(_which(flags)))
     with policy_player(saved, workers, watch) as player:
@@ -217,14 +217,15 @@ def play(flags: EvaluateFlags, watch: ShowPlayed, given: Given | None = None) ->
         return evaluation_of(played, player.run.facts), []
 
 
-def playing_workers(flags: PlayFlags, count: int | None, copies: int) -> PlayingWorkers:
+def playing_workers(flags: PlayFlags, count: int | None, copies: int, of_run: SettingsOfRun | None = None) -> PlayingWorkers:
     """`count` local workers that play the episodes, or workers that join from elsewhere at `flags.bind`.
 
-    If `count` is None, it is derived from the run's settings. The timeouts are those of the run.
+    If `count` is None, it is derived from the run's settings. The timeouts are those of the run. `of_run`: the run's
+    settings, if they have been read already.
 
     `copies`: see `PlayingWorkers.copies`.
     """
-    of_run = SettingsOfRun.read(flags.run)
+    of_run = of_run or SettingsOfRun.read(flags.run)
     settings = RolloutConfig(
         max_env_failures=flags.max_env_failures,
         start_timeout_s=of_run.start_timeout_s,
